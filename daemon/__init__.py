@@ -1,0 +1,1 @@
+"""The process: configuration, acquisition, log, replay, health and the command line."""

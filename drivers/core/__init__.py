@@ -1,0 +1,1 @@
+"""Framing, checksums and the parser contract that every protocol file shares."""

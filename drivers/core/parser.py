@@ -1,0 +1,144 @@
+"""The contract of every protocol file: bytes in, records out, no I/O, no clock, no logging.
+
+What the wire says never raises: it is counted in `ParserCounters` and skipped. A programming mistake of the caller
+(wrong settings) raises `DriverSettingsError` when the parser is made, never later.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+
+DeviceKind = Literal["gnss", "imu", "scanner"]
+TransportKind = Literal["serial", "can", "udp", "gnss"]
+
+
+class DriverSettingsError(ValueError):
+    """A setting the driver cannot work with; the text names the key and what would be right."""
+
+
+@dataclass(slots=True)
+class ParserCounters:
+    """What a parser saw, so that nothing is dropped silently.
+
+    Attributes:
+        bytes: all bytes fed.
+        messages: complete messages with a good checksum, by name (``GGA``, ``NAV-PVT``, ``BESTPOS``, ``frame``).
+        bad_checksums: frames whose checksum failed.
+        bad_messages: frames with a good checksum that could not be decoded (length, content).
+        bytes_skipped: bytes that belong to no frame.
+        errors: specific errors by code, for example ``bad_length``, ``sequence_gap``.
+    """
+
+    bytes: int = 0
+    messages: Counter[str] = field(default_factory=Counter)
+    bad_checksums: int = 0
+    bad_messages: int = 0
+    bytes_skipped: int = 0
+    errors: Counter[str] = field(default_factory=Counter)
+
+
+class Parser(ABC):
+    """Feeds on units of one channel in the order of their arrival.
+
+    ``feed`` and ``feed_batch`` give the same records for the same bytes however they are cut. `close` gives what
+    was still held back and counts an unfinished tail in ``counters.bytes_skipped``.
+    """
+
+    def __init__(self) -> None:
+        self.counters = ParserCounters()
+
+    @abstractmethod
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one unit; return the records it completed, in order."""
+
+    @abstractmethod
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Take consecutive units of equal length; return the records they completed, in order."""
+
+    def close(self) -> list[Record]:
+        """Release the tail at the end of a stream."""
+        return []
+
+
+class StreamParser(Parser):
+    """For byte streams, whose units end anywhere: `feed` is written, `feed_batch` follows."""
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Feed the rows one by one; stream units are few."""
+        records: list[Record] = []
+        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
+            records += self.feed(Chunk(batch.source, host_time_ns, unit.tobytes()))
+        return records
+
+
+class PacketParser(Parser):
+    """For datagrams and CAN frames, whose units are whole: `parse_units` is written, both feeds follow."""
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """One unit is a batch of one row."""
+        units = np.frombuffer(chunk.data, dtype=np.uint8).reshape(1, -1)
+        return self.parse_units(np.array([chunk.host_time_ns], dtype=np.int64), units)
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Hand the rows to `parse_units` whole."""
+        return self.parse_units(batch.host_time_ns, batch.units)
+
+    @abstractmethod
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Decode units of equal length, vectorised.
+
+        Args:
+            host_time_ns: (n,) host time of each unit.
+            units: (n, length) uint8, one row a unit, possibly strided.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSettings:
+    """All a parser may know of its configuration.
+
+    Attributes:
+        source: ``kind/name``.
+        config: the device's table of the configuration, defaults filled in.
+        files: contents of the files it names, by key (``dbc``, ``geometry``), from disk or from a log's attachments.
+    """
+
+    source: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """What a protocol file declares in its ``DRIVERS`` tuple.
+
+    Attributes:
+        protocol: the name in the configuration.
+        kind: gnss, imu or scanner.
+        transports: kinds of transport it can come by.
+        yields: record types it gives.
+        summary: one line for ``swath devices``.
+        make_parser: builds the parser of everything.
+        make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
+            where the device says no time.
+        names_edge: which edge its time messages name by default; None where mixed or none.
+        needs: configuration keys without which it cannot work.
+    """
+
+    protocol: str
+    kind: DeviceKind
+    transports: tuple[TransportKind, ...]
+    yields: tuple[type, ...]
+    summary: str
+    make_parser: Callable[[DeviceSettings], Parser]
+    make_time_parser: Callable[[DeviceSettings], Parser] | None = None
+    names_edge: NamesEdge | None = None
+    needs: tuple[str, ...] = ()

@@ -1,0 +1,1 @@
+"""GNSS receivers: one file a protocol."""

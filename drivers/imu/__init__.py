@@ -1,0 +1,1 @@
+"""Inertial units: one file a protocol."""
