@@ -1,0 +1,330 @@
+"""One thread a wire: wait, take what the kernel has, stamp it, hand it to the recorder. Nothing here knows a protocol.
+
+Only GNSS bytes are looked at besides, for the time messages in them, after they have been handed over.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from daemon.block_queue import BlockQueue, QueueItem, SourceCount
+from daemon.channels import ChannelTable, JsonChannel
+from daemon.events import Events, Severity
+from daemon.host_clock import HostClock, StampConverter, read_clock_pair
+from daemon.log.format import ChannelSpec
+from daemon.log.writer import encode_block
+from drivers.session import Session, SessionState
+from drivers.transports.base import PpsSource, RawEdge, Transport, UnitBlock
+from georef.records import Int64Array
+
+WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
+ACCOUNT_S = 0.25  # and says how much it has lost at least this often
+SILENT_AFTER_S = 3.0
+
+UnitsSeen = Callable[[Int64Array, UnitBlock], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One port, socket or bus of a device, and where its units go in the log.
+
+    Attributes:
+        source: name of its account: ``kind/name``, with ``/aux`` for a scanner's second port.
+        topic: of the raw channel.
+        encoding: MCAP message encoding, ``x-swath-serial``, ``x-swath-can`` or ``x-swath-udp``.
+        chunk_class: "scanner" or "other".
+        metadata: of the channel, without a sender's.
+        wanted_buffer_bytes: receive buffer that was asked for; 0 where there is none.
+    """
+
+    source: str
+    topic: str
+    encoding: str
+    chunk_class: str
+    metadata: dict[str, str]
+    wanted_buffer_bytes: int = 0
+
+
+@dataclass(slots=True)
+class _Account:
+    """Running totals of one receiver; `snapshot` travels with the blocks."""
+
+    units: int = 0
+    bytes: int = 0
+    lost_kernel: int = 0
+    lost_queue: int = 0
+    last_unit_ns: int | None = None
+    receive_buffer_bytes: int = 0
+    state: str = "opening"
+    ambiguous: int = 0
+
+    def snapshot(self) -> SourceCount:
+        return SourceCount(
+            units=self.units,
+            bytes=self.bytes,
+            lost_kernel=self.lost_kernel,
+            lost_queue=self.lost_queue,
+            stamp_ambiguous=self.ambiguous,
+            last_unit_ns=self.last_unit_ns,
+            receive_buffer_bytes=self.receive_buffer_bytes,
+            state=self.state,
+        )
+
+
+@dataclass(slots=True)
+class Shared:
+    """What all receivers of a session work with."""
+
+    clock: HostClock
+    queue: BlockQueue
+    channels: ChannelTable
+    events: Events
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+class Receiver(threading.Thread, ABC):
+    """The life of a receive thread; subclasses take units and edges.
+
+    Attributes:
+        came_back_ns: CLOCK_MONOTONIC of the last return from a wait, for the watchdog.
+    """
+
+    def __init__(self, source: str, shared: Shared) -> None:
+        super().__init__(name=source, daemon=True)
+        self.source = source
+        self.came_back_ns = time.monotonic_ns()
+        self.shared = shared
+        self.account = _Account()
+        self.stamps = StampConverter(shared.clock)
+        self._accounted_ns = 0
+        self._told_state = SessionState.CLOSED
+        self._told_silent = False
+
+    def run(self) -> None:
+        """Receive until told to stop; an error here is a defect, which the watchdog turns into a restart."""
+        try:
+            while not self.shared.stop.is_set():
+                self.receive_once()
+                self.came_back_ns = time.monotonic_ns()
+            self.finish()
+        except Exception as error:
+            text = f"receive thread failed: {type(error).__name__}: {error}"
+            self.shared.events.post(Severity.CRITICAL, self.source, "receiver_failed", text)
+            raise
+
+    @abstractmethod
+    def receive_once(self) -> None:
+        """One wait and what came of it."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Close the device and give the last account."""
+
+    def tell_account(self, *, now: bool = False) -> None:
+        """Let the recorder know the totals even when no unit came."""
+        monotonic = time.monotonic_ns()
+        if now or monotonic - self._accounted_ns >= ACCOUNT_S * 1e9:
+            self._accounted_ns = monotonic
+            self.shared.queue.put(QueueItem(self.source, count=self.account.snapshot()))
+
+    def tell_state(self, state: SessionState, last_error: str | None) -> None:
+        """Report opening, loss, silence and return as events, each once."""
+        if state is not self._told_state:
+            self._tell_change(state, last_error)
+            self._told_state = state
+        self.account.state = self._state_word(state)
+
+    def _tell_change(self, state: SessionState, last_error: str | None) -> None:
+        post = self.shared.events.post
+        if state is SessionState.OPEN:
+            self.account.last_unit_ns = None
+            self._opened_ns = self.shared.clock.now_ns()
+            self._told_silent = False
+            post(Severity.INFO, self.source, "device_opened", "opened")
+        elif self._told_state is SessionState.OPEN:
+            post(Severity.ERROR, self.source, "device_lost", f"{last_error or 'device has gone'}; waiting for it")
+        elif self._told_state is SessionState.CLOSED and state is SessionState.WAITING:
+            post(Severity.WARNING, self.source, "device_absent", f"{last_error or 'cannot be opened'}; waiting for it")
+
+    def _state_word(self, state: SessionState) -> str:
+        if state is not SessionState.OPEN:
+            return "absent" if state is SessionState.WAITING else "opening"
+        last = self.account.last_unit_ns or self._opened_ns
+        silent_s = (self.shared.clock.now_ns() - last) * 1e-9
+        if silent_s <= SILENT_AFTER_S:
+            return "receiving"
+        if not self._told_silent:
+            self._told_silent = True
+            self._silent_since_ns = last
+            self.shared.events.post(Severity.WARNING, self.source, "silent", f"no data for {silent_s:.0f} s")
+        return "silent"
+
+    def note_units(self, count: int, length: int, last_ns: int) -> None:
+        """Count units; tell when silence ended."""
+        if self._told_silent:
+            self._told_silent = False
+            gap_s = (last_ns - self._silent_since_ns) * 1e-9
+            self.shared.events.post(Severity.INFO, self.source, "resumed", f"data again after {gap_s:.1f} s")
+        self.account.units += count
+        self.account.bytes += count * length
+        self.account.last_unit_ns = last_ns
+
+
+class UnitReceiver(Receiver):
+    """Takes serial reads, datagrams or CAN frames of one wire."""
+
+    def __init__(
+        self, wire: Wire, session: Session[Transport], shared: Shared, units_seen: UnitsSeen | None = None
+    ) -> None:
+        super().__init__(wire.source, shared)
+        self._wire = wire
+        self._session = session
+        self._units_seen = units_seen
+        self._channel_ids: dict[tuple[str, int] | None, int] = {}
+        self._sequences: dict[int, int] = {}
+        self._kernel_base = 0  # losses of earlier openings
+        self._kernel_now = 0
+        self._told_buffer = False
+
+    def receive_once(self) -> None:
+        """Wait for units, stamp them, hand them over, then look for time in them."""
+        blocks = self._session.receive(WAIT_S)
+        if blocks:
+            times = self._stamp(blocks)
+            self._update_kernel_losses(force=False)
+            for block, log_time_ns in zip(blocks, times, strict=True):
+                self._hand_over(block, log_time_ns)
+            if self._units_seen is not None:
+                for block, log_time_ns in zip(blocks, times, strict=True):
+                    self._units_seen(log_time_ns, block)
+        self.tell_state(self._session.state, self._session.last_error)
+        self._update_kernel_losses(force=not blocks)
+        self.tell_account()
+
+    def finish(self) -> None:
+        """Close; the kernel's last word on losses is read before."""
+        self._update_kernel_losses(force=True)
+        self._session.close()
+        self.tell_account(now=True)
+
+    def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
+        counts = [len(block.units) for block in blocks]
+        if all(block.kernel_realtime_ns is None for block in blocks):
+            joined = None
+        else:
+            joined = np.concatenate(
+                [
+                    np.zeros(n, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
+                    for block, n in zip(blocks, counts, strict=True)
+                ]
+            )
+        host = self.stamps.convert_at(joined, sum(counts), read_clock_pair())
+        self.account.ambiguous = self.stamps.ambiguous
+        return np.split(host, np.cumsum(counts)[:-1])
+
+    def _hand_over(self, block: UnitBlock, log_time_ns: Int64Array) -> None:
+        count, length = block.units.shape
+        channel_id = self._channel(block.peer)
+        sequence = self._sequences[channel_id]
+        self._sequences[channel_id] = (sequence + count) & 0xFFFFFFFF
+        encoded = encode_block(channel_id, sequence, log_time_ns, block.units)
+        self.note_units(count, length, int(log_time_ns[-1]))
+        if not self.shared.queue.put(QueueItem(self.source, encoded, self.account.snapshot())):
+            if self.account.lost_queue == 0:
+                text = "the writer does not keep up and its queue is full; units are being dropped and counted"
+                self.shared.events.post(Severity.CRITICAL, self.source, "queue_full", text)
+            self.account.lost_queue += count
+
+    def _channel(self, peer: tuple[str, int] | None) -> int:
+        channel_id = self._channel_ids.get(peer)
+        if channel_id is None:
+            metadata = dict(self._wire.metadata)
+            if peer is not None:
+                metadata |= {"source_address": peer[0], "source_port": str(peer[1])}
+            wire = self._wire
+            spec = ChannelSpec(wire.topic, wire.encoding, metadata, None, wire.chunk_class)
+            channel_id = self.shared.channels.add(self.source, spec)
+            self._channel_ids[peer] = channel_id
+            self._sequences[channel_id] = 0
+        return channel_id
+
+    def _update_kernel_losses(self, *, force: bool) -> None:
+        now = time.monotonic_ns()
+        if not force and now - self._accounted_ns < ACCOUNT_S * 1e9:
+            return
+        counters = self._session.poll_counters()
+        lost = counters.lost_kernel - self.account.lost_kernel
+        if lost > 0:
+            self.account.lost_kernel += lost
+            self.account.units += lost
+            text = f"the kernel dropped {lost} units: the receive buffer was full"
+            self.shared.events.post(Severity.ERROR, self.source, "lost_kernel", text)
+        granted = counters.receive_buffer_bytes
+        self.account.receive_buffer_bytes = granted
+        if granted and granted < self._wire.wanted_buffer_bytes and not self._told_buffer:
+            self._told_buffer = True
+            wanted = self._wire.wanted_buffer_bytes
+            text = f"receive buffer of {granted} bytes granted, {wanted} wanted: sysctl -w net.core.rmem_max=67108864"
+            self.shared.events.post(Severity.WARNING, self.source, "receive_buffer_small", text)
+
+
+class PpsReceiver(Receiver):
+    """Takes the edges of one PPS source; every edge goes to ``/pps/<name>``, accepted by the clock or not."""
+
+    def __init__(
+        self,
+        name: str,
+        session: Session[PpsSource],
+        shared: Shared,
+        edge_seen: Callable[[int, int], None],
+    ) -> None:
+        super().__init__(f"pps/{name}", shared)
+        self._session = session
+        self._edge_seen = edge_seen
+        self._channel = JsonChannel(shared.channels, self.source, f"/pps/{name}", "swath.Pps")
+        self._sequence: int | None = None
+
+    def receive_once(self) -> None:
+        """Wait for edges and hand them over."""
+        edges = self._session.receive(WAIT_S)
+        if edges:
+            stamps = np.array([edge.realtime_ns for edge in edges], dtype=np.int64)
+            times = self.stamps.convert_at(stamps, len(edges), read_clock_pair())
+            self.account.ambiguous = self.stamps.ambiguous
+            for edge, host_ns in zip(edges, times.tolist(), strict=True):
+                self._hand_over(edge, host_ns)
+        self.tell_state(self._session.state, self._session.last_error)
+        self.tell_account()
+
+    def finish(self) -> None:
+        """Close and give the last account."""
+        self._session.close()
+        self.tell_account(now=True)
+
+    def _hand_over(self, edge: RawEdge, host_ns: int) -> None:
+        self._count_missed(edge.sequence)
+        value: dict[str, object] = {
+            "edge_time_ns": host_ns,
+            "sequence": edge.sequence,
+            "edge": edge.edge,
+            "realtime_ns": edge.realtime_ns,
+        }
+        encoded = self._channel.encode(self.shared.clock.now_ns(), value)
+        self.note_units(1, len(encoded.data), host_ns)
+        if not self.shared.queue.put(QueueItem(self.source, encoded, self.account.snapshot())):
+            self.account.lost_queue += 1
+        self._edge_seen(host_ns, edge.sequence)
+
+    def _count_missed(self, sequence: int) -> None:
+        """The kernel keeps one edge: those it overwrote before they were fetched show as a jump of its sequence."""
+        previous, self._sequence = self._sequence, sequence
+        if previous is not None and 1 < sequence - previous < 1000:
+            missed = sequence - previous - 1
+            self.account.lost_kernel += missed
+            self.account.units += missed

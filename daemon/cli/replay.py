@@ -1,0 +1,54 @@
+"""``swath replay``: put a log back on wires."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or a directory of them.", metavar="LOG…")],
+    wire: Annotated[Path, typer.Option(help="Configuration that names the ports, buses and FIFOs to play to.")],
+    pace: Annotated[float, typer.Option(help="Times as fast as recorded; other than 1 no PPS is written.")] = 1.0,
+) -> None:
+    """Play a log's bytes back to ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from daemon.config import load_config
+    from daemon.errors import ExitCode, UserError
+    from daemon.log.reader import open_logs
+    from daemon.replay import close_outputs, open_outputs, timed_units
+    from daemon.wire_player import PlayReport, play
+
+    if pace <= 0:
+        raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.CONFIG)
+    config = load_config(wire)
+    sessions = open_logs(logs)
+    console = Console(stderr=True)
+    stop: list[int] = []
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, lambda number, frame: stop.append(number))
+    try:
+        outputs = open_outputs(config, with_pps=pace == 1.0)
+    except OSError as error:
+        raise UserError(str(error), exit_code=ExitCode.IO) from error
+    try:
+        for session in sessions:
+            columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+            with Progress(*columns, console=console, transient=True) as bar:
+                task = bar.add_task(session.session_id, total=None, told="")
+
+                def tell(seconds: float, report: PlayReport) -> None:
+                    bar.update(task, told=f"{seconds:.0f} s, {sum(report.units.values())} units")  # noqa: B023
+
+                units = timed_units(session, with_pps=pace == 1.0)
+                report = play(units, outputs, pace=pace, progress=tell, stopped=lambda: bool(stop))
+            for source in sorted(outputs):
+                refused = f", {report.refused[source]} refused by a reader" if report.refused[source] else ""
+                console.print(f"{source}: {report.units[source]} units, {report.bytes[source]} bytes{refused}")
+    finally:
+        close_outputs(outputs)

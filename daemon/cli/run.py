@@ -1,0 +1,42 @@
+"""``swath run``: record."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+_JOURNAL_PRIORITY = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
+
+
+class _JournalFormatter(logging.Formatter):
+    """Lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return f"<{_JOURNAL_PRIORITY[record.levelno]}>{super().format(record)}"
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    if "JOURNAL_STREAM" in os.environ:
+        handler.setFormatter(_JournalFormatter("%(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-8s %(message)s", "%H:%M:%S"))
+    logging.getLogger("swath").addHandler(handler)
+    logging.getLogger("swath").setLevel(logging.INFO)
+
+
+def command(
+    config: Annotated[Path, typer.Argument(help="Configuration, for example /etc/swath/swath.toml.")],
+    seconds: Annotated[float | None, typer.Option(help="Stop after so many seconds.", min=0.0)] = None,
+) -> None:
+    """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP starts a new part."""
+    from daemon.config import load_config
+    from daemon.run import record
+
+    _log_to_stderr()
+    raise typer.Exit(int(record(load_config(config), seconds)))

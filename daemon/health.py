@@ -1,0 +1,61 @@
+"""Is the recorder alive, and what would one tell a person about it in a sentence?
+
+The watchdog is fed while the recorder progresses. A silent or absent sensor is an event and a word in the sentence,
+never a reason to restart: a restart would only cost the data of the others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+
+from daemon.acquire import Receiver
+from daemon.recorder import WriterHealth, Writing
+
+PROGRESS_S = 2.0
+
+
+def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: int | None = None) -> list[str]:
+    """Names of the threads that have not made progress within `PROGRESS_S`; empty is healthy."""
+    now = time.monotonic_ns() if now_ns is None else now_ns
+    limit = now - int(PROGRESS_S * 1e9)
+    stuck = [receiver.source for receiver in receivers if receiver.came_back_ns < limit]
+    # A status a second: the last one may be a second old and its successor have two seconds to reach the disk.
+    if writer.status_ns < limit - int(1e9):
+        stuck.append("writer")
+    return stuck
+
+
+def duration_text(seconds: float) -> str:
+    """``3 h 05 min``, ``12 min``, ``40 s``."""
+    if seconds >= 3600:
+        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+    return f"{int(seconds // 60)} min" if seconds >= 60 else f"{int(seconds)} s"
+
+
+def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
+    """What the operator reads in ``systemctl status``."""
+    if writer.state is not Writing.RECORDING:
+        return f"NOT RECORDING: {writer.reason}"
+    troubles = [text for text in map(_trouble, writer.statuses.items()) if text]
+    sources = len(writer.statuses)
+    told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in"
+    room = f"{writer.free_bytes / 1e9:.1f} GB free"
+    if writer.bytes_per_s > 0:
+        room += f" ({duration_text(writer.free_bytes / writer.bytes_per_s)})"
+    return f"recording {session_id} part {part}: {told}; {room}"
+
+
+def _trouble(item: tuple[str, Mapping[str, object]]) -> str:
+    source, status = item
+    lost = sum(int(str(status[key])) for key in ("lost_kernel", "lost_queue", "lost_write"))
+    words = []
+    if status["state"] == "silent":
+        words.append(f"silent for {status['last_unit_age_s'] or 0:.0f} s")
+    elif status["state"] != "receiving":
+        words.append(str(status["state"]))
+    if lost:
+        words.append(f"{lost} units lost")
+    if status.get("time_state") not in (None, "LOCKED"):
+        words.append(f"time {status['time_state']}")
+    return f"{source} " + ", ".join(words) if words else ""

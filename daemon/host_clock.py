@@ -1,0 +1,189 @@
+"""Host time of a session: CLOCK_MONOTONIC plus a constant, and kernel stamps brought onto it.
+
+The rules are those of docs/log-format.md, "Time stamps": a step of the wall clock never moves a log_time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from georef.records import Int64Array
+
+STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
+_BRACKET_NS = 20_000  # two MONOTONIC reads around one of REALTIME, no further apart, bound its error to half of this
+_BRACKET_TRIES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPair:
+    """REALTIME and MONOTONIC at one instant, good to half of ``width_ns``."""
+
+    realtime_ns: int
+    monotonic_ns: int
+    width_ns: int
+
+    @property
+    def offset_ns(self) -> int:
+        """REALTIME − MONOTONIC."""
+        return self.realtime_ns - self.monotonic_ns
+
+
+def read_clock_pair() -> ClockPair:
+    """The tightest of a few bracketed readings, so that a preempted one does not look like a step."""
+    best: ClockPair | None = None
+    for _ in range(_BRACKET_TRIES):
+        before = time.monotonic_ns()
+        realtime = time.time_ns()
+        after = time.monotonic_ns()
+        pair = ClockPair(realtime, (before + after) // 2, after - before)
+        if best is None or pair.width_ns < best.width_ns:
+            best = pair
+        if best.width_ns <= _BRACKET_NS:
+            break
+    assert best is not None
+    return best
+
+
+class HostClock:
+    """Host time of one session, fixed when it is made."""
+
+    def __init__(self, start: ClockPair | None = None) -> None:
+        pair = start if start is not None else read_clock_pair()
+        self.realtime_ns = pair.realtime_ns
+        self.monotonic_ns = pair.monotonic_ns
+        self.offset_ns = pair.offset_ns
+
+    def now_ns(self) -> int:
+        """Host time now."""
+        return time.monotonic_ns() + self.offset_ns
+
+    def step_ns(self, pair: ClockPair) -> int:
+        """How far the wall clock has been stepped since the session's start."""
+        return pair.offset_ns - self.offset_ns
+
+
+class StampConverter:
+    """Brings one channel's kernel stamps (CLOCK_REALTIME) to host time, across steps of the wall clock.
+
+    Attributes:
+        ambiguous: stamps that neither the old nor the new step could place; their read time was taken.
+    """
+
+    def __init__(self, clock: HostClock) -> None:
+        self._clock = clock
+        self._step_ns = 0
+        self._previous_read_ns = clock.now_ns()
+        self.ambiguous = 0
+
+    def convert(self, stamps_ns: Int64Array | None, count: int) -> Int64Array:
+        """Host times of the units of a batch that has just been read.
+
+        Args:
+            stamps_ns: (n,) CLOCK_REALTIME stamps, 0 where a unit came without; None where the transport has none.
+            count: n.
+        """
+        return self.convert_at(stamps_ns, count, read_clock_pair())
+
+    def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
+        """As `convert`, with the clock reading taken after the batch given."""
+        read_ns = pair.monotonic_ns + self._clock.offset_ns
+        old_step = self._step_ns
+        new_step = self._clock.step_ns(pair)
+        if abs(new_step - old_step) <= max(STEP_NOTICED_NS, pair.width_ns):
+            new_step = old_step
+        previous_read_ns, self._previous_read_ns, self._step_ns = self._previous_read_ns, read_ns, new_step
+        if stamps_ns is None:
+            return np.full(count, read_ns, dtype=np.int64)
+        host = stamps_ns - new_step
+        if new_step != old_step:
+            host = self._place(stamps_ns, old_step, new_step, previous_read_ns, read_ns)
+        return np.where(stamps_ns == 0, read_ns, host)
+
+    def _place(
+        self, stamps_ns: Int64Array, old_step: int, new_step: int, previous_read_ns: int, read_ns: int
+    ) -> Int64Array:
+        by_old, by_new = stamps_ns - old_step, stamps_ns - new_step
+        # The reading after the batch and the stamps are of different clocks' reads: half a noticed step of slack.
+        slack = STEP_NOTICED_NS // 2
+        old_fits = (by_old >= previous_read_ns - slack) & (by_old <= read_ns + slack)
+        new_fits = (by_new >= previous_read_ns - slack) & (by_new <= read_ns + slack)
+        undecided = (old_fits == new_fits) & (stamps_ns != 0)
+        self.ambiguous += int(undecided.sum())
+        return np.where(undecided, read_ns, np.where(old_fits, by_old, by_new))
+
+
+class _Timex(ctypes.Structure):
+    """``struct timex`` of adjtimex(2), 64-bit Linux."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("constant", ctypes.c_long),
+        ("precision", ctypes.c_long),
+        ("tolerance", ctypes.c_long),
+        ("time_sec", ctypes.c_long),
+        ("time_usec", ctypes.c_long),
+        ("tick", ctypes.c_long),
+        ("ppsfreq", ctypes.c_long),
+        ("jitter", ctypes.c_long),
+        ("shift", ctypes.c_int),
+        ("stabil", ctypes.c_long),
+        ("jitcnt", ctypes.c_long),
+        ("calcnt", ctypes.c_long),
+        ("errcnt", ctypes.c_long),
+        ("stbcnt", ctypes.c_long),
+        ("tai", ctypes.c_int),
+        ("reserved", ctypes.c_int * 11),
+    )
+
+
+STA_UNSYNC = 0x0040
+_FREQ_PPM_SCALE = 65536.0  # adjtimex(2): freq is ppm with a 16-bit fraction
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ClockDiscipline:
+    """What adjtimex(2) says of the wall clock."""
+
+    frequency_ppm: float
+    status: int
+    max_error_s: float
+
+    @property
+    def disciplined(self) -> bool:
+        """The kernel believes that somebody keeps this clock right to within half a second."""
+        return not self.status & STA_UNSYNC and self.max_error_s < 0.5
+
+
+def read_clock_discipline() -> ClockDiscipline:
+    """The kernel's own account of how its wall clock is kept."""
+    timex = _Timex()
+    if _libc.adjtimex(ctypes.byref(timex)) < 0:
+        return ClockDiscipline(0.0, STA_UNSYNC, float("inf"))
+    return ClockDiscipline(timex.freq / _FREQ_PPM_SCALE, int(timex.status), timex.maxerror * 1e-6)
+
+
+def read_clock_sample() -> dict[str, int | float]:
+    """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status."""
+    pair = read_clock_pair()
+    before = time.monotonic_ns()
+    raw = time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+    after = time.monotonic_ns()
+    discipline = read_clock_discipline()
+    shift = (before + after) // 2 - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
+    return {
+        "realtime_ns": pair.realtime_ns,
+        "monotonic_ns": pair.monotonic_ns,
+        "monotonic_raw_ns": raw - shift,
+        "frequency_ppm": discipline.frequency_ppm,
+        "status": discipline.status,
+    }

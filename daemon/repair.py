@@ -1,0 +1,80 @@
+"""After recording has begun: logs that a crash left open are completed, by another process, one at a time.
+
+The repair never competes with the recording: it runs at idle CPU and I/O priority and starts on a log only while the
+disk keeps the reserve and room for the whole copy. The original is not touched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from daemon.events import Events, Severity
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+_LOOK_AGAIN_S = 60.0
+
+
+def unfinished_logs(directory: Path) -> list[Path]:
+    """Logs of a directory without their end and without a repaired copy, oldest first."""
+    found = []
+    for path in directory.glob("*.mcap"):
+        if path.name.endswith(".recovered.mcap") or path.with_suffix(".recovered.mcap").exists():
+            continue
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(MCAP_MAGIC)))
+            if file.read() != MCAP_MAGIC:
+                found.append(path)
+    return sorted(found, key=lambda path: path.stat().st_mtime)
+
+
+async def repair_left_open(
+    directory: Path, reserve_bytes: int, is_current: Callable[[Path], bool], events: Events
+) -> None:
+    """Repair what a crash left open; waits while there is no room, ends when nothing is left to do."""
+    given_up: set[Path] = set()
+    told_room = False
+    while True:
+        candidates = await asyncio.to_thread(unfinished_logs, directory)
+        waiting = [path for path in candidates if path not in given_up and not is_current(path)]
+        if not waiting:
+            return
+        path = waiting[0]
+        if shutil.disk_usage(directory).free <= reserve_bytes + path.stat().st_size:
+            if not told_room:
+                told_room = True
+                text = f"{path.name} was left open by a crash; no room to repair it now"
+                events.post(Severity.WARNING, "recorder", "repair_waits", text)
+            await asyncio.sleep(_LOOK_AGAIN_S)
+            continue
+        if not await _repair(path, reserve_bytes, events):
+            given_up.add(path)
+
+
+async def _repair(path: Path, reserve_bytes: int, events: Events) -> bool:
+    """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
+    command = [sys.executable, "-m", "daemon.cli.main", "recover", "--background"]
+    command += ["--keep-free-mb", str(reserve_bytes // 1_000_000), str(path)]
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        _, errors = await process.communicate()
+    except asyncio.CancelledError:
+        process.terminate()
+        await process.wait()
+        raise
+    if process.returncode in (0, 4):
+        text = f"{path.name}, left open by a crash, was repaired beside it"
+        events.post(Severity.INFO, "recorder", "log_repaired", text)
+        return True
+    lines = errors.decode(errors="replace").strip().splitlines()
+    text = f"{path.name} could not be repaired: {lines[-1] if lines else f'exit status {process.returncode}'}"
+    events.post(Severity.WARNING, "recorder", "repair_failed", text)
+    return False

@@ -1,0 +1,65 @@
+"""A finished log as a sequence of timed units, and the outputs that a configuration names for them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from daemon.config import Config
+from daemon.log.reader import Session
+from daemon.wire_player import Output, PpsOutput, TimedUnit, open_output
+
+_FIXED = "fixed:"
+
+
+def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
+    """Raw units and PPS edges of a session in the order of their host time.
+
+    A PPS edge's time is the edge's own, not that of its message.
+    """
+    for batch in session.batches_by_time():
+        source = source_of_topic(batch.channel.topic)
+        if source is None:
+            continue
+        if source.startswith("pps/"):
+            if with_pps:
+                for row in batch.units:
+                    yield TimedUnit(int(json.loads(row.tobytes())["edge_time_ns"]), source, b"")
+            continue
+        for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
+            yield TimedUnit(time_ns, source, row.tobytes())
+
+
+def source_of_topic(topic: str) -> str | None:
+    """``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
+    if topic.startswith("/pps/"):
+        return topic[1:]
+    return topic[1 : -len("/raw")] if topic.endswith("/raw") else None
+
+
+def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
+    """The sending ends of every transport that a configuration names.
+
+    Raises:
+        TransportError: one cannot be made; those already made are closed.
+    """
+    outputs: dict[str, Output] = {}
+    try:
+        for device in config.devices():
+            for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
+                if spec is not None and spec.kind != "gnss":
+                    outputs[device.source + suffix] = open_output(spec)
+        for name, pps in config.pps.items():
+            if with_pps and pps.source.startswith(_FIXED):
+                outputs[f"pps/{name}"] = PpsOutput(Path(pps.source.removeprefix(_FIXED)))
+    except OSError:
+        close_outputs(outputs)
+        raise
+    return outputs
+
+
+def close_outputs(outputs: dict[str, Output]) -> None:
+    """Close them all."""
+    for output in outputs.values():
+        output.close()

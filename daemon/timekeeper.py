@@ -1,0 +1,125 @@
+"""What time it is while recording: edges and time messages of the running session, and the state of each clock.
+
+Nothing here changes what is logged: a later reading of the log does all of it again, from the same edges and bytes.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from daemon.events import Events, Severity
+from drivers.core.parser import Parser
+from drivers.transports.base import UnitBlock
+from georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
+from georef.timescales import HostTimeline, PpsClock
+
+
+@dataclass(slots=True)
+class _TimeSource:
+    """A GNSS stream whose time messages are read."""
+
+    source: str
+    clock: PpsClock
+    parser: Parser
+    names_edge: NamesEdge | None
+
+
+class TimeKeeper:
+    """Feeds one `PpsClock` a PPS source (and one a GNSS without PPS); all calls are safe from any thread."""
+
+    def __init__(self, events: Events) -> None:
+        self._events = events
+        self._lock = threading.Lock()
+        self._timeline = HostTimeline()
+        self._clocks: dict[str, PpsClock] = {}  # by the source that shows it: pps/main, gnss/rover
+        self._sources: dict[str, _TimeSource] = {}
+        self._failed: set[str] = set()
+
+    def add_pps(self, source: str, assumed_leap_seconds: int | None, delay_ns: int) -> None:
+        """A PPS source, ``pps/name``."""
+        self._clocks[source] = PpsClock(assumed_leap_seconds=assumed_leap_seconds, delay_ns=delay_ns)
+
+    def add_gnss(
+        self,
+        source: str,
+        pps_source: str | None,
+        parser: Parser,
+        names_edge: NamesEdge | None,
+        assumed_leap_seconds: int | None,
+    ) -> None:
+        """A GNSS stream; its clock is its PPS's, or one of messages alone."""
+        if pps_source is not None:
+            self._clocks[source] = self._clocks[pps_source]
+        else:
+            self._clocks[source] = PpsClock(assumed_leap_seconds=assumed_leap_seconds)
+        self._sources[source] = _TimeSource(source, self._clocks[source], parser, names_edge)
+
+    def units_seen(self, source: str) -> Callable[[Int64Array, UnitBlock], None]:
+        """What a GNSS receiver thread calls with the bytes it has just handed over."""
+
+        def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
+            if source in self._failed:
+                return
+            try:
+                records = self._sources[source].parser.feed_batch(ChunkBatch(source, log_time_ns, block.units))
+            except Exception as error:
+                self._failed.add(source)
+                text = f"time parser failed, bytes are recorded all the same: {type(error).__name__}: {error}"
+                self._events.post(Severity.ERROR, source, "time_parser_failed", text)
+                return
+            self._take(self._sources[source], records)
+
+        return feed
+
+    def _take(self, time_source: _TimeSource, records: list[Record]) -> None:
+        messages = [record for record in records if isinstance(record, TimeMessage)]
+        if not messages:
+            return
+        with self._lock:
+            host_ns = np.array([message.host_time_ns for message in messages], dtype=np.int64)
+            raw_ns = self._timeline.raw_from_host(host_ns)
+            for message, raw in zip(messages, raw_ns.tolist(), strict=True):
+                names = time_source.names_edge or message.names_edge
+                time_source.clock.add_message(
+                    time_source.source, replace(message, host_time_ns=raw, names_edge=names)
+                )
+            self._drain(time_source.source, time_source.clock)
+
+    def edge_seen(self, source: str) -> Callable[[int, int], None]:
+        """What a PPS receiver thread calls with an edge's host time and sequence number."""
+
+        def feed(host_ns: int, sequence: int) -> None:
+            with self._lock:
+                raw_ns = int(self._timeline.raw_from_host(np.array([host_ns], dtype=np.int64))[0])
+                self._clocks[source].add_edge(raw_ns, sequence)
+                self._drain(source, self._clocks[source])
+
+        return feed
+
+    def clock_sample(self, realtime_ns: int, monotonic_host_ns: int, monotonic_raw_ns: int) -> None:
+        """The host's clocks side by side, ten times a second; MONOTONIC already as host time."""
+        with self._lock:
+            self._timeline.add(realtime_ns, monotonic_host_ns, monotonic_raw_ns)
+
+    def status(self, source: str, host_ns: int) -> dict[str, object]:
+        """``time_state`` and ``time_sigma_ns`` of a gnss or pps source; nothing for the others."""
+        clock = self._clocks.get(source)
+        if clock is None:
+            return {}
+        with self._lock:
+            raw_ns = int(self._timeline.raw_from_host(np.array([host_ns], dtype=np.int64))[0])
+            status = clock.status(raw_ns)
+            self._drain(source, clock)
+        sigma = status.sigma_ns
+        return {
+            "time_state": str(status.state),
+            "time_sigma_ns": round(sigma, 1) if sigma is not None and np.isfinite(sigma) else None,
+        }
+
+    def _drain(self, source: str, clock: PpsClock) -> None:
+        for event in clock.drain_events():
+            self._events.post(Severity(event.severity), source, event.code, event.text)

@@ -1,0 +1,228 @@
+"""Puts recorded units back on wires at their recorded pace: ptys, UDP, CAN, and PPS edges into a ``fixed:`` FIFO.
+
+`swath replay` plays logs with it, the demonstration plays captures; a recorder, gpsd or a maker's viewer listens.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import stat
+import time
+import tty
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from drivers.transports.base import TransportError
+from drivers.transports.uri import TransportSpec, open_transport
+
+_PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted
+_LATE_S = 0.002  # units due within this are sent without another sleep
+
+
+@dataclass(frozen=True, slots=True)
+class TimedUnit:
+    """One unit and when it came; ``source`` picks the output."""
+
+    time_ns: int
+    source: str
+    data: bytes
+
+
+class Output(ABC):
+    """Where a source's units go."""
+
+    @abstractmethod
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Send one unit; False when nobody took it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close and remove what was created."""
+
+
+class PtyOutput(Output):
+    """A pseudo-terminal that stands at the path where a recorder expects its serial port."""
+
+    def __init__(self, path: Path) -> None:
+        if path.exists() and not path.is_symlink():
+            raise TransportError(f"{path}: is there already and is no link; give a path that may be made")
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        path.unlink(missing_ok=True)
+        path.symlink_to(os.ttyname(self._slave))
+        self._path = path
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Write all bytes, waiting for a slow reader for a while."""
+        view = memoryview(data)
+        deadline = time.monotonic() + _PATIENCE_S
+        while view:
+            try:
+                view = view[os.write(self._master, view) :]
+            except BlockingIOError:
+                if not select.select([], [self._master], [], max(0.0, deadline - time.monotonic()))[1]:
+                    return False
+        return True
+
+    def close(self) -> None:
+        """Remove the link and hang up."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class UdpOutput(Output):
+    """Datagrams to the port that a recorder listens on."""
+
+    def __init__(self, spec: TransportSpec) -> None:
+        group = spec.options.get("group")
+        host = group or ("127.0.0.1" if spec.host in ("0.0.0.0", "") else spec.host)
+        self._address = (host, spec.port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        if group:
+            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Send one datagram."""
+        try:
+            self._socket.sendto(data, self._address)
+        except OSError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class CanOutput(Output):
+    """Frames to the bus that a recorder listens on."""
+
+    def __init__(self, spec: TransportSpec) -> None:
+        self._transport = open_transport(spec)
+        self._transport.open()
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Send one SocketCAN frame."""
+        try:
+            self._transport.send(data)
+        except TransportError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._transport.close()
+
+
+class PpsOutput(Output):
+    """Edges as lines ``realtime_ns sequence`` into the FIFO of a ``fixed:`` source."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.exists():
+            os.mkfifo(path)
+        elif not stat.S_ISFIFO(path.stat().st_mode):
+            raise TransportError(f"{path}: is there already and is no FIFO; remove it or give another path")
+        self._path = path
+        self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+        self._sequence = 0
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        """Write the edge that is due now; its data are not used."""
+        self._sequence += 1
+        try:
+            os.write(self._fd, f"{due_realtime_ns} {self._sequence}\n".encode())
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close and remove the FIFO."""
+        os.close(self._fd)
+        self._path.unlink(missing_ok=True)
+
+
+def open_output(spec: TransportSpec) -> Output:
+    """The sending end of a transport of the configuration.
+
+    Raises:
+        TransportError: it cannot be made.
+    """
+    if spec.kind == "serial":
+        return PtyOutput(Path(spec.address))
+    return UdpOutput(spec) if spec.kind == "udp" else CanOutput(spec)
+
+
+@dataclass(slots=True)
+class PlayReport:
+    """What was sent, by source.
+
+    Attributes:
+        units, bytes: sent.
+        refused: units that nobody took in time.
+        latest_s: how late the latest unit was.
+    """
+
+    units: Counter[str] = field(default_factory=Counter)
+    bytes: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+    latest_s: float = 0.0
+
+
+def play(
+    units: Iterable[TimedUnit],
+    outputs: Mapping[str, Output],
+    *,
+    pace: float = 1.0,
+    progress: Callable[[float, PlayReport], None] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> PlayReport:
+    """Send units when they are due: the first now, the others after it as recorded, ``pace`` times as fast.
+
+    Args:
+        units: in time order; those of sources without an output are passed over.
+        outputs: by source.
+        pace: 1 is as recorded.
+        progress: called about ten times a second with the played seconds.
+        stopped: ends the play early when true.
+    """
+    report = PlayReport()
+    start_ns = time.monotonic_ns()
+    realtime_ns = time.time_ns()
+    first_ns: int | None = None
+    told_s = 0.0
+    for unit in units:
+        if unit.source not in outputs:
+            continue
+        first_ns = unit.time_ns if first_ns is None else first_ns
+        due_s = (unit.time_ns - first_ns) * 1e-9 / pace
+        _sleep_until(start_ns, due_s, stopped)
+        if stopped():
+            break
+        sent = outputs[unit.source].send(unit.data, realtime_ns + round(due_s * 1e9))
+        _count(report, unit, sent)
+        now_s = (time.monotonic_ns() - start_ns) * 1e-9
+        report.latest_s = max(report.latest_s, now_s - due_s)
+        if progress is not None and now_s - told_s > 0.1:
+            told_s = now_s
+            progress(due_s, report)
+    return report
+
+
+def _sleep_until(start_ns: int, due_s: float, stopped: Callable[[], bool]) -> None:
+    while (wait_s := due_s - (time.monotonic_ns() - start_ns) * 1e-9) > _LATE_S and not stopped():
+        time.sleep(min(wait_s, 0.2))
+
+
+def _count(report: PlayReport, unit: TimedUnit, sent: bool) -> None:
+    if sent:
+        report.units[unit.source] += 1
+        report.bytes[unit.source] += len(unit.data)
+    else:
+        report.refused[unit.source] += 1

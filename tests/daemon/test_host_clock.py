@@ -1,0 +1,106 @@
+"""Host time: kernel stamps land where they belong, whatever the wall clock does."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from daemon.host_clock import (
+    STA_UNSYNC,
+    ClockDiscipline,
+    ClockPair,
+    HostClock,
+    StampConverter,
+    read_clock_discipline,
+    read_clock_pair,
+    read_clock_sample,
+)
+
+REALTIME_0 = 1_800_000_000_000_000_000
+MONOTONIC_0 = 5_000_000_000_000
+SECOND = 1_000_000_000
+HOUR = 3600 * SECOND
+
+
+def pair(seconds: float, step_ns: int = 0) -> ClockPair:
+    """The clocks so many seconds after the start, the wall clock stepped by ``step_ns``."""
+    elapsed = round(seconds * SECOND)
+    return ClockPair(REALTIME_0 + elapsed + step_ns, MONOTONIC_0 + elapsed, 100)
+
+
+def host(seconds: float) -> int:
+    return REALTIME_0 + round(seconds * SECOND)
+
+
+@pytest.fixture
+def converter(monkeypatch: pytest.MonkeyPatch) -> StampConverter:
+    monkeypatch.setattr(time, "monotonic_ns", lambda: MONOTONIC_0)
+    return StampConverter(HostClock(pair(0)))
+
+
+def test_stamps_without_a_step_are_host_time(converter: StampConverter) -> None:
+    stamps = np.array([host(0.9), host(0.95)], dtype=np.int64)
+    assert converter.convert_at(stamps, 2, pair(1.0)).tolist() == [host(0.9), host(0.95)]
+    assert converter.ambiguous == 0
+
+
+@pytest.mark.parametrize("step_ns", [HOUR, -HOUR, 60_000, -60_000])
+def test_batch_across_a_step_takes_old_and_new(converter: StampConverter, step_ns: int) -> None:
+    converter.convert_at(None, 1, pair(1.0))
+    before = np.array([host(1.2)], dtype=np.int64)  # stamped before the step, read after it
+    after = np.array([host(1.4) + step_ns], dtype=np.int64)
+    times = converter.convert_at(np.concatenate([before, after]), 2, pair(1.5, step_ns))
+    if abs(step_ns) == HOUR:
+        assert times.tolist() == [host(1.2), host(1.4)]
+        assert converter.ambiguous == 0
+    else:
+        # 60 µs fit both ways into a batch of half a second: the read time is taken, and counted.
+        assert times.tolist() == [host(1.5), host(1.5)]
+        assert converter.ambiguous == 2
+    later = np.array([host(1.7) + step_ns], dtype=np.int64)
+    assert converter.convert_at(later, 1, pair(1.8, step_ns)).tolist() == [host(1.7)]
+
+
+def test_stamp_that_fits_neither_step_takes_the_read_time(converter: StampConverter) -> None:
+    converter.convert_at(None, 1, pair(1.0))
+    stale = np.array([host(0.2)], dtype=np.int64)
+    assert converter.convert_at(stale, 1, pair(1.5, HOUR)).tolist() == [host(1.5)]
+    assert converter.ambiguous == 1
+
+
+def test_a_wide_bracket_is_not_taken_for_a_step(converter: StampConverter) -> None:
+    wobble = ClockPair(REALTIME_0 + SECOND + 90_000, MONOTONIC_0 + SECOND, 200_000)
+    stamps = np.array([host(0.9)], dtype=np.int64)
+    assert converter.convert_at(stamps, 1, wobble).tolist() == [host(0.9)]
+    assert converter.ambiguous == 0
+
+
+def test_units_without_a_stamp_take_the_read_time(converter: StampConverter) -> None:
+    assert converter.convert_at(None, 2, pair(1.0)).tolist() == [host(1.0)] * 2
+    mixed = np.array([0, host(1.9)], dtype=np.int64)
+    assert converter.convert_at(mixed, 2, pair(2.0)).tolist() == [host(2.0), host(1.9)]
+
+
+def test_clock_pair_is_tight_and_host_time_follows_monotonic() -> None:
+    reading = read_clock_pair()
+    assert 0 <= reading.width_ns < 50_000_000
+    clock = HostClock(reading)
+    assert clock.step_ns(reading) == 0
+    before = time.monotonic_ns()
+    assert before + clock.offset_ns <= clock.now_ns()
+
+
+def test_clock_sample_has_the_three_clocks() -> None:
+    sample = read_clock_sample()
+    assert abs(int(sample["realtime_ns"]) - time.time_ns()) < 10 * SECOND
+    assert abs(int(sample["monotonic_raw_ns"]) - time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)) < 10 * SECOND
+    assert -500 <= sample["frequency_ppm"] <= 500
+
+
+def test_discipline_needs_sync_and_a_bounded_error() -> None:
+    assert ClockDiscipline(0.0, 0, 0.01).disciplined
+    assert not ClockDiscipline(0.0, STA_UNSYNC, 0.01).disciplined
+    assert not ClockDiscipline(0.0, 0, 16.0).disciplined
+    assert read_clock_discipline().max_error_s >= 0
