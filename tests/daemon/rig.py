@@ -1,0 +1,129 @@
+"""A recorder in its own process, and wires to send on: what every end-to-end test works with."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+START_S = 30.0
+
+
+def free_udp_port() -> int:
+    """A UDP port that nobody has at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("0.0.0.0", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def wait_until(condition: Callable[[], object], what: str, timeout_s: float = START_S) -> None:
+    """Wait for something to become true; fails with its name."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {timeout_s:g} s: {what}")
+        time.sleep(0.02)
+
+
+class NotifySocket:
+    """The service manager's end of sd_notify."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "notify"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        self.messages: list[dict[str, str]] = []
+
+    def poll(self, timeout_s: float = 0.0) -> None:
+        """Take what has come."""
+        while select.select([self._socket], [], [], timeout_s)[0]:
+            text = self._socket.recv(4096).decode()
+            self.messages.append(dict(line.split("=", 1) for line in text.splitlines() if "=" in line))
+            timeout_s = 0.0
+
+    def count(self, key: str) -> int:
+        """How many messages had a key."""
+        self.poll()
+        return sum(key in message for message in self.messages)
+
+    def last(self, key: str) -> str:
+        """The newest value of a key, or nothing."""
+        self.poll()
+        return next((message[key] for message in reversed(self.messages) if key in message), "")
+
+    def close(self) -> None:
+        """Close and remove the socket."""
+        self._socket.close()
+        self.path.unlink(missing_ok=True)
+
+
+class Recorder:
+    """``swath run`` on a configuration, as a service manager starts it."""
+
+    def __init__(self, folder: Path, config: str, *, watchdog_s: float | None = None, prefix: list[str] | None = None):
+        folder.mkdir(parents=True, exist_ok=True)
+        self.config = folder / "swath.toml"
+        self.config.write_text(config)
+        self.notify = NotifySocket(folder)
+        environment: dict[str, str] = dict(os.environ) | {"NOTIFY_SOCKET": str(self.notify.path)}
+        if watchdog_s is not None:
+            environment["WATCHDOG_USEC"] = str(round(watchdog_s * 1e6))
+        self.stderr_path = folder / "stderr.txt"
+        with self.stderr_path.open("ab") as stderr:
+            self.process = subprocess.Popen(
+                [*(prefix or []), sys.executable, "-m", "daemon.cli.main", "run", str(self.config)],
+                stderr=stderr,
+                stdout=subprocess.DEVNULL,
+                env=environment,
+            )
+
+    def __enter__(self) -> Recorder:
+        self.wait_ready()
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self.notify.close()
+
+    def wait_ready(self) -> None:
+        """Until READY; fails with what the recorder said."""
+
+        def ready() -> bool:
+            if self.process.poll() is not None:
+                raise AssertionError(f"swath run ended with {self.process.returncode}: {self.stderr()}")
+            return self.notify.count("READY") > 0
+
+        wait_until(ready, "READY")
+
+    def stderr(self) -> str:
+        """What it has said."""
+        return self.stderr_path.read_text()
+
+    def wait_said(self, text: str, times: int = 1, timeout_s: float = START_S) -> None:
+        """Until its journal has a text so many times."""
+        wait_until(lambda: self.stderr().count(text) >= times, f"{text!r} in the journal: {self.stderr()}", timeout_s)
+
+    def stop(self, timeout_s: float = 30.0) -> int:
+        """SIGTERM; its exit status."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout_s)
+
+    def kill(self) -> None:
+        """SIGKILL, as a power cut would."""
+        self.process.kill()
+        self.process.wait()
+
+
+def session_table(directory: Path, **keys: object) -> str:
+    """[session] with small defaults."""
+    values: Mapping[str, object] = {"name": '"test"', "directory": f'"{directory}"', "reserve_mb": 1, **keys}
+    return "[session]\n" + "".join(f"{key} = {value}\n" for key, value in values.items())
