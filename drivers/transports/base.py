@@ -41,12 +41,18 @@ class TransportCounters:
         lost_kernel: units the kernel dropped at the socket or descriptor.
         receive_buffer_bytes: what was granted, read back; 0 where there is no such thing.
         error_frames, bus_off: CAN controller trouble.
+        receive_buffer_asked_bytes: what was asked for; more than was granted means that the system's limit is lower.
+        refused: what arrived and is no unit: datagrams of other senders, lines or messages nobody can read.
+        line_errors: framing, parity and overrun errors of a serial line; bytes are missing or wrong, not units.
     """
 
     lost_kernel: int = 0
     receive_buffer_bytes: int = 0
     error_frames: int = 0
     bus_off: int = 0
+    receive_buffer_asked_bytes: int = 0
+    refused: int = 0
+    line_errors: int = 0
 
 
 class Transport(ABC):

@@ -1,0 +1,43 @@
+"""Who holds a port or device: the name that makes "in use" a message one can act on."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+_UDP_TABLE = Path("/proc/net/udp")
+
+
+def process_holding(target: str) -> str:
+    """Name and id of a process with a descriptor whose link in /proc reads ``target``.
+
+    Processes of other users cannot be looked into; then, and where nobody is found, "another program".
+    """
+    for folder in Path("/proc").glob("[0-9]*/fd"):
+        if _has_link(folder, target):
+            pid = int(folder.parent.name)
+            return "this program itself" if pid == os.getpid() else f"{_command(pid)} (process {pid})"
+    return "another program"
+
+
+def udp_port_holder(port: int) -> str:
+    """Name and id of a process that has a UDP socket on local ``port``."""
+    for line in _UDP_TABLE.read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        if int(fields[1].partition(":")[2], 16) == port:
+            return process_holding(f"socket:[{fields[9]}]")
+    return "another program"
+
+
+def _has_link(folder: Path, target: str) -> bool:
+    try:
+        return any(os.readlink(entry) == target for entry in folder.iterdir())
+    except OSError:  # not ours to look into, or gone meanwhile
+        return False
+
+
+def _command(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return "a program"

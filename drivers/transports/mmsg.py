@@ -1,0 +1,175 @@
+"""Many datagrams in one system call: recvmmsg(2) into preallocated slots, stamps and senders read as arrays.
+
+Used for UDP and for SocketCAN, whose sockets differ only in the length of a unit and in having a sender. The layouts
+are those of <sys/socket.h>: `struct mmsghdr`, `struct iovec` and the one control message that is asked for,
+SCM_TIMESTAMPNS (socket(7)).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import mmap
+import os
+import socket
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.transports.base import UnitBlock
+from georef.records import ByteRows, Int64Array
+
+SO_TIMESTAMPNS = 35  # also SCM_TIMESTAMPNS, <asm-generic/socket.h>
+SO_RCVBUFFORCE = 33
+SO_MEMINFO = 55  # nine u32, <linux/sock_diag.h>
+SK_MEMINFO_DROPS = 8
+PEER_BYTES = 16  # struct sockaddr_in
+
+_WORD = ctypes.sizeof(ctypes.c_void_p)
+_MMSGHDR = np.dtype(  # struct msghdr in whole words, then msg_len
+    {
+        "names": ["name", "namelen", "iov", "iovlen", "control", "controllen", "flags", "len"],
+        "formats": [np.uintp, np.uint32, np.uintp, np.uintp, np.uintp, np.uintp, np.int32, np.uint32],
+        "offsets": [_WORD * word for word in range(8)],
+        "itemsize": 8 * _WORD,
+    }
+)
+_IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
+_STAMP = np.dtype(  # struct cmsghdr with a struct timespec
+    [("len", np.uintp), ("level", np.int32), ("type", np.int32), ("sec", np.intp), ("nsec", np.intp)]
+)
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_recvmmsg = _libc.recvmmsg
+_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
+_recvmmsg.restype = ctypes.c_int
+
+
+class MessageReader:
+    """Slots for ``slots`` datagrams of at most ``unit_bytes`` each; one reader serves one thread.
+
+    The slots are anonymous memory: only pages that a datagram has touched count. They are spread over the cache by a
+    stride that is no power of two.
+    """
+
+    def __init__(self, unit_bytes: int, slots: int, *, peers: bool) -> None:
+        stride = -(-unit_bytes // 64) * 64 + 64
+        self.slots = slots
+        self._memory = mmap.mmap(-1, slots * stride)
+        self._units: ByteRows = np.frombuffer(self._memory, np.uint8).reshape(slots, stride)
+        self._peers = np.zeros((slots, PEER_BYTES), np.uint8)
+        self._peer_keys: NDArray[np.uint64] = self._peers.view(np.uint64)[:, 0]  # family, port, address
+        self._stamps = np.zeros(slots, _STAMP)
+        self._headers = np.zeros(slots, _MMSGHDR)
+        self._iovecs = np.zeros(slots, _IOVEC)
+        self._peer_names: dict[int, tuple[str, int]] = {}
+        self._with_peers = peers
+        self._lay_out(unit_bytes, stride)
+
+    def _lay_out(self, unit_bytes: int, stride: int) -> None:
+        row = np.arange(self.slots, dtype=np.uintp)
+        self._iovecs["base"] = self._units.ctypes.data + row * stride
+        self._iovecs["len"] = unit_bytes
+        self._headers["iov"] = self._iovecs.ctypes.data + row * _IOVEC.itemsize
+        self._headers["iovlen"] = 1
+        self._headers["control"] = self._stamps.ctypes.data + row * _STAMP.itemsize
+        self._headers["controllen"] = _STAMP.itemsize
+        if self._with_peers:
+            self._headers["name"] = self._peers.ctypes.data + row * PEER_BYTES
+            self._headers["namelen"] = PEER_BYTES
+        self._headers_at = self._headers.ctypes.data
+
+    def read(self, fd: int) -> int:
+        """Fill slots with what ``fd`` holds, without waiting; the number filled.
+
+        Raises:
+            OSError: of the call, other than that there is nothing or that a signal came.
+        """
+        count: int = _recvmmsg(fd, self._headers_at, self.slots, socket.MSG_DONTWAIT, None)
+        if count >= 0:
+            return count
+        number = ctypes.get_errno()
+        if number in (errno.EAGAIN, errno.EINTR):
+            return 0
+        raise OSError(number, os.strerror(number))
+
+    def blocks(self, count: int) -> list[UnitBlock]:
+        """The first ``count`` slots as blocks: runs of equal length and sender, copied out of the slots, in order."""
+        if count == 0:
+            return []
+        lengths = self._headers["len"][:count]
+        stamps = self._take_stamps(count)
+        changes = lengths[1:] != lengths[:-1]
+        if self._with_peers:
+            keys = self._peer_keys[:count]
+            changes |= keys[1:] != keys[:-1]
+        starts = [0, *(np.flatnonzero(changes) + 1).tolist(), count]
+        return [self._block(first, last, stamps) for first, last in pairwise(starts)]
+
+    def _block(self, first: int, last: int, stamps: Int64Array) -> UnitBlock:
+        units = self._units[first:last, : int(self._headers["len"][first])].copy()
+        peer = self._peer(first) if self._with_peers else None
+        return UnitBlock(units, stamps[first:last], peer)
+
+    def _take_stamps(self, count: int) -> Int64Array:
+        """(count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none; readies the headers for the next."""
+        rows = self._stamps[:count]
+        nanoseconds: Int64Array = rows["sec"].astype(np.int64) * 1_000_000_000 + rows["nsec"]
+        given = (
+            (self._headers["controllen"][:count] == _STAMP.itemsize)
+            & (rows["level"] == socket.SOL_SOCKET)
+            & (rows["type"] == SO_TIMESTAMPNS)
+        )
+        nanoseconds[~given] = 0
+        self._headers["controllen"][:count] = _STAMP.itemsize
+        if self._with_peers:
+            self._headers["namelen"][:count] = PEER_BYTES
+        return nanoseconds
+
+    def _peer(self, slot: int) -> tuple[str, int]:
+        key = int(self._peer_keys[slot])
+        if key not in self._peer_names:
+            if len(self._peer_names) > 4096:  # a sender that changes its port with every datagram
+                self._peer_names.clear()
+            raw = self._peers[slot].tobytes()
+            self._peer_names[key] = (socket.inet_ntoa(raw[4:8]), int.from_bytes(raw[2:4], "big"))
+        return self._peer_names[key]
+
+
+class DropCounter:
+    """Datagrams the kernel dropped at one socket, from SO_MEMINFO, unwrapped over its 32 bits."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._last = self._kernel_count()
+        self.total = 0
+
+    def update(self) -> int:
+        """The exact total since the counter was made."""
+        count = self._kernel_count()
+        self.total += (count - self._last) & 0xFFFFFFFF
+        self._last = count
+        return self.total
+
+    def _kernel_count(self) -> int:
+        info = self._sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36)
+        return int(np.frombuffer(info, np.uint32)[SK_MEMINFO_DROPS])
+
+
+def ask_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
+    """Ask for a receive buffer and read back what was granted, bytes.
+
+    The kernel keeps, and getsockopt returns, twice the value asked for (its own bookkeeping, socket(7)); half of it
+    is returned here, so that it compares with what was asked and with net.core.rmem_max.
+    """
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted_bytes)
+    except PermissionError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)  # capped silently at rmem_max
+    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def ask_stamps(sock: socket.socket) -> None:
+    """Have the kernel stamp every datagram with CLOCK_REALTIME on arrival."""
+    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
