@@ -19,8 +19,9 @@ from daemon.events import Events, Severity
 from daemon.host_clock import HostClock, StampConverter, read_clock_pair
 from daemon.log.format import ChannelSpec
 from daemon.log.writer import encode_block
+from daemon.threads import name_thread
 from drivers.session import Session, SessionState
-from drivers.transports.base import PpsSource, RawEdge, Transport, UnitBlock
+from drivers.transports.base import RawEdge, UnitBlock
 from georef.records import Int64Array
 
 WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
@@ -40,7 +41,6 @@ class Wire:
         encoding: MCAP message encoding, ``x-swath-serial``, ``x-swath-can`` or ``x-swath-udp``.
         chunk_class: "scanner" or "other".
         metadata: of the channel, without a sender's.
-        wanted_buffer_bytes: receive buffer that was asked for; 0 where there is none.
     """
 
     source: str
@@ -48,7 +48,6 @@ class Wire:
     encoding: str
     chunk_class: str
     metadata: dict[str, str]
-    wanted_buffer_bytes: int = 0
 
 
 @dataclass(slots=True)
@@ -105,9 +104,11 @@ class Receiver(threading.Thread, ABC):
         self._accounted_ns = 0
         self._told_state = SessionState.CLOSED
         self._told_silent = False
+        self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
 
     def run(self) -> None:
         """Receive until told to stop; an error here is a defect, which the watchdog turns into a restart."""
+        name_thread(self.source)
         try:
             while not self.shared.stop.is_set():
                 self.receive_once()
@@ -133,14 +134,14 @@ class Receiver(threading.Thread, ABC):
             self._accounted_ns = monotonic
             self.shared.queue.put(QueueItem(self.source, count=self.account.snapshot()))
 
-    def tell_state(self, state: SessionState, last_error: str | None) -> None:
+    def tell_state(self, state: SessionState, last_error: str) -> None:
         """Report opening, loss, silence and return as events, each once."""
         if state is not self._told_state:
             self._tell_change(state, last_error)
             self._told_state = state
         self.account.state = self._state_word(state)
 
-    def _tell_change(self, state: SessionState, last_error: str | None) -> None:
+    def _tell_change(self, state: SessionState, last_error: str) -> None:
         post = self.shared.events.post
         if state is SessionState.OPEN:
             self.account.last_unit_ns = None
@@ -148,9 +149,9 @@ class Receiver(threading.Thread, ABC):
             self._told_silent = False
             post(Severity.INFO, self.source, "device_opened", "opened")
         elif self._told_state is SessionState.OPEN:
-            post(Severity.ERROR, self.source, "device_lost", f"{last_error or 'device has gone'}; waiting for it")
+            post(Severity.ERROR, self.source, "device_lost", f"{last_error}; waiting for it")
         elif self._told_state is SessionState.CLOSED and state is SessionState.WAITING:
-            post(Severity.WARNING, self.source, "device_absent", f"{last_error or 'cannot be opened'}; waiting for it")
+            post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
 
     def _state_word(self, state: SessionState) -> str:
         if state is not SessionState.OPEN:
@@ -180,7 +181,7 @@ class UnitReceiver(Receiver):
     """Takes serial reads, datagrams or CAN frames of one wire."""
 
     def __init__(
-        self, wire: Wire, session: Session[Transport], shared: Shared, units_seen: UnitsSeen | None = None
+        self, wire: Wire, session: Session[UnitBlock], shared: Shared, units_seen: UnitsSeen | None = None
     ) -> None:
         super().__init__(wire.source, shared)
         self._wire = wire
@@ -188,8 +189,6 @@ class UnitReceiver(Receiver):
         self._units_seen = units_seen
         self._channel_ids: dict[tuple[str, int] | None, int] = {}
         self._sequences: dict[int, int] = {}
-        self._kernel_base = 0  # losses of earlier openings
-        self._kernel_now = 0
         self._told_buffer = False
 
     def receive_once(self) -> None:
@@ -267,9 +266,9 @@ class UnitReceiver(Receiver):
             self.shared.events.post(Severity.ERROR, self.source, "lost_kernel", text)
         granted = counters.receive_buffer_bytes
         self.account.receive_buffer_bytes = granted
-        if granted and granted < self._wire.wanted_buffer_bytes and not self._told_buffer:
+        wanted = counters.receive_buffer_asked_bytes
+        if granted < wanted and not self._told_buffer:
             self._told_buffer = True
-            wanted = self._wire.wanted_buffer_bytes
             text = f"receive buffer of {granted} bytes granted, {wanted} wanted: sysctl -w net.core.rmem_max=67108864"
             self.shared.events.post(Severity.WARNING, self.source, "receive_buffer_small", text)
 
@@ -280,7 +279,7 @@ class PpsReceiver(Receiver):
     def __init__(
         self,
         name: str,
-        session: Session[PpsSource],
+        session: Session[RawEdge],
         shared: Shared,
         edge_seen: Callable[[int, int], None],
     ) -> None:

@@ -22,6 +22,7 @@ from daemon.events import Events, Severity
 from daemon.host_clock import HostClock
 from daemon.log.writer import EncodedBlock, PartWriter
 from daemon.parts import Parts
+from daemon.threads import name_thread
 
 log = logging.getLogger("swath")
 
@@ -122,6 +123,7 @@ class Recorder(threading.Thread):
 
     def run(self) -> None:
         """Write until told to stop, then everything that is still queued, the last status and the index."""
+        name_thread("writer")
         try:
             while not self.stop.is_set():
                 self._turn()

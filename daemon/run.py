@@ -178,7 +178,6 @@ def _wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
         encoding=_ENCODINGS[transport.kind],
         chunk_class="scanner" if device.kind == "scanner" else "other",
         metadata=metadata,
-        wanted_buffer_bytes=transport.receive_buffer_bytes if transport.kind == "udp" else 0,
     )
 
 

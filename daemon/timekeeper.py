@@ -84,9 +84,7 @@ class TimeKeeper:
             raw_ns = self._timeline.raw_from_host(host_ns)
             for message, raw in zip(messages, raw_ns.tolist(), strict=True):
                 names = time_source.names_edge or message.names_edge
-                time_source.clock.add_message(
-                    time_source.source, replace(message, host_time_ns=raw, names_edge=names)
-                )
+                time_source.clock.add_message(time_source.source, replace(message, host_time_ns=raw, names_edge=names))
             self._drain(time_source.source, time_source.clock)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:

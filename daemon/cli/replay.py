@@ -38,7 +38,12 @@ def command(
         raise UserError(str(error), exit_code=ExitCode.IO) from error
     try:
         for session in sessions:
-            columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[told]}"),
+            )
             with Progress(*columns, console=console, transient=True) as bar:
                 task = bar.add_task(session.session_id, total=None, told="")
 

@@ -1,0 +1,226 @@
+"""What types cannot say: names that must exist, files, wires used twice, what the drivers need.
+
+Every check gives lines ``key: what is wrong; what would be right``; the file's name is put before by the caller.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daemon.config.calibration_file import check_calibration
+from daemon.config.config import Config
+from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
+from drivers.core.parser import DeviceKind, Driver, DriverSettingsError
+from drivers.core.registry import UnknownProtocolError, find_driver
+
+if TYPE_CHECKING:
+    from drivers.transports.uri import TransportSpec
+
+DeviceTable = GnssConfig | ImuConfig | ScannerConfig
+ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
+
+
+def check_devices(config: Config) -> list[str]:
+    """All findings of a configuration whose types are right."""
+    lines: list[str] = []
+    lines += _check_pps(config)
+    lines += _check_files(config)
+    for kind, name, table in config.device_tables():
+        lines += _check_device(config, kind, name, table)
+    lines += _check_wires(config)
+    return lines
+
+
+def _check_pps(config: Config) -> Iterator[str]:
+    from drivers.transports.uri import parse_pps
+
+    taken: dict[tuple[str, str], str] = {}
+    for name, pps in config.pps.items():
+        key = f"pps.{name}.source"
+        try:
+            parse_pps(pps.source, edge=pps.edge)
+        except ValueError as error:
+            yield f"{key}: {error}"
+            continue
+        device = (os.path.realpath(pps.source.partition(":")[2] or pps.source), pps.edge)
+        if device in taken:
+            yield f"{taken[device]} and {key}: both are {pps.source}; one source may use a device"
+        taken.setdefault(device, key)
+
+
+def _check_files(config: Config) -> Iterator[str]:
+    """Files named must be there; two DBC files of one name would be one attachment."""
+    dbc_of: dict[str, tuple[str, Path]] = {}
+    for kind, name, table in config.device_tables():
+        for file_key, path in config.files_of(table).items():
+            key = f"{kind}.{name}.{'geometry.file' if file_key == 'geometry' else file_key}"
+            problem = _unreadable(path)
+            if problem:
+                yield f"{key}: {path}: {problem}; give a file, relative to the configuration"
+                continue
+            if file_key == "dbc":
+                first_key, first_path = dbc_of.setdefault(path.name, (key, path))
+                if first_path.read_bytes() != path.read_bytes():
+                    yield f"{first_key} and {key}: two files named {path.name}; the log keeps them by name, rename one"
+    if config.mta.terrain:
+        problem = _unreadable(config.resolve(config.mta.terrain))
+        if problem:
+            yield f"mta.terrain: {config.resolve(config.mta.terrain)}: {problem}; give a file or leave it empty"
+
+
+def _unreadable(path: Path) -> str | None:
+    if path.is_dir():
+        return "is a directory"
+    try:
+        with path.open("rb"):
+            return None
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTable) -> Iterator[str]:
+    section = f"{kind}.{name}"
+    if table.pps is not None and table.pps not in config.pps:
+        known = ", ".join(config.pps) or "none; add [pps.main]"
+        yield f'{section}.pps: got "{table.pps}", want the name of a [pps.<name>]; there are: {known}'
+    yield from _check_rotations(section, table)
+    if isinstance(table, ScannerConfig):
+        yield from _check_calibration(config, name, table)
+    try:
+        driver = find_driver(kind, table.protocol)
+    except UnknownProtocolError as error:
+        yield f"{section}.protocol: {error}"
+        return
+    yield from _check_transport(config, section, table, driver)
+    needs = list(_check_needs(section, table, driver))
+    yield from needs
+    if not needs and not any(_unreadable(path) for path in config.files_of(table).values()):
+        try:
+            driver.make_parser(config.settings_of(kind, name, table))
+        except DriverSettingsError as error:
+            yield f"{section}: {error}"
+
+
+def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
+    for need in driver.needs:
+        value: object = table
+        for part in need.split("."):
+            value = getattr(value, part, None)
+        if value is None:
+            key = need.split(".")
+            described = type(table).model_fields[key[0]].description if key[0] in type(table).model_fields else ""
+            yield f"{section}.{need}: missing; protocol {driver.protocol} needs it: {described}"
+
+
+def _check_transport(config: Config, section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
+    from drivers.transports.uri import parse_transport
+
+    allowed = ", ".join(driver.transports)
+    try:
+        spec = parse_transport(table.transport)
+    except ValueError as error:
+        yield f"{section}.transport: {error}"
+    else:
+        if spec.kind not in driver.transports:
+            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
+        elif spec.kind == "gnss" and spec.address not in config.gnss:
+            known = ", ".join(config.gnss) or "none"
+            yield f'{section}.transport: got "{table.transport}", want the name of a [gnss.<name>]; there are: {known}'
+    if isinstance(table, ScannerConfig) and table.auxiliary:
+        try:
+            auxiliary = parse_transport(table.auxiliary)
+        except ValueError as error:
+            yield f"{section}.auxiliary: {error}"
+        else:
+            if auxiliary.kind != "udp":
+                yield f'{section}.auxiliary: got "{table.auxiliary}", want udp:<address>:<port>'
+
+
+def _check_rotations(section: str, table: DeviceTable) -> Iterator[str]:
+    for key in ("rotation_b_imu", "installation"):
+        rows = getattr(table, key, None)
+        if rows is None:
+            continue
+        problem = rotation_problem(rows)
+        if problem:
+            yield f"{section}.{key}: {problem}"
+
+
+def rotation_problem(rows: list[list[float]]) -> str | None:
+    """Why three rows are not a proper rotation matrix; None when they are."""
+    matrix = np.array(rows, dtype=np.float64)
+    lengths = np.linalg.norm(matrix, axis=1)
+    for row in range(3):
+        if abs(lengths[row] - 1.0) > ROTATION_TOLERANCE:
+            return f"not a rotation: row {row + 1} has length {lengths[row]:.6g}, want 1"
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+        return "not a rotation: its rows are not perpendicular to each other"
+    if np.linalg.det(matrix) < 0.0:
+        return "not a rotation but a mirroring (determinant -1): turn the sign of one axis"
+    return None
+
+
+def _check_calibration(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:
+    if table.calibration is None:
+        return
+    path = config.resolve(table.calibration)
+    if _unreadable(path) is None:
+        for problem in check_calibration(path, name, table):
+            yield f"scanner.{name}.calibration: {path}: {problem}"
+
+
+def _check_wires(config: Config) -> Iterator[str]:
+    """Two sources on one port or device: one would take the other's bytes."""
+    wires: list[tuple[str, TransportSpec]] = list(_wires(config))
+    for index, (key, spec) in enumerate(wires):
+        for other_key, other in wires[:index]:
+            if same_wire(spec, other):
+                yield f"{other_key} and {key}: both use {_wire_name(spec)}; give each its own"
+                break
+
+
+def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
+    from drivers.transports.uri import parse_transport
+
+    for kind, name, table in config.device_tables():
+        for key in ("transport", "auxiliary"):
+            text = getattr(table, key, None)
+            if text is None:
+                continue
+            try:
+                spec = parse_transport(text)
+            except ValueError:
+                continue  # already a finding
+            if spec.kind != "gnss":
+                yield f"{kind}.{name}.{key}", spec
+
+
+def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
+    """Whether two transports would open the same port or device.
+
+    UDP ports are one where the addresses are equal or either is the wildcard; serial devices where their real paths
+    are; a CAN bus where interface and channel are.
+    """
+    if one.kind != other.kind:
+        return False
+    if one.kind == "serial":
+        return os.path.realpath(one.address) == os.path.realpath(other.address)
+    if one.kind == "udp":
+        host, _, port = one.address.rpartition(":")
+        other_host, _, other_port = other.address.rpartition(":")
+        wild = {"", "0.0.0.0", "[::]", "::", "*"}
+        return int(port) == int(other_port) and (host == other_host or host in wild or other_host in wild)
+    return one.address == other.address
+
+
+def _wire_name(spec: TransportSpec) -> str:
+    if spec.kind == "udp":
+        return f"UDP port {spec.address.rpartition(':')[2]}"
+    if spec.kind == "serial":
+        return f"the device {os.path.realpath(spec.address)}"
+    return f"the CAN bus {spec.address}"

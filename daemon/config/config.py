@@ -1,0 +1,195 @@
+"""The loaded configuration: its tables, the file they came from, its devices and what of it goes into a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from daemon.config.tables import (
+    AtmosphereConfig,
+    AttitudeConfig,
+    GnssConfig,
+    ImuConfig,
+    MtaConfig,
+    OutputConfig,
+    PpsConfig,
+    ProfileConfig,
+    ScannerConfig,
+    SessionConfig,
+    Tables,
+)
+from drivers.core.parser import DeviceKind, DeviceSettings
+
+if TYPE_CHECKING:
+    from drivers.transports.uri import TransportSpec
+
+FileKey = Literal["dbc", "calibration", "geometry"]
+PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # what a parser is given; a calibration is not its business
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEntry:
+    """One device of the configuration.
+
+    Attributes:
+        kind, name: of its section; ``source`` is ``kind/name``.
+        transport: where its bytes come from; kind ``gnss`` where they lie inside another stream.
+        auxiliary: the same head's second port.
+        protocol: the driver's name.
+        pps: name of its PPS source.
+        settings: what its parser is made with.
+        files: the files it names, by key.
+    """
+
+    kind: DeviceKind
+    name: str
+    transport: TransportSpec
+    auxiliary: TransportSpec | None
+    protocol: str
+    pps: str | None
+    settings: DeviceSettings
+    files: dict[FileKey, Path]
+
+    @property
+    def source(self) -> str:
+        """``kind/name``, the source's name everywhere."""
+        return f"{self.kind}/{self.name}"
+
+
+class Config:
+    """The configuration of one recorder."""
+
+    def __init__(self, tables: Tables, path: Path, text: str) -> None:
+        self.tables = tables
+        self.path = path
+        self.text = text
+
+    @property
+    def session(self) -> SessionConfig:
+        """``[session]``, its directory made absolute."""
+        session = self.tables.session
+        return session.model_copy(update={"directory": str(self.resolve(session.directory))})
+
+    @property
+    def pps(self) -> dict[str, PpsConfig]:
+        """``[pps.<name>]``."""
+        return self.tables.pps
+
+    @property
+    def gnss(self) -> dict[str, GnssConfig]:
+        """``[gnss.<name>]``."""
+        return self.tables.gnss
+
+    @property
+    def imu(self) -> dict[str, ImuConfig]:
+        """``[imu.<name>]``."""
+        return self.tables.imu
+
+    @property
+    def scanner(self) -> dict[str, ScannerConfig]:
+        """``[scanner.<name>]``."""
+        return self.tables.scanner
+
+    @property
+    def attitude(self) -> AttitudeConfig:
+        """``[attitude]``."""
+        return self.tables.attitude
+
+    @property
+    def atmosphere(self) -> AtmosphereConfig:
+        """``[atmosphere]``."""
+        return self.tables.atmosphere
+
+    @property
+    def mta(self) -> MtaConfig:
+        """``[mta]``."""
+        return self.tables.mta
+
+    @property
+    def profile(self) -> ProfileConfig:
+        """``[profile]``."""
+        return self.tables.profile
+
+    @property
+    def output(self) -> OutputConfig:
+        """``[output]``."""
+        return self.tables.output
+
+    def resolve(self, name: str) -> Path:
+        """A path of the file: relative ones are relative to the file."""
+        return (self.path.parent / name).absolute()
+
+    def device_tables(self) -> Iterator[tuple[DeviceKind, str, GnssConfig | ImuConfig | ScannerConfig]]:
+        """(kind, name, table) of every device, in the order of the kinds and of the file."""
+        for name, gnss in self.gnss.items():
+            yield "gnss", name, gnss
+        for name, imu in self.imu.items():
+            yield "imu", name, imu
+        for name, scanner in self.scanner.items():
+            yield "scanner", name, scanner
+
+    def files_of(self, table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, Path]:
+        """The files a device's table names, by key."""
+        named: dict[FileKey, str | None] = {}
+        if isinstance(table, ImuConfig):
+            named["dbc"] = table.dbc
+        if isinstance(table, ScannerConfig):
+            named["calibration"] = table.calibration
+            named["geometry"] = table.geometry.file if table.geometry else None
+        return {key: self.resolve(name) for key, name in named.items() if name is not None}
+
+    def settings_of(self, kind: DeviceKind, name: str, table: GnssConfig | ImuConfig | ScannerConfig) -> DeviceSettings:
+        """What the parser of a device is made with; reads its files.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        files = self.files_of(table)
+        contents = {key: files[key].read_bytes() for key in PARSER_FILES if key in files}
+        return DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
+
+    def devices(self) -> Iterator[DeviceEntry]:
+        """Every device: GNSS, IMU, scanners, in the order of the file."""
+        from drivers.transports.uri import parse_transport
+
+        for kind, name, table in self.device_tables():
+            auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None
+            yield DeviceEntry(
+                kind=kind,
+                name=name,
+                transport=parse_transport(table.transport),
+                auxiliary=parse_transport(auxiliary) if auxiliary else None,
+                protocol=table.protocol,
+                pps=table.pps,
+                settings=self.settings_of(kind, name, table),
+                files=self.files_of(table),
+            )
+
+    def attachments(self) -> list[tuple[str, str, bytes]]:
+        """What goes into every log: (name, media type, bytes); names as in the log format's page."""
+        found = [("config.toml", "application/toml", self.text.encode())]
+        for _, name, table in self.device_tables():
+            for key, path in self.files_of(table).items():
+                attachment = _attachment_name(key, name, path)
+                if all(attachment != other for other, _, _ in found):
+                    found.append((attachment, _media_type(path), path.read_bytes()))
+        return found
+
+
+def plain_table(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[str, Any]:
+    """A device's table as plain values, defaults filled in."""
+    return table.model_dump()
+
+
+def _attachment_name(key: FileKey, device: str, path: Path) -> str:
+    if key == "dbc":
+        return f"dbc/{path.name}"
+    suffix = path.suffix if key == "geometry" else ".toml"
+    return f"{key}/{device}{suffix}"
+
+
+def _media_type(path: Path) -> str:
+    known = {".toml": "application/toml", ".json": "application/json", ".csv": "text/csv"}
+    return known.get(path.suffix.lower(), "text/plain")

@@ -1,0 +1,209 @@
+"""Reads the file and says in one line each what is wrong with it: file, key, what was got, what would be right."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from daemon.config.checks import check_devices
+from daemon.config.config import Config
+from daemon.config.tables import Tables
+from daemon.errors import ConfigError, ExitCode, UserError
+
+MAX_CONFIG_BYTES = 4 * 1024 * 1024  # no sane configuration is larger; a log given by mistake is not read whole
+_SHOWN_CHARACTERS = 60
+
+_TYPE_WANTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text in quotes",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "finite_number": "a finite number",
+}
+_BOUND_SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+
+
+def load_config(path: str | Path) -> Config:
+    """Read and validate a configuration file and all files it names.
+
+    Raises:
+        ConfigError: all that is wrong with it, one line each.
+        UserError: the file cannot be read.
+    """
+    file = Path(path)
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(MAX_CONFIG_BYTES + 1)
+    except OSError as error:
+        text = f"{file}: {error.strerror}; give the path of a configuration file"
+        raise UserError(text, ExitCode.USAGE) from error
+    if len(content) > MAX_CONFIG_BYTES:
+        raise ConfigError(f"{file}: larger than {MAX_CONFIG_BYTES} bytes; want a TOML file of keys")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ConfigError(f"{file}: line {line}: not UTF-8 text; want a TOML file") from error
+    return parse_config(text, file)
+
+
+def parse_config(text: str, path: Path) -> Config:
+    """Validate the text of a configuration whose files lie beside ``path``.
+
+    Raises:
+        ConfigError: all that is wrong with it, one line each.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not TOML: {str(error).splitlines()[0]}") from error
+    try:
+        tables = Tables.model_validate(table)
+    except ValidationError as error:
+        lines = [describe(details) for details in error.errors(include_url=False)]
+        raise ConfigError([f"{path}: {line}" for line in lines]) from error
+    config = Config(tables, path, text)
+    lines = check_devices(config)
+    if lines:
+        raise ConfigError([f"{path}: {line}" for line in lines])
+    return config
+
+
+def describe(details: ErrorDetails) -> str:
+    """One line of one finding of the models: key path, what was got, what would be right."""
+    location = [item for item in details["loc"] if item != "[key]"]
+    kind, context = details["type"], details.get("ctx", {})
+    key = _key_path(location)
+    if details["loc"][-1:] == ("[key]",):
+        return f"{key}: a name becomes a topic; want 1 to 64 of A-Z a-z 0-9 _ -"
+    if kind == "extra_forbidden":
+        return f"{key}: unknown key; {_suggestion(location)}"
+    if kind == "missing":
+        return f"{key}: missing; want {_wanted_of_field(_field_at(location))}"
+    if kind == "value_error":
+        return f"{key}: {context['error']}" if key else str(context["error"])
+    return f"{key}: got {shown(details['input'])}, want {_wanted(kind, context, location)}"
+
+
+def shown(value: object) -> str:
+    """A value as it stands in the file, shortened."""
+    if isinstance(value, Mapping):
+        return "a table"
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 1]}…"
+
+
+def _key_path(location: Sequence[int | str]) -> str:
+    path = ""
+    for item in location:
+        if isinstance(item, int):
+            path += f"[{item}]"
+        else:
+            path += f".{item}" if path else item
+    return path
+
+
+def _wanted(kind: str, context: Mapping[str, Any], location: Sequence[int | str]) -> str:
+    if kind == "literal_error":
+        return str(context["expected"]).replace("'", '"')
+    if kind in ("too_short", "too_long") and kind == "too_short" and context.get("min_length") == 1:
+        return "at least one"
+    if kind in ("too_short", "too_long"):
+        return f"{context.get('min_length', context.get('max_length'))} of them"
+    if kind == "string_too_short":
+        return "text that is not empty"
+    if kind == "string_pattern_mismatch":
+        return _wanted_of_pattern(str(context["pattern"]))
+    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+        return _bounds(_field_at(location)) or f"{kind} {context}"
+    wanted = _TYPE_WANTED.get(kind, kind)
+    bounds = _bounds(_field_at(location)) if kind in ("float_type", "int_type") else ""
+    return f"{wanted} {bounds}".rstrip()
+
+
+def _wanted_of_pattern(pattern: str) -> str:
+    if r"\." in pattern:
+        return "MESSAGE.signal of the DBC"
+    if "gnss|imu" in pattern:
+        return "kind/name of a source"
+    return "1 to 64 of A-Z a-z 0-9 _ -"
+
+
+def _wanted_of_field(field: FieldInfo | None) -> str:
+    if field is None:
+        return "this table"
+    if field.description:
+        return field.description
+    model = _model_in(field.annotation)
+    return f"the table with {', '.join(model.model_fields)}" if model else "a value"
+
+
+def _bounds(field: FieldInfo | None) -> str:
+    """``>= 1 and <= 60``, from the field's own metadata."""
+    if field is None:
+        return ""
+    parts = []
+    for attribute, sign in _BOUND_SIGNS:
+        for item in field.metadata:
+            bound = getattr(item, attribute, None)
+            if bound is not None:
+                parts.append(f"{sign} {bound:.10g}")
+    return " and ".join(parts)
+
+
+def _model_in(annotation: object) -> type[BaseModel] | None:
+    """The model in ``M``, ``M | None``, ``dict[str, M]``, ``list[M]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if get_origin(annotation) in (dict, list, Union, UnionType, Annotated):
+        for argument in get_args(annotation):
+            if (model := _model_in(argument)) is not None:
+                return model
+    return None
+
+
+def _is_named(annotation: object) -> bool:
+    return get_origin(annotation) is dict
+
+
+def _walk(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
+    """The innermost model on the way to a location, and the last field passed."""
+    model: type[BaseModel] | None = Tables
+    field: FieldInfo | None = None
+    skip = False
+    for item in location:
+        if skip or isinstance(item, int):
+            skip = False
+            continue
+        if model is None or item not in model.model_fields:
+            return model, None
+        field = model.model_fields[item]
+        skip = _is_named(field.annotation)
+        inner = _model_in(field.annotation)
+        model = inner if inner is not None else model
+    return model, field
+
+
+def _field_at(location: Sequence[int | str]) -> FieldInfo | None:
+    return _walk(location)[1]
+
+
+def _suggestion(location: Sequence[int | str]) -> str:
+    model, _ = _walk(location[:-1])
+    known = list(model.model_fields) if model is not None else []
+    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"there are: {', '.join(known)}"

@@ -1,0 +1,262 @@
+"""Every key of the configuration: its type, unit (in the name), bounds and default.
+
+Strict: a key not named here is an error, text is never taken for a number. The descriptions are what
+docs/configuration.md prints.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
+SIGNAL_PATTERN = r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$"
+
+Name = Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
+Text = Annotated[str, Field(min_length=1)]
+Signal = Annotated[str, Field(pattern=SIGNAL_PATTERN)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
+SignalTriple = Annotated[list[Signal], Field(min_length=3, max_length=3)]
+
+
+def _zero_vector() -> list[float]:
+    return [0.0, 0.0, 0.0]
+
+
+def _identity() -> list[list[float]]:
+    return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+class Section(BaseModel):
+    """A table of the file."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class SessionConfig(Section):
+    """``[session]``: what is recorded where."""
+
+    name: Name = Field(description="begins the name of every log")
+    directory: Text = Field("/var/lib/swath", description="where logs go; relative to this file")
+    compression: Literal["auto", "lz4", "zstd", "none"] = Field(
+        "auto", description="of chunks; auto: scanner none, the rest lz4"
+    )
+    split_size_mb: float = Field(2048.0, ge=1.0, le=1_000_000.0, description="a new part after this size")
+    split_minutes: float = Field(30.0, ge=0.01, le=1440.0, description="a new part after this time")
+    fsync_s: float = Field(1.0, ge=0.05, le=60.0, description="how often the log is forced to the disk")
+    reserve_mb: float = Field(
+        512.0, ge=1.0, le=10_000_000.0, description="free space at which recording stops cleanly, and resumes above"
+    )
+
+
+class PpsConfig(Section):
+    """``[pps.<name>]``: a source of one edge a second."""
+
+    source: Text = Field(description="/dev/ppsN, serial-dcd:/dev/ttyS0 or fixed:<path>")
+    edge: Literal["assert", "clear"] = Field("assert", description="which edge is the second")
+    delay_ns: int = Field(
+        0, ge=-500_000_000, le=500_000_000, description="cable and capture delay, subtracted from the stamp"
+    )
+
+
+class GnssConfig(Section):
+    """``[gnss.<name>]``: a receiver."""
+
+    transport: Text = Field(description="serial:…, udp:… or can:…")
+    protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
+    pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this receiver")
+    names_edge: Literal["auto", "previous", "next"] = Field(
+        "auto", description="which edge its time message names; auto: by protocol"
+    )
+    lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre x_a^b")
+    secondary_lever_arm_m: Vector | None = Field(None, description="second antenna, for dual-antenna heading")
+    leap_seconds: int = Field(18, ge=0, le=60, description="GPS − UTC, only used until the receiver says, for NMEA")
+    datum: str | None = Field(
+        None,
+        min_length=1,
+        description='realisation of its positions, as "EPSG:7912"; absent: WGS 84, realisation unknown; '
+        '"same": the output\'s',
+    )
+
+
+class SignalsConfig(Section):
+    """``[imu.<name>.signals]``: which signal of the DBC is what, as ``MESSAGE.signal``."""
+
+    specific_force: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
+    angular_rate: SignalTriple | None = Field(None, description="three signals, axes of the IMU")
+    sample_ticks: Signal | None = Field(None, description="the device's counter when the sample was taken")
+    pps_ticks: Signal | None = Field(None, description="the counter latched at the last PPS edge")
+    temperature: Signal | None = Field(None, description="°C")
+
+
+class NoiseConfig(Section):
+    """``[imu.<name>.noise]``: for the navigation filter; single keys override the grade."""
+
+    grade: Literal["navigation", "tactical", "mems"] = Field("tactical", description="gives what is absent below")
+    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, le=100.0, description="default: the grade's")
+    velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
+        None, ge=0.0, le=100.0, description="default: the grade's"
+    )
+    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    accel_bias_mg: float | None = Field(None, ge=0.0, le=1_000.0, description="default: the grade's")
+    bias_correlation_h: float | None = Field(None, gt=0.0, le=10_000.0, description="default: the grade's")
+    gyro_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    accel_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+
+
+class ImuConfig(Section):
+    """``[imu.<name>]``: an inertial measurement unit."""
+
+    transport: Text = Field(description="can:<interface>:<channel>?…, serial:… or gnss:<name> (inside that stream)")
+    protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
+    dbc: Text | None = Field(None, description="the DBC file, relative to this file")
+    rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
+    rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
+    tick_hz: float = Field(
+        1_000_000.0, gt=0.0, le=1e12, description="of its counters; they wrap at their signals' width"
+    )
+    pps: Name | None = Field(None, description="name of the [pps.<name>] its latched counter follows")
+    sample: Literal["mean", "instant", "increment"] = Field(
+        "mean", description="mean over the interval, instant value, or increment (delta velocity, delta angle)"
+    )
+    stamp: Literal["end", "middle", "start"] = Field("end", description="what of the interval the stamp is")
+    group: Literal["last", "first"] = Field(
+        "last", description="the message with sample_ticks closes (last) or opens (first) a sample"
+    )
+    signals: SignalsConfig | None = Field(None, description="the map of the DBC's signals")
+    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="for the navigation filter")
+
+
+class GeometryConfig(Section):
+    """``[scanner.<name>.geometry]``: how the beam is deflected."""
+
+    type: Literal["oscillating", "polygon", "monogon", "nutating", "fibre", "risley"] | None = Field(
+        None, description="srep: the kind of deflection"
+    )
+    facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
+    file: Text | None = Field(None, description="the device's own table (beam angles, metadata), relative to this file")
+
+    @model_validator(mode="after")
+    def _polygon_has_facets(self) -> Self:
+        if self.type == "polygon" and self.facets is None:
+            raise ValueError('type = "polygon" needs facets = <number of facets>')
+        if self.type != "polygon" and self.facets is not None:
+            raise ValueError('facets belongs to type = "polygon" only')
+        return self
+
+
+class GimbalStage(Section):
+    """One stage of a gimbal, outermost first (FORMULAS 2.1, NGA Eq. 3)."""
+
+    angles_deg: Vector = Field(default_factory=_zero_vector, description="fixed roll, pitch, yaw of the stage")
+    lever_arm_m: Vector = Field(
+        default_factory=_zero_vector, description="from this stage's centre to the next inner one"
+    )
+    source: str | None = Field(
+        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of angles"
+    )
+
+
+class GimbalConfig(Section):
+    """``[scanner.<name>.gimbal]``: a stabilised or pointed mount."""
+
+    stages: list[GimbalStage] = Field(min_length=1, max_length=4, description="outermost first")
+
+
+class ScannerConfig(Section):
+    """``[scanner.<name>]``: a laser scanner."""
+
+    transport: Text = Field(description="udp:<address>:<port>?group=…&source=…")
+    auxiliary: Text | None = Field(None, description="the same head's position, IMU or GPS packets")
+    protocol: Text = Field(description="srep, velodyne-vlp16, … (`swath devices` lists them)")
+    pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this head")
+    model: str = Field("", description="maker's type; a calibration of another is refused")
+    serial: str = Field("", description="serial number; a calibration of another is refused")
+    mirror_factor: float | None = Field(
+        None, ge=-4.0, le=4.0, description="beam angle per encoder angle; srep: mandatory (2 flat mirror, 1 monogon)"
+    )
+    installation: Matrix | None = Field(
+        None, description="T, b from s, rows of the matrix; mandatory for spinning heads, else identity"
+    )
+    calibration: Text | None = Field(None, description="calibration file, relative to this file")
+    lever_arm_m: Vector = Field(default_factory=_zero_vector, description="x_s^b, when no calibration file gives it")
+    range_min_m: float = Field(0.0, ge=0.0, le=100_000.0, description="nearer returns are left out of products")
+    range_max_m: float = Field(10_000.0, gt=0.0, le=100_000.0, description="farther returns are left out of products")
+    geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
+    gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError(f"range_min_m {self.range_min_m:g} is not below range_max_m {self.range_max_m:g}")
+        if self.mirror_factor == 0.0:
+            raise ValueError("mirror_factor is 0; want 2 for a flat mirror turned in its plane, 1 for a 45° mirror")
+        return self
+
+
+class AttitudeConfig(Section):
+    """``[attitude]``: what vertical the attitude refers to."""
+
+    vertical: Literal["ellipsoid", "plumb"] = Field("ellipsoid", description="plumb needs the two keys below")
+    xi_arcsec: float | None = Field(None, ge=-120.0, le=120.0, description="deflection of the vertical, north")
+    eta_arcsec: float | None = Field(None, ge=-120.0, le=120.0, description="deflection of the vertical, east")
+
+    @model_validator(mode="after")
+    def _plumb_has_deflection(self) -> Self:
+        given = [key for key in ("xi_arcsec", "eta_arcsec") if getattr(self, key) is not None]
+        if self.vertical == "plumb" and len(given) < 2:
+            raise ValueError('vertical = "plumb" needs xi_arcsec and eta_arcsec')
+        if self.vertical == "ellipsoid" and given:
+            raise ValueError(f'{given[0]} belongs to vertical = "plumb" only')
+        return self
+
+
+class AtmosphereConfig(Section):
+    """``[atmosphere]``: the air between the scanner and the ground."""
+
+    ranges: Literal["corrected", "vacuum"] = Field(
+        "corrected", description="corrected: by the device; vacuum: correct by the model below"
+    )
+    model: Literal["standard", "measured"] = Field("standard", description="standard atmosphere, or the values below")
+    temperature_c: float = Field(15.0, ge=-80.0, le=60.0, description="at height_m, for measured")
+    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0, description="at height_m, for measured")
+    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="relative, for measured")
+    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="where it was measured")
+    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="bending of the beam")
+
+
+class MtaConfig(Section):
+    """``[mta]``: pulses in air."""
+
+    terrain: str = Field("", description="coarse DEM, relative to this file; empty: continuity")
+
+
+class ProfileConfig(Section):
+    """``[profile]``: names for the records."""
+
+    aircraft: str = Field("", description="the aircraft")
+    installation: str = Field("", description="id of this mounting")
+
+
+class OutputConfig(Section):
+    """``[output]``: the mapping frame."""
+
+    crs: str | None = Field(None, min_length=1, description="any PROJ CRS; two-dimensional: ellipsoidal heights")
+    epoch: float | None = Field(None, ge=1900.0, le=2200.0, description="coordinate epoch (year), for dynamic datums")
+
+
+class Tables(Section):
+    """The whole file."""
+
+    session: SessionConfig
+    pps: dict[Name, PpsConfig] = Field(default_factory=dict)
+    gnss: dict[Name, GnssConfig] = Field(default_factory=dict)
+    imu: dict[Name, ImuConfig] = Field(default_factory=dict)
+    scanner: dict[Name, ScannerConfig] = Field(default_factory=dict)
+    attitude: AttitudeConfig = Field(default_factory=AttitudeConfig)
+    atmosphere: AtmosphereConfig = Field(default_factory=AtmosphereConfig)
+    mta: MtaConfig = Field(default_factory=MtaConfig)
+    profile: ProfileConfig = Field(default_factory=ProfileConfig)
+    output: OutputConfig = Field(default_factory=OutputConfig)

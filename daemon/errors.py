@@ -1,0 +1,32 @@
+"""Errors a user can mend, each one line, and the exit codes of every command."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """What a command's exit status says."""
+
+    OK = 0
+    PROBLEM = 1  # the job ran and found a problem
+    USAGE = 2  # wrong configuration or wrong use
+    IO = 3  # cannot read or write: no such file, log directory not writable
+    DAMAGE = 4  # data is damaged
+
+
+class UserError(Exception):
+    """Something the user can mend: printed as ``swath: <message>``, each line of the message by itself."""
+
+    def __init__(self, message: str, exit_code: ExitCode = ExitCode.PROBLEM) -> None:
+        super().__init__(message)
+        self.message = message
+        self.exit_code = exit_code
+
+
+class ConfigError(UserError):
+    """The configuration is wrong; one line an error: file, key, what was got, what would be right."""
+
+    def __init__(self, lines: str | list[str]) -> None:
+        self.lines = [lines] if isinstance(lines, str) else list(lines)
+        super().__init__("\n".join(self.lines), ExitCode.USAGE)
