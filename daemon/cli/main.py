@@ -1,40 +1,42 @@
-"""The command line: `swath COMMAND`, one file a command, loaded when it is asked for.
+"""The command line: `swath COMMAND`, one file a command.
 
-Errors are one line on stderr; no traceback reaches a user.
+Every error is one line on stderr. No traceback reaches a user: an internal error is written to a file that the
+line names.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import importlib.util
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
 
-import click
 import typer
-from typer.core import TyperGroup
 
 from daemon.errors import ExitCode, UserError
 
-if TYPE_CHECKING:
-    from click import Command, Context
-
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 
+HELP = """Airborne laser scanning: from the sensors' wires into a log that survives.
+
+`swath run CONFIG` records; `swath check CONFIG` says before the flight what every device answers.
+"""
 EPILOG = (
-    "Exit codes: 0 ok · 1 the job found a problem · 2 wrong configuration or usage · "
-    "3 cannot read or write · 4 data is damaged · 130 interrupted"
+    "Exit codes: 0 ok, 1 the job found a problem, 2 wrong configuration or usage, 3 cannot read or write, "
+    "4 data is damaged, 130 interrupted. `swath COMMAND --help` says more of a command."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """A command as the help lists it: its file is not imported for that."""
+    """A command: its name, its line and its panel in the help."""
 
     name: str
     summary: str
@@ -42,36 +44,108 @@ class Listed:
 
     @property
     def module(self) -> str:
-        """Where the command is."""
+        """The file it is in."""
         return f"daemon.cli.{self.name.replace('-', '_')}"
 
 
 COMMANDS = (
-    Listed("run", "Record: every byte of the configured sensors into a log.", "Record"),
-    Listed("check", "Open every configured device and say what it answers.", "Record"),
-    Listed("info", "What a log holds: duration, counts, rates, gaps, losses, time status.", "Logs"),
-    Listed("replay", "Put the bytes of a log back on the wires.", "Logs"),
-    Listed("recover", "Repair a log that a crash left open; say exactly what was lost.", "Logs"),
-    Listed("devices", "List the protocols there are and what each yields.", "Setup"),
+    Listed("run", "Record every byte of the configured sensors.", "Record"),
+    Listed("check", "Validate a configuration; open every device and say what it answers.", "Record"),
+    Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
+    Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
+    Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 
 
-def _is_there(listed: Listed) -> bool:
-    return (Path(__file__).parent / f"{listed.module.rpartition('.')[2]}.py").exists()
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"swath {importlib.metadata.version('swath')}")
+        raise typer.Exit
 
 
-class LazyGroup(TyperGroup):
-    """Lists the commands without importing their files."""
+def _callback(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version and leave.")
+    ] = False,
+) -> None:
+    """Options of `swath` itself."""
 
-    def list_commands(self, ctx: Context) -> list[str]:
-        """Names in the order of the help."""
-        return [listed.name for listed in COMMANDS if _is_there(listed)]
 
-    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
-        """A command: a placeholder for the help's list, the real one otherwise."""
-        listed = next((listed for listed in COMMANDS if listed.name == cmd_name and _is_there(listed)), None)
-        if listed is None:
-            return None
-        if getattr(ctx, "listing", False):
-            return _placeholder(listed)
-        return load_command(listed)
+def make_app() -> typer.Typer:
+    """The application with every command whose file there is; a command's file imports what is heavy when it runs."""
+    made = typer.Typer(
+        name="swath", help=HELP, epilog=EPILOG, no_args_is_help=True, add_completion=False, rich_markup_mode="markdown"
+    )
+    made.callback(help=HELP, epilog=EPILOG)(_callback)
+    for listed in COMMANDS:
+        if importlib.util.find_spec(listed.module) is not None:
+            command = importlib.import_module(listed.module).command
+            made.command(listed.name, short_help=listed.summary, rich_help_panel=listed.panel)(command)
+    return made
+
+
+app = make_app()
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code."""
+    sys.exit(run_app(sys.argv[1:]))
+
+
+def run_app(arguments: list[str]) -> int:
+    """Run a command; every way it can end becomes an exit code and at most a line an error."""
+    try:
+        result = app(args=arguments, prog_name="swath", standalone_mode=False)
+        sys.stdout.flush()
+    except UserError as error:
+        _say(*error.message.splitlines())
+        return int(error.exit_code)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        return int(ExitCode.PROBLEM)
+    except Exception as error:  # the last resort: everything a command did not foresee
+        return _end_unforeseen(error)
+    return int(result) if isinstance(result, int) else int(ExitCode.OK)
+
+
+def _end_unforeseen(error: Exception) -> int:
+    """A usage error of the argument parser, an abort, an I/O error, or a defect of ours."""
+    format_message = getattr(error, "format_message", None)  # its class moved between versions of typer
+    if callable(format_message):
+        message = " ".join(str(format_message()).split())
+        if message and type(error).__name__ != "NoArgsIsHelpError":
+            context = getattr(error, "ctx", None)
+            _say(f"{message.rstrip('.')}; see `{context.command_path if context else 'swath'} --help`")
+        return int(ExitCode.USAGE)
+    if isinstance(error, typer.Abort):
+        return INTERRUPTED
+    path = _write_traceback(error)
+    what = f"{type(error).__name__}: {error}".splitlines()[0]
+    _say(f"internal error: {what} (details in {path})" if path else f"internal error: {what}")
+    return int(ExitCode.IO if isinstance(error, OSError) else ExitCode.PROBLEM)
+
+
+def _write_traceback(error: Exception) -> Path | None:
+    """Keep the details where a user may find them: the service's state directory, else the temporary one."""
+    directory = os.environ.get("STATE_DIRECTORY", "").split(":")[0] or tempfile.gettempdir()
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=f"swath-error-{stamp}-", suffix=".txt", dir=directory)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+            stream.write(f"swath {' '.join(sys.argv[1:])}\n")
+            traceback.print_exception(error, file=stream)
+    except OSError:
+        return None
+    return Path(name)
+
+
+def _say(*lines: str) -> None:
+    for line in lines:
+        print(f"swath: {line}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

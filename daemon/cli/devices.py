@@ -1,0 +1,55 @@
+"""`swath devices`: the protocols there are."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from drivers.core.parser import Driver
+
+
+def describe_driver(driver: Driver) -> dict[str, Any]:
+    """A driver as plain values, the form of ``--json``."""
+    return {
+        "protocol": driver.protocol,
+        "kind": driver.kind,
+        "transports": list(driver.transports),
+        "yields": [record.__name__ for record in driver.yields],
+        "gives_time": driver.make_time_parser is not None,
+        "names_edge": str(driver.names_edge) if driver.names_edge is not None else None,
+        "needs": list(driver.needs),
+        "summary": driver.summary,
+    }
+
+
+def command(
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """List the protocols there are: how they come, what they yield, what the configuration must say."""
+    from drivers.core.registry import KINDS, all_drivers
+
+    listed = [describe_driver(driver) for kind in KINDS for driver in all_drivers(kind).values()]
+    if as_json:
+        print(json.dumps({"devices": listed}, indent=2))
+        return
+    _print_table(listed)
+
+
+def _print_table(listed: list[dict[str, Any]]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in ("kind", "protocol", "by", "yields", "needs", ""):
+        table.add_column(title, no_wrap=title in ("kind", "protocol"))
+    kind = ""
+    for row in listed:
+        first = row["kind"] if row["kind"] != kind else ""
+        kind = row["kind"]
+        cells = [", ".join(row[key]) for key in ("transports", "yields", "needs")]
+        table.add_row(first, row["protocol"], *cells, row["summary"])
+    Console().print(table)
