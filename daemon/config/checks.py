@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from drivers.transports.uri import TransportSpec
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig
+WILDCARD = "0.0.0.0"
 ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
 
 
@@ -124,7 +125,7 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
     try:
         spec = parse_transport(table.transport)
     except ValueError as error:
-        yield f"{section}.transport: {error}"
+        yield f"{section}.{error}"
     else:
         if spec.kind not in driver.transports:
             yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
@@ -203,24 +204,31 @@ def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
 def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
     """Whether two transports would open the same port or device.
 
-    UDP ports are one where the addresses are equal or either is the wildcard; serial devices where their real paths
-    are; a CAN bus where interface and channel are.
+    UDP ports are one where the addresses (or groups) are equal or either is the wildcard; devices where their real
+    paths are, also a serial CAN adapter's; a CAN bus where interface and channel are.
     """
-    if one.kind != other.kind:
-        return False
-    if one.kind == "serial":
-        return os.path.realpath(one.address) == os.path.realpath(other.address)
-    if one.kind == "udp":
-        host, _, port = one.address.rpartition(":")
-        other_host, _, other_port = other.address.rpartition(":")
-        wild = {"", "0.0.0.0", "[::]", "::", "*"}
-        return int(port) == int(other_port) and (host == other_host or host in wild or other_host in wild)
-    return one.address == other.address
+    if one.kind == "udp" and other.kind == "udp":
+        addresses = {_udp_address(one), _udp_address(other)}
+        return one.port == other.port and (len(addresses) == 1 or WILDCARD in addresses)
+    path, other_path = _device_path(one), _device_path(other)
+    if path is not None or other_path is not None:
+        return path == other_path
+    return one.kind == other.kind and one.address == other.address
+
+
+def _udp_address(spec: TransportSpec) -> str:
+    return spec.options.get("group", spec.host)
+
+
+def _device_path(spec: TransportSpec) -> str | None:
+    """The real path of a device file, behind symbolic links; None where the transport is none."""
+    path = spec.channel if spec.kind == "can" else spec.address
+    is_path = spec.kind == "serial" or (spec.kind == "can" and path.startswith("/"))
+    return os.path.realpath(path) if is_path else None
 
 
 def _wire_name(spec: TransportSpec) -> str:
     if spec.kind == "udp":
-        return f"UDP port {spec.address.rpartition(':')[2]}"
-    if spec.kind == "serial":
-        return f"the device {os.path.realpath(spec.address)}"
-    return f"the CAN bus {spec.address}"
+        return f"UDP port {spec.port}"
+    path = _device_path(spec)
+    return f"the device {path}" if path else f"the CAN bus {spec.address}"

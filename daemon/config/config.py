@@ -147,7 +147,7 @@ class Config:
             OSError: a file cannot be read.
         """
         files = self.files_of(table)
-        contents = {key: files[key].read_bytes() for key in PARSER_FILES if key in files}
+        contents: dict[str, bytes] = {key: files[key].read_bytes() for key in PARSER_FILES if key in files}
         return DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
 
     def devices(self) -> Iterator[DeviceEntry]:
