@@ -20,19 +20,27 @@ class Gate:
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._lock = threading.Lock()
         self._open = True
+        self.woken = False
         self._fd = fd
         self._poll = select.poll()
         if fd >= 0:
             self._poll.register(fd, events)
         self._poll.register(self._wake_fd, select.POLLIN)
+        self._wake_poll = select.poll()
+        self._wake_poll.register(self._wake_fd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> int:
         """Poll events of the descriptor; 0 when the time is over or the gate was woken."""
         ready = dict(self._poll.poll(max(0.0, timeout_s) * 1000.0))
         return 0 if self._wake_fd in ready else ready.get(self._fd, 0)
 
+    def pause(self, time_s: float) -> None:
+        """Let time pass, whatever the descriptor has, until the gate is woken."""
+        self._wake_poll.poll(max(0.0, time_s) * 1000.0)
+
     def wake(self) -> None:
         """Let every present and coming `wait` return at once."""
+        self.woken = True
         with self._lock:
             if self._open:
                 os.eventfd_write(self._wake_fd, 1)

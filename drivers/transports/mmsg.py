@@ -142,11 +142,11 @@ class DropCounter:
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
-        self._last = self._kernel_count()
+        self._last = 0
         self.total = 0
 
     def update(self) -> int:
-        """The exact total since the counter was made."""
+        """The exact total since the socket was made."""
         count = self._kernel_count()
         self.total += (count - self._last) & 0xFFFFFFFF
         self._last = count

@@ -239,10 +239,18 @@ def open_transport(spec: TransportSpec) -> Transport:
 
         return SerialTransport(spec)
     if spec.kind == "can":
-        from drivers.transports.can_bus import PythonCanTransport, SocketCanTransport
-
-        return SocketCanTransport(spec) if spec.interface == "socketcan" else PythonCanTransport(spec)
+        return _open_can(spec)
     raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
+
+
+def _open_can(spec: TransportSpec) -> Transport:
+    if spec.interface == "socketcan":
+        from drivers.transports.can_socket import SocketCanTransport
+
+        return SocketCanTransport(spec)
+    from drivers.transports.can_bus import PythonCanTransport
+
+    return PythonCanTransport(spec)
 
 
 def parse_pps(text: str, edge: str = "assert") -> PpsSource:

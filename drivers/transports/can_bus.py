@@ -1,0 +1,214 @@
+"""CAN through python-can: every interface it has, save SocketCAN, which has a way of its own.
+
+python-can gives messages, one Python object each; they become SocketCAN frames here, so that a log holds the same
+whatever adapter was used. Where the interface is a datagram socket (udp_multicast) the kernel's stamps and its count of
+drops are used as for UDP; other adapters' stamps are of their own clocks or of the host's read, and are not handed
+over.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import time
+from typing import Any
+
+import can
+import numpy as np
+
+from drivers.transports.base import TransportError, UnitBlock
+from drivers.transports.can_frame import ERROR_BUS_OFF, pack_frame, unpack_frame
+from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
+from drivers.transports.mmsg import DropCounter, ask_receive_buffer
+from drivers.transports.uri import TransportSpec
+
+KERNEL_STAMPED = frozenset({"udp_multicast"})
+MAX_FRAMES = 1000  # bounds one receive
+SLICE_S = 0.1  # a bus without a descriptor is asked in slices, so that a close from outside is noticed
+BUFFER_BYTES = 4 << 20
+SEND_TIMEOUT_S = 1.0
+
+_UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+_WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+
+
+def keyword_value(text: str) -> int | float | bool | str:
+    """An option's text as python-can's interfaces expect it: whole number, number, yes or no, else as it stands."""
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    try:
+        return int(text, 0)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+class PythonCanTransport(DescriptorTransport):
+    """One bus of python-can; a unit is a frame of 16 or 72 bytes.
+
+    Args:
+        spec: ``can:<interface>:<channel>``; every option is a keyword of that interface's bus.
+    """
+
+    def __init__(self, spec: TransportSpec) -> None:
+        super().__init__(spec.text or f"can:{spec.address}")
+        self._spec = spec
+        self._kernel_stamped = spec.interface in KERNEL_STAMPED
+        self._bus: can.BusABC | None = None
+        self._fd = -1
+        self._sock: socket.socket | None = None
+        self._drops: DropCounter | None = None
+
+    def _open_device(self) -> int:
+        keywords: dict[str, Any] = {key: keyword_value(value) for key, value in self._spec.options.items()}
+        spec = self._spec
+        try:
+            self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
+        except (can.CanError, OSError, ImportError, *_UNREADABLE) as error:
+            raise TransportError(f"{self.name}: cannot open the CAN bus: {_one_line(error)}") from error
+        self._fd = _descriptor(self._bus)
+        self._watch_socket()
+        return self._fd
+
+    def _watch_socket(self) -> None:
+        """A bus on a datagram socket gets a larger buffer and its drops are counted."""
+        if self._fd < 0 or not stat.S_ISSOCK(os.fstat(self._fd).st_mode):
+            return
+        sock = socket.socket(fileno=os.dup(self._fd))
+        if sock.type != socket.SOCK_DGRAM:
+            sock.close()
+            return
+        self._sock = sock
+        self.counters.receive_buffer_asked_bytes = BUFFER_BYTES
+        self.counters.receive_buffer_bytes = ask_receive_buffer(sock, BUFFER_BYTES)
+        self._drops = DropCounter(sock)
+
+    def _close_device(self) -> None:
+        if self._sock is not None:
+            self._sock.close()
+            self._sock = self._drops = None
+        bus, self._bus = self._bus, None
+        if bus is None:
+            return
+        try:
+            bus.shutdown()
+        except (can.CanError, OSError):  # slcan says goodbye to its device, which may have gone
+            port = getattr(bus, "serialPortOrig", None)
+            if port is not None:
+                port.close()
+
+    def _refresh_counters(self) -> None:
+        if self._drops is not None:
+            self.counters.lost_kernel = self._drops.update()
+
+    def _receive(self, gate: Gate, timeout_s: float) -> list[UnitBlock]:
+        frames: list[bytes] = []
+        stamps: list[int] = []
+        for message in self._messages(gate, timeout_s):
+            try:
+                frames.append(pack_frame(message))
+            except ValueError:
+                self.counters.refused += 1
+                continue
+            stamps.append(round(message.timestamp * 1e9))
+            if message.is_error_frame:
+                self.counters.error_frames += 1
+                self.counters.bus_off += bool(message.arbitration_id & ERROR_BUS_OFF)
+        return _blocks(frames, stamps if self._kernel_stamped else None)
+
+    def _messages(self, gate: Gate, timeout_s: float) -> list[can.Message]:
+        """What the bus has, after waiting for the first."""
+        messages: list[can.Message] = []
+        if self._fd >= 0:
+            events = gate.wait(timeout_s)
+            if not events:
+                return []
+        else:
+            messages += self._first_in_slices(gate, timeout_s)
+            if not messages:
+                return []
+            events = 0
+        refused = self.counters.refused
+        while len(messages) < MAX_FRAMES:
+            message = self._read(0.0)
+            if message is None:
+                break
+            messages.append(message)
+        if events & HUNG_UP and not messages and self.counters.refused == refused:
+            raise TransportError(f"{self.name}: the CAN adapter has gone")
+        return messages
+
+    def _first_in_slices(self, gate: Gate, timeout_s: float) -> list[can.Message]:
+        deadline_s = time.monotonic() + timeout_s
+        while not gate.woken:
+            left_s = deadline_s - time.monotonic()
+            message = self._read(min(max(left_s, 0.0), SLICE_S))
+            if message is not None:
+                return [message]
+            if left_s <= 0:
+                break
+        return []
+
+    def _read(self, timeout_s: float) -> can.Message | None:
+        """One message; None on silence or on input nobody can read, which is counted."""
+        assert self._bus is not None
+        try:
+            return self._bus.recv(timeout_s)
+        except can.CanError as error:
+            if not isinstance(error.__cause__, _UNREADABLE):
+                raise TransportError(f"{self.name}: the CAN bus failed: {_one_line(error)}") from error
+            self._refuse()
+        except OSError as error:
+            raise TransportError(f"{self.name}: the CAN bus failed: {_one_line(error)}") from error
+        except _UNREADABLE:
+            self._refuse()
+        return None
+
+    def _refuse(self) -> None:
+        """Count input nobody can read; slcan keeps an undecodable line unless it is told to flush."""
+        self.counters.refused += 1
+        flush = getattr(self._bus, "flush", None)
+        if flush is not None:
+            flush()
+
+    def _send(self, data: bytes) -> None:
+        assert self._bus is not None
+        message = unpack_frame(data)
+        message.timestamp = time.time()  # udp_multicast sends it along
+        try:
+            self._bus.send(message, timeout=SEND_TIMEOUT_S)
+        except (can.CanError, OSError) as error:
+            raise TransportError(f"{self.name}: sending failed: {_one_line(error)}") from error
+
+
+def _descriptor(bus: can.BusABC) -> int:
+    try:
+        return int(bus.fileno())
+    except (NotImplementedError, can.CanError):
+        return -1
+
+
+def _one_line(error: BaseException) -> str:
+    """The error's text and, where it hides what happened, that of its cause."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    cause = error.__cause__
+    reason = "" if cause is None else " ".join(str(cause).split())
+    return text if not reason or reason in text else f"{text}: {reason}"
+
+
+def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:
+    """Runs of equal length, in order."""
+    blocks: list[UnitBlock] = []
+    first = 0
+    for last in range(1, len(frames) + 1):
+        if last < len(frames) and len(frames[last]) == len(frames[first]):
+            continue
+        units = np.frombuffer(b"".join(frames[first:last]), np.uint8).reshape(last - first, len(frames[first]))
+        realtime_ns = None if stamps is None else np.array(stamps[first:last], np.int64)
+        blocks.append(UnitBlock(units, realtime_ns))
+        first = last
+    return blocks

@@ -1,0 +1,128 @@
+"""PPS on a serial port's DCD line, waited for with TIOCMIWAIT and stamped right after the wake-up.
+
+The wait cannot be ended from outside, neither by closing the port nor by a time limit. It is therefore made in a
+thread of its own, which owns its descriptor and ends with the next edge or with the device; `close` lets it go and
+returns at once. Stamps are 40 to 60 µs late and more on a busy machine: a kernel PPS (``ldattach PPS``) is better.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import queue
+import struct
+import termios
+import threading
+import time
+
+from drivers.transports.base import PpsSource, RawEdge, TransportError
+
+_TIOCMIWAIT = 0x545C  # <asm-generic/ioctls.h>
+_TIOCGICOUNT = 0x545D
+_ICOUNTER_DCD = struct.Struct("@12xi64x")  # field dcd of struct serial_icounter_struct, <linux/serial.h>
+
+
+class SerialDcdPps(PpsSource):
+    """Edges of DCD; the line raised is "assert"."""
+
+    def __init__(self, path: str, edge: str = "assert") -> None:
+        self._path = path
+        self._edge = edge
+        self._watch: _Watch | None = None
+
+    def open(self) -> None:
+        """Open the port without touching its settings and begin to wait.
+
+        Raises:
+            TransportError: absent, not permitted, or a port without modem lines.
+        """
+        if self._watch is not None:
+            raise TransportError(f"serial-dcd:{self._path}: is open already")
+        try:
+            fd = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise TransportError(self._why(error)) from error
+        try:
+            _carrier(fd)
+            changes = _dcd_changes(fd)
+        except OSError as error:
+            os.close(fd)
+            raise TransportError(self._why(error)) from error
+        self._watch = _Watch(fd, changes)
+        threading.Thread(target=self._watch.run, name=f"dcd {self._path}", daemon=True).start()
+
+    def _why(self, error: OSError) -> str:
+        name = f"serial-dcd:{self._path}"
+        if error.errno == errno.ENOENT:
+            return f"{name}: there is no {self._path}"
+        if error.errno in (errno.EACCES, errno.EPERM):
+            return f"{name}: {self._path} is not permitted to this user; add it to the group dialout"
+        if error.errno in (errno.ENOTTY, errno.EINVAL):
+            return f"{name}: {self._path} has no DCD line to wait on (TIOCMIWAIT); a real serial port has one"
+        return f"{name}: {self._path} failed: {error.strerror}"
+
+    def receive(self, timeout_s: float) -> list[RawEdge]:
+        """See `PpsSource.receive`."""
+        watch = self._watch
+        if watch is None:
+            raise TransportError(f"serial-dcd:{self._path}: is closed")
+        try:
+            item = watch.edges.get(timeout=max(timeout_s, 0.0)) if timeout_s > 0 else watch.edges.get_nowait()
+        except queue.Empty:
+            return []
+        if isinstance(item, OSError):
+            raise TransportError(self._why(item)) from item
+        return [item] if item is not None and item.edge == self._edge else []
+
+    def close(self) -> None:
+        """Let the waiting thread go; a `receive` under way returns."""
+        watch, self._watch = self._watch, None
+        if watch is not None:
+            watch.stopped.set()
+            watch.edges.put(None)
+
+
+class _Watch:
+    """The thread that waits, and its descriptor."""
+
+    def __init__(self, fd: int, changes: int) -> None:
+        self._fd = fd
+        self._changes = changes
+        self.stopped = threading.Event()
+        self.edges: queue.SimpleQueue[RawEdge | OSError | None] = queue.SimpleQueue()
+
+    def run(self) -> None:
+        try:
+            while not self.stopped.is_set():
+                fcntl.ioctl(self._fd, _TIOCMIWAIT, termios.TIOCM_CAR)
+                realtime_ns = time.clock_gettime_ns(time.CLOCK_REALTIME)
+                changes = _dcd_changes(self._fd)
+                edge, sequence = edge_at_wake_up(self._changes, changes, _carrier(self._fd))
+                self._changes = changes
+                self.edges.put(RawEdge(realtime_ns, sequence, edge, kernel_stamp=False))
+        except OSError as error:
+            self.edges.put(error)
+        finally:
+            os.close(self._fd)
+
+
+def edge_at_wake_up(changes_before: int, changes: int, carrier: bool) -> tuple[str, int]:
+    """Which edge ended the wait, and its number.
+
+    The driver counts changes of the line. The first change after ``changes_before`` ended the wait; with an odd
+    number of changes since, the line is now where that edge left it, with an even number where it was before. Two
+    changes make a pulse, so that edges of one polarity number without gaps unless one was missed.
+    """
+    happened = max(changes - changes_before, 1)
+    rose = carrier if happened % 2 else not carrier
+    return ("assert" if rose else "clear"), (changes_before + 1) >> 1
+
+
+def _carrier(fd: int) -> bool:
+    lines = int.from_bytes(fcntl.ioctl(fd, termios.TIOCMGET, bytes(4)), "little")
+    return bool(lines & termios.TIOCM_CAR)
+
+
+def _dcd_changes(fd: int) -> int:
+    return int(_ICOUNTER_DCD.unpack(fcntl.ioctl(fd, _TIOCGICOUNT, bytes(_ICOUNTER_DCD.size)))[0])
