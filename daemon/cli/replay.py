@@ -25,7 +25,7 @@ def command(
     from daemon.wire_player import PlayReport, play
 
     if pace <= 0:
-        raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.CONFIG)
+        raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
     sessions = open_logs(logs)
     console = Console(stderr=True)

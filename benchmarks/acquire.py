@@ -1,0 +1,258 @@
+"""What recording costs: CPU of the recorder's process, losses and memory, beside the machine's own limits.
+
+python -m benchmarks.acquire [--seconds 60] [--json FILE]
+
+The limit beside each figure is what the bare building blocks cost in the same run: recvmmsg into slots and one
+writev a batch to a file, without stamps, log format, checksums or index. Sender and receiver share the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from daemon.log.reader import open_logs
+
+TICKS = os.sysconf("SC_CLK_TCK")
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass
+class Figure:
+    """One line of the table."""
+
+    name: str
+    sent: int
+    recorded: int
+    cpu_percent: float
+    limit_cpu_percent: float | None
+    rss_mb: float
+    note: str = ""
+
+
+def cpu_s(pid: int) -> float:
+    """User and system seconds of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def rss_mb(pid: int) -> float:
+    """Resident megabytes of a process now."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 1e6
+
+
+def free_port() -> int:
+    """A UDP port nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextlib.contextmanager
+def recorder(folder: Path, tables: str) -> Iterator[subprocess.Popen[bytes]]:
+    """``swath run`` on a configuration, ready when given, ended cleanly when left."""
+    config = folder / "swath.toml"
+    logs = folder / "logs"
+    config.write_text(f'[session]\nname = "bench"\ndirectory = "{logs}"\nreserve_mb = 1\n{tables}')
+    with (folder / "stderr.txt").open("w") as stderr:
+        process = subprocess.Popen([sys.executable, "-m", "daemon.cli.main", "run", str(config)], stderr=stderr)
+    try:
+        while not (logs / "recording.json").exists():
+            if process.poll() is not None:
+                raise SystemExit((folder / "stderr.txt").read_text())
+            time.sleep(0.05)
+        time.sleep(1.0)
+        yield process
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+
+
+def sender(*words: object) -> subprocess.Popen[str]:
+    """A sender process."""
+    command = [sys.executable, "-m", "benchmarks.senders", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def scanner_table(port: int) -> str:
+    """A scanner on a port."""
+    return f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+
+
+def last_status(folder: Path) -> dict[str, dict[str, int]]:
+    """The newest status of each source in the log."""
+    statuses: dict[str, dict[str, int]] = {}
+    for session in open_logs([folder / "logs"]):
+        for batch in session.batches(lambda topic: topic.startswith("/status/")):
+            statuses[batch.channel.topic.removeprefix("/status/")] = json.loads(batch.units[-1].tobytes())
+    return statuses
+
+
+def record_udp(length: int, rate: float, seconds: float) -> Figure:
+    """Datagrams to the log."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, port = Path(name), free_port()
+        with recorder(folder, scanner_table(port)) as process:
+            before, started = cpu_s(process.pid), time.monotonic()
+            load = sender("udp", port, length, rate, seconds)
+            highest = 0.0
+            while load.poll() is None:
+                highest = max(highest, rss_mb(process.pid))
+                time.sleep(0.25)
+            cpu = (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
+            assert load.stdout is not None
+            sent_text, took_text = load.stdout.read().split()
+            time.sleep(2.0)
+        status = last_status(folder)["scanner/left"]
+    sent, took = int(sent_text), float(took_text)
+    note = f"{sent / took:,.0f} datagrams/s, {sent * length / took / 1e6:.0f} MB/s"
+    lost = {key: status[key] for key in ("lost_kernel", "lost_queue", "lost_write") if status[key]}
+    return Figure(f"UDP {rate:,.0f} × {length} B/s", sent, status["written"], cpu, None, highest, note + str(lost or ""))
+
+
+BARE = """
+import os, socket, sys, time
+from drivers.transports.mmsg import MessageReader, ask_receive_buffer
+port, path = int(sys.argv[1]), sys.argv[2]
+sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+ask_receive_buffer(sock, 32 << 20)
+sock.bind(("127.0.0.1", port))
+reader = MessageReader(65535, 256, peers=False)
+fd = os.open(path, os.O_WRONLY | os.O_CREAT)
+print("ready", flush=True)
+total = 0
+while True:
+    time.sleep(0.004)
+    while count := reader.read(sock.fileno()):
+        total += count
+        lengths = reader._headers["len"][:count]
+        os.write(fd, reader._units[:count, : int(lengths[0])].copy())
+        if count < reader.slots:
+            break
+"""
+
+
+def bare_udp(length: int, rate: float, seconds: float) -> float:
+    """CPU percent of the building blocks alone."""
+    with tempfile.TemporaryDirectory() as name:
+        port = free_port()
+        command = [sys.executable, "-c", BARE, str(port), f"{name}/raw"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            before, started = cpu_s(process.pid), time.monotonic()
+            sender("udp", port, length, rate, seconds).communicate()
+            return (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def stall(seconds: float) -> Figure:
+    """20 000 datagrams a second while the recorder is stopped for half a second (SIGSTOP)."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, port = Path(name), free_port()
+        with recorder(folder, scanner_table(port)) as process:
+            load = sender("udp", port, 1206, 20000, seconds)
+            time.sleep(seconds / 2)
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(0.5)
+            process.send_signal(signal.SIGCONT)
+            out, _ = load.communicate()
+            time.sleep(2.0)
+        status = last_status(folder)["scanner/left"]
+    granted = status["receive_buffer_bytes"]
+    note = f"receive buffer granted {granted / 1e6:.0f} MB"
+    return Figure("0.5 s stall at 20,000 × 1206 B/s", int(out.split()[0]), status["written"], 0.0, None, 0.0, note)
+
+
+def other_sensors(seconds: float, *, load: bool) -> Figure:
+    """GNSS at 921600 baud through a pty and 1000 CAN frames a second on a udp_multicast bus."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        (folder / "rover").symlink_to(os.ttyname(slave))
+        tables = (
+            f'[gnss.rover]\ntransport = "serial:{folder}/rover?baud=921600"\nprotocol = "nmea"\n'
+            '[imu.main]\ntransport = "can:udp_multicast:239.74.163.99"\nprotocol = "canmod-gps"\n'
+        )
+        with recorder(folder, tables) as process:
+            before, started = cpu_s(process.pid), time.monotonic()
+            sent = 0
+            if load:
+                writer = threading.Thread(target=_write_serial, args=(master, 92160.0, seconds))
+                writer.start()
+                can = sender("can", "239.74.163.99", 1000, seconds)
+                out, _ = can.communicate()
+                writer.join()
+                sent = int(out)
+            else:
+                time.sleep(seconds)
+            cpu = (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
+            memory = rss_mb(process.pid)
+            time.sleep(2.0)
+        os.close(master)
+        os.close(slave)
+        status = last_status(folder)
+    what = "GNSS 921600 baud + CAN 1000 frames/s" if load else "no data at all"
+    note = f"GNSS {status['gnss/rover']['bytes']:,} bytes"
+    return Figure(what, sent, status["imu/main"]["written"], cpu, None, memory, note)
+
+
+def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
+    line = b"$PSWTH," + b"x" * 100 + b"\r\n"
+    sent, start = 0, time.monotonic()
+    while (elapsed := time.monotonic() - start) < seconds:
+        while sent < elapsed * bytes_per_s:
+            sent += os.write(fd, line)
+        time.sleep(0.001)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the two sustained loads")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    arguments = parser.parse_args()
+    figures: list[Figure] = []
+    for length, rate in ((1206, 20000.0), (8448, 5000.0)):
+        figure = record_udp(length, rate, arguments.seconds)
+        figure.limit_cpu_percent = bare_udp(length, rate, min(arguments.seconds, 15.0))
+        figures.append(figure)
+    figure = record_udp(1206, 110000.0, 10.0)
+    figure.limit_cpu_percent = bare_udp(1206, 110000.0, 5.0)
+    figures.append(figure)
+    figures.append(stall(6.0))
+    idle = other_sensors(10.0, load=False)
+    busy = other_sensors(30.0, load=True)
+    busy.note += f"; {busy.cpu_percent - idle.cpu_percent:.1f} points above no data"
+    figures += [idle, busy]
+    print(f"{'load':<38} {'sent':>10} {'recorded':>10} {'CPU %':>6} {'bare %':>7} {'RSS MB':>7}  note")
+    for figure in figures:
+        bare = f"{figure.limit_cpu_percent:7.1f}" if figure.limit_cpu_percent is not None else "      -"
+        print(
+            f"{figure.name:<38} {figure.sent:>10,} {figure.recorded:>10,} {figure.cpu_percent:6.1f} {bare} "
+            f"{figure.rss_mb:7.0f}  {figure.note}"
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(figure) for figure in figures], indent=1))
+
+
+if __name__ == "__main__":
+    main()

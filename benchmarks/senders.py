@@ -1,0 +1,103 @@
+"""Load for the acquisition benchmarks, each sender a process of its own: datagrams by sendmmsg(2), serial, CAN.
+
+python -m benchmarks.senders udp PORT BYTES RATE SECONDS   prints the number sent and the seconds it took
+python -m benchmarks.senders serial PATH BYTES_PER_S SECONDS
+python -m benchmarks.senders can CHANNEL RATE SECONDS
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import socket
+import sys
+import time
+
+import numpy as np
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_SLOTS = 256
+_HEADER = np.dtype(
+    {
+        "names": ["iov", "iovlen"],
+        "formats": [np.uintp, np.uintp],
+        "offsets": [16, 24],
+        "itemsize": 64,
+    }
+)
+_IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
+
+
+def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, float]:
+    """Send numbered datagrams at a rate; (sent, seconds). Each begins with its number, u64 little-endian."""
+    rng = np.random.default_rng(1)
+    units = rng.integers(0, 256, (_SLOTS, length), dtype=np.uint8)
+    numbers = units[:, :8].view("<u8")[:, 0]
+    iovecs = np.zeros(_SLOTS, _IOVEC)
+    iovecs["base"] = units.ctypes.data + np.arange(_SLOTS) * length
+    iovecs["len"] = length
+    headers = np.zeros(_SLOTS, _HEADER)
+    headers["iov"] = iovecs.ctypes.data + np.arange(_SLOTS) * _IOVEC.itemsize
+    headers["iovlen"] = 1
+    sent, at = 0, headers.ctypes.data
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4 << 20)
+        sock.connect(("127.0.0.1", port))
+        fd, start = sock.fileno(), time.monotonic()
+        while (elapsed := time.monotonic() - start) < seconds:
+            due = min(int(elapsed * rate) - sent, _SLOTS)
+            if due <= 0:
+                time.sleep(0.0005)
+                continue
+            numbers[:due] = np.arange(sent, sent + due)
+            count = _libc.sendmmsg(fd, ctypes.c_void_p(at), due, 0)
+            if count < 0:
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+            sent += count
+        return sent, time.monotonic() - start
+
+
+def send_serial(path: str, bytes_per_s: float, seconds: float) -> int:
+    """Write numbered lines at a line's speed; bytes written."""
+    sent, number, start = 0, 0, time.monotonic()
+    fd = os.open(path, os.O_WRONLY | os.O_NOCTTY)
+    try:
+        while (elapsed := time.monotonic() - start) < seconds:
+            while sent < elapsed * bytes_per_s:
+                line = b"$PSWTH,%010d,%s\r\n" % (number, b"x" * 100)
+                os.write(fd, line)
+                sent += len(line)
+                number += 1
+            time.sleep(0.001)
+    finally:
+        os.close(fd)
+    return sent
+
+
+def send_can(channel: str, rate: float, seconds: float) -> int:
+    """Send numbered 8-byte frames on a udp_multicast bus; frames sent."""
+    import can
+
+    sent, start = 0, time.monotonic()
+    with can.Bus(interface="udp_multicast", channel=channel) as bus:
+        while (elapsed := time.monotonic() - start) < seconds:
+            while sent < elapsed * rate:
+                bus.send(can.Message(arbitration_id=0x121, data=sent.to_bytes(8, "little"), is_extended_id=False))
+                sent += 1
+            time.sleep(0.0005)
+    return sent
+
+
+def main() -> None:
+    """Send what the command line says."""
+    kind, *rest = sys.argv[1:]
+    if kind == "udp":
+        print(*send_udp(int(rest[0]), int(rest[1]), float(rest[2]), float(rest[3])))
+    elif kind == "serial":
+        print(send_serial(rest[0], float(rest[1]), float(rest[2])))
+    else:
+        print(send_can(rest[0], float(rest[1]), float(rest[2])))
+
+
+if __name__ == "__main__":
+    main()

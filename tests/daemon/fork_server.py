@@ -1,0 +1,26 @@
+"""Starts recorders by fork, all imports done: a hundred starts cost what one does. A line a recorder, its pid back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from daemon.config import load_config
+from daemon.run import record
+
+
+def main() -> None:
+    """Fork for every configuration named on standard input; children record until they are killed."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    for line in sys.stdin:
+        pid = os.fork()
+        if pid == 0:
+            os._exit(int(record(load_config(Path(line.strip())))))
+        sys.stdout.write(f"{pid}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

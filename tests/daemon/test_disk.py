@@ -1,0 +1,127 @@
+"""A disk that fills up: told at once, counted to the unit, the file whole, and recording again when there is room."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.log_check import official_counts, read_log
+from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+
+SIZE_MB = 24
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own, of 24 MB."""
+    if os.geteuid() != 0:
+        pytest.fail("this test mounts a tmpfs: run it as root")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "swath-test", str(folder)], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def config_of(logs: Path, port: int, reserve_mb: float) -> str:
+    table = session_table(logs, reserve_mb=reserve_mb)
+    return table + f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+
+
+class Flood:
+    """Numbered datagrams of 1206 bytes, about 5 MB/s."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._port = port
+        self.sent = 0
+
+    def send(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for _ in range(20):
+                data = self.sent.to_bytes(8, "little") + os.urandom(1198)
+                self._socket.sendto(data, ("127.0.0.1", self._port))
+                self.sent += 1
+            time.sleep(0.005)
+
+    def send_until(self, condition, timeout_s: float = 60.0) -> None:  # type: ignore[no-untyped-def]
+        end = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end, "not within time"
+            self.send(0.1)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.mark.parametrize(("reserve_mb", "said"), [(8, "disk_reserve"), (0, "write_failed")])
+def test_stops_when_full_and_resumes_when_there_is_room(small_disk: Path, reserve_mb: int, said: str) -> None:
+    """With a reserve it stops before the disk is full; without, the disk's own error stops it. Neither loses count."""
+    port = free_udp_port()
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(6 << 20))
+    flood = Flood(port)
+    logs = small_disk / "logs"
+    with Recorder(small_disk.parent / "rig", config_of(logs, port, reserve_mb)) as recorder:
+        recorder.wait_said("device_opened")
+        flood.send_until(lambda: f"disk {said}" in recorder.stderr())
+        wait_until(lambda: "NOT RECORDING" in recorder.notify.last("STATUS"), "said in STATUS")
+        flood.send(0.5)
+        assert recorder.process.poll() is None
+        filler.unlink()
+        for old in sorted(logs.glob("*.mcap"))[:-1]:
+            old.unlink()
+        flood.send_until(lambda: "disk recording_resumed" in recorder.stderr())
+        flood.send(0.3)
+        time.sleep(1.5)
+        assert recorder.stop() == 0, recorder.stderr()
+    flood.close()
+    content = read_log(logs)
+    status = content.messages["/status/scanner/left"][-1][1]
+    found = [int.from_bytes(data[:8], "little") for _, data in content.units["scanner/left"]]
+    assert status["units"] == flood.sent
+    assert status["lost_write"] > 0
+    assert status["written"] == len(found) == flood.sent - status["lost_write"] - status["lost_kernel"]
+    assert found == sorted(set(found))
+    assert found[-1] == flood.sent - 1
+    assert content.damage == 0
+    for path in logs.glob("*.mcap"):
+        if path.stat().st_size and path.read_bytes().endswith(b"\x89MCAP0\r\n"):
+            assert official_counts(path)["/scanner/left/raw"] > 0
+    if reserve_mb:
+        assert content.events("disk_reserve")
+        assert all(path.read_bytes().endswith(b"\x89MCAP0\r\n") for path in logs.glob("*.mcap"))
+
+
+def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
+    (small_disk / "filler").write_bytes(bytes(20 << 20))
+    port = free_udp_port()
+    logs = small_disk / "logs"
+    with Recorder(small_disk.parent / "rig", config_of(logs, port, 8), watchdog_s=1.0) as recorder:
+        assert "NOT RECORDING" in recorder.notify.last("STATUS")
+        fed = recorder.notify.count("WATCHDOG")
+        time.sleep(4)
+        assert recorder.notify.count("WATCHDOG") > fed + 5
+        (small_disk / "filler").unlink()
+        recorder.wait_said("disk recording_resumed")
+        assert recorder.stop() == 0
+
+
+def test_directory_that_cannot_be_written(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    recorder = Recorder(tmp_path / "rig", config_of(blocked / "logs", free_udp_port(), 1))
+    assert recorder.process.wait(30) == 3
+    recorder.notify.close()
+    (line,) = recorder.stderr().splitlines()
+    assert "session.directory" in line
+    assert str(blocked) in line

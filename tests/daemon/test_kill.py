@@ -1,0 +1,166 @@
+"""kill -9 at a hundred random moments: what was on the wire half a second before is in the log, and the log is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from daemon.log.reader import open_logs
+from daemon.log.recover import recover
+from tests.daemon.log_check import official_counts
+from tests.daemon.rig import free_udp_port, session_table, wait_until
+
+KILLS = 100
+AT_ONCE = 5
+LOSS_S = 0.5
+
+
+class ForkServer:
+    """Recorders on demand."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-m", "tests.daemon.fork_server"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._lock = threading.Lock()
+
+    def start(self, config: Path) -> int:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with self._lock:
+            self._process.stdin.write(f"{config}\n")
+            self._process.stdin.flush()
+            return int(self._process.stdout.readline())
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait(30)
+        self._process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ForkServer]:
+    fork_server = ForkServer()
+    yield fork_server
+    fork_server.close()
+
+
+@dataclass
+class Sent:
+    """Numbered units of each stream with the monotonic second at which each was sent."""
+
+    times: dict[str, list[float]]
+
+
+def send_until(stop: threading.Event, port: int, master: int, fifo: int, sent: Sent) -> None:
+    """A datagram a millisecond, a line every 10 ms, an edge every 100 ms, all numbered."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        number = 0
+        while not stop.is_set():
+            sent.times["scanner"].append(time.monotonic())
+            sock.sendto(number.to_bytes(4, "little") + b"x" * 200, ("127.0.0.1", port))
+            if number % 10 == 0:
+                sent.times["gnss"].append(time.monotonic())
+                os.write(master, b"$P,%08d\r\n" % (number // 10))
+            if number % 100 == 0:
+                sent.times["pps"].append(time.monotonic())
+                os.write(fifo, b"%d %d\n" % (time.time_ns(), number // 100 + 1))
+            number += 1
+            time.sleep(0.001)
+
+
+def record_and_kill(server: ForkServer, folder: Path, after_s: float) -> None:
+    """One recorder, killed in the middle; then what must be true of what it left."""
+    folder.mkdir()
+    port, link, fifo_path, logs = free_udp_port(), folder / "rover", folder / "pps", folder / "logs"
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link.symlink_to(os.ttyname(slave))
+    os.mkfifo(fifo_path)
+    fifo = os.open(fifo_path, os.O_RDWR)
+    config = folder / "swath.toml"
+    config.write_text(
+        session_table(logs)
+        + f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+        + f'[gnss.rover]\ntransport = "serial:{link}"\nprotocol = "nmea"\npps = "main"\n'
+        + f'[pps.main]\nsource = "fixed:{fifo_path}"\n'
+    )
+    pid = server.start(config)
+    wait_until(lambda: (logs / "recording.json").exists(), "recording")
+    stop, sent = threading.Event(), Sent({"scanner": [], "gnss": [], "pps": []})
+    thread = threading.Thread(target=send_until, args=(stop, port, master, fifo, sent))
+    thread.start()
+    time.sleep(after_s)
+    os.kill(pid, signal.SIGKILL)
+    killed = time.monotonic()
+    stop.set()
+    thread.join()
+    for fd in (master, slave, fifo):
+        os.close(fd)
+    check_what_is_left(logs, sent, killed)
+
+
+def check_what_is_left(logs: Path, sent: Sent, killed: float) -> None:
+    """The unrepaired file has every unit sent until half a second before the kill; the recovered one the same."""
+    (path,) = logs.glob("*.mcap")
+    found = numbers_in(path)
+    for stream, times in sent.times.items():
+        # before its port was open, what was sent went nowhere: the stream begins with the first unit found
+        assert found[stream] or times[0] > killed - 2 * LOSS_S, f"{stream}: nothing of {len(times)} units"
+        if not found[stream]:
+            continue
+        expected = [n for n, at in enumerate(times) if n >= found[stream][0] and at < killed - LOSS_S]
+        missing = set(expected) - set(found[stream])
+        assert not missing, f"{stream}: {len(missing)} units sent before {LOSS_S} s before the kill are missing"
+    report = recover(path)
+    recovered = path.with_suffix(".recovered.mcap")
+    assert report is not None
+    assert numbers_in(recovered) == found
+    assert sum(official_counts(recovered).values()) >= sum(map(len, found.values()))
+
+
+def numbers_in(path: Path) -> dict[str, list[int]]:
+    """The numbers of each stream's units in a log."""
+    found: dict[str, list[int]] = {"scanner": [], "pps": []}
+    text = b""
+    for session in open_logs([path]):
+        for batch in session.batches():
+            for row in batch.units:
+                data = row.tobytes()
+                if batch.channel.topic.startswith("/scanner"):
+                    found["scanner"].append(int.from_bytes(data[:4], "little"))
+                elif batch.channel.topic.startswith("/pps"):
+                    found["pps"].append(json.loads(data)["sequence"] - 1)
+                elif batch.channel.topic == "/gnss/rover/raw":
+                    text += data
+    lines = text.split(b"\r\n")[:-1]
+    return found | {"gnss": [int(line.split(b",")[1]) for line in lines if line.startswith(b"$P,") and len(line) == 11]}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_killed_at_a_hundred_random_moments(server: ForkServer, tmp_path: Path) -> None:
+    rng = random.Random(20261121)
+    moments = [rng.uniform(0.05, 2.0) for _ in range(KILLS)]
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        jobs = [
+            pool.submit(record_and_kill, server, tmp_path / str(number), after_s)
+            for number, after_s in enumerate(moments)
+        ]
+        for job in jobs:
+            job.result()

@@ -1,0 +1,263 @@
+"""``swath run`` as a service runs it: real ports, real files, every byte, every state."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.log_check import official_counts, read_log
+from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+
+SREP = """
+[scanner.left]
+transport = "udp:127.0.0.1:{port}"
+protocol = "srep"
+mirror_factor = 1.0
+"""
+ROVER = """
+[gnss.rover]
+transport = "serial:{path}?baud=921600"
+protocol = "nmea"
+pps = "main"
+[pps.main]
+source = "fixed:{fifo}"
+"""
+
+
+class Pty:
+    """A serial port whose other end the test holds; the link is the device's name under udev."""
+
+    def __init__(self, link: Path) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.link = link
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(self.slave))
+
+    def write(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def unplug(self) -> None:
+        self.link.unlink(missing_ok=True)
+        os.close(self.slave)
+        os.close(self.master)
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    return tmp_path / "logs"
+
+
+@pytest.fixture
+def sender() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        yield sock
+
+
+def nmea_zda(second: int) -> bytes:
+    body = f"GPZDA,{second // 3600:02d}{second // 60 % 60:02d}{second % 60:02d}.00,21,11,2026,00,00"
+    checksum = 0
+    for byte in body.encode():
+        checksum ^= byte
+    return f"${body}*{checksum:02X}\r\n".encode()
+
+
+def test_every_byte_of_every_wire_is_in_the_log(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+    port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
+    os.mkfifo(fifo)
+    pty = Pty(link)
+    config = session_table(logs) + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+    datagrams = [os.urandom(1206) for _ in range(500)] + [os.urandom(n) for n in (1, 7, 60000, 1206, 1206)]
+    lines = []
+    with Recorder(tmp_path, config) as recorder, fifo.open("w") as edges:
+        recorder.wait_said("device_opened", times=3)
+        for index, datagram in enumerate(datagrams):
+            sender.sendto(datagram, ("127.0.0.1", port))
+            if index % 50 == 0:
+                now = time.time_ns()
+                edges.write(f"{now} {index // 50 + 1}\n")
+                edges.flush()
+                lines.append(nmea_zda(index))
+                pty.write(lines[-1])
+                time.sleep(0.1)
+        time.sleep(1.3)
+        assert recorder.stop() == 0, recorder.stderr()
+    pty.unplug()
+    (path,) = logs.glob("*.mcap")
+    content = read_log(path)
+    assert [data for _, data in content.units["scanner/left"]] == datagrams
+    assert content.data("gnss/rover") == b"".join(lines)
+    assert [value["sequence"] for _, value in content.messages["/pps/main"]] == list(range(1, 12))
+    last = content.messages["/status/scanner/left"][-1][1]
+    assert (last["units"], last["written"], last["bytes"]) == (505, 505, sum(map(len, datagrams)))
+    assert content.damage == 0
+    counts = official_counts(path)
+    assert counts["/scanner/left/raw"] == 505
+    assert counts["/pps/main"] == 11
+    assert not (logs / "recording.json").exists()
+
+
+def test_kernel_stamps_are_the_units_times(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+    port = free_udp_port()
+    with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:
+        recorder.wait_said("device_opened")
+        sent = []
+        for _ in range(20):
+            sent.append(time.time_ns())
+            sender.sendto(b"x" * 100, ("127.0.0.1", port))
+            time.sleep(0.03)
+        recorder.stop()
+    times = [time_ns for time_ns, _ in read_log(logs).units["scanner/left"]]
+    delays = [time_ns - sent_ns for time_ns, sent_ns in zip(times, sent, strict=True)]
+    # loopback delivers inside the send call: the stamp lies between this send and the next, whenever it was read
+    assert all(-1_000_000 <= delay < 30_000_000 for delay in delays), delays
+
+
+def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: Path, logs: Path) -> None:
+    config = session_table(logs) + ROVER.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
+    with Recorder(tmp_path, config, watchdog_s=0.6) as recorder:
+        fed = recorder.notify.count("WATCHDOG")
+        started = time.monotonic()
+        longest, last = 0.0, started
+        while time.monotonic() - started < 10 * 0.6:
+            recorder.notify.poll(0.05)
+            if recorder.notify.count("WATCHDOG") > fed:
+                fed = recorder.notify.count("WATCHDOG")
+                longest, last = max(longest, time.monotonic() - last), time.monotonic()
+        assert longest < 0.6
+        assert "gnss/rover absent" in recorder.notify.last("STATUS")
+        assert recorder.stop() == 0
+    assert {event["source"] for event in read_log(logs).events("device_absent")} == {"gnss/rover", "pps/main"}
+
+
+def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
+    config = session_table(logs) + SREP.format(port=free_udp_port())
+    with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
+        thread = next(
+            int(task.name)
+            for task in Path(f"/proc/{recorder.process.pid}/task").iterdir()
+            if (task / "comm").read_text().strip() == "writer"
+        )
+        wait_until(lambda: recorder.notify.count("WATCHDOG") >= 3, "watchdog fed while all is well")
+        libc = ctypes.CDLL(None, use_errno=True)
+        attach, detach = 16, 17
+        assert libc.ptrace(attach, thread, None, None) == 0, os.strerror(ctypes.get_errno())
+        try:
+            time.sleep(4.0)  # progress is allowed 3 s; then nothing may be said any more
+            fed = recorder.notify.count("WATCHDOG")
+            time.sleep(2.0)
+            assert recorder.notify.count("WATCHDOG") == fed
+        finally:
+            os.waitpid(thread, 0x40000000)  # __WALL
+            libc.ptrace(detach, thread, None, None)
+        recorder.kill()  # what the service manager does now
+    with Recorder(tmp_path / "again", config) as restarted:
+        wait_until(lambda: (logs / "recording.json").exists(), "recording again")
+        restarted.wait_said("log_repaired")
+        assert restarted.stop() == 0
+    assert len(list(logs.glob("*.recovered.mcap"))) == 1
+
+
+def test_serial_port_unplugged_and_plugged_in_again(tmp_path: Path, logs: Path) -> None:
+    link, fifo = tmp_path / "rover", tmp_path / "pps"
+    os.mkfifo(fifo)
+    config = session_table(logs) + ROVER.format(path=link, fifo=fifo)
+    with Recorder(tmp_path, config) as recorder:
+        recorder.wait_said("gnss/rover device_absent")
+        sent = []
+        for turn in range(3):
+            pty = Pty(link)
+            recorder.wait_said("gnss/rover device_opened", times=turn + 1)
+            for second in range(10):
+                sent.append(nmea_zda(turn * 100 + second))
+                pty.write(sent[-1])
+            wait_until(lambda pty=pty: not _waiting_to_be_read(pty), "bytes taken")  # type: ignore[misc]
+            time.sleep(0.3)
+            pty.unplug()
+            recorder.wait_said("gnss/rover device_lost", times=turn + 1)
+        assert recorder.stop() == 0
+    content = read_log(logs)
+    assert content.data("gnss/rover") == b"".join(sent)
+    assert len([event for event in content.events("device_lost") if event["source"] == "gnss/rover"]) == 3
+
+
+def _waiting_to_be_read(pty: Pty) -> int:
+    import fcntl
+    import struct
+    import termios
+
+    return int(struct.unpack("i", fcntl.ioctl(pty.slave, termios.FIONREAD, b"\0" * 4))[0])
+
+
+def test_udp_silence_and_resume_are_told(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+    port = free_udp_port()
+    with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:
+        recorder.wait_said("device_opened")
+        sender.sendto(b"first", ("127.0.0.1", port))
+        recorder.wait_said("scanner/left silent")
+        wait_until(lambda: "scanner/left silent" in recorder.notify.last("STATUS"), "silence in STATUS")
+        sender.sendto(b"second", ("127.0.0.1", port))
+        recorder.wait_said("scanner/left resumed")
+        assert recorder.stop() == 0
+    content = read_log(logs)
+    assert [data for _, data in content.units["scanner/left"]] == [b"first", b"second"]
+    states = [value["state"] for _, value in content.messages["/status/scanner/left"]]
+    assert "silent" in states
+
+
+def test_sighup_starts_a_new_part(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
+    port = free_udp_port()
+    numbers = 0
+    with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:
+        recorder.wait_said("device_opened")
+        for part in range(3):
+            for _ in range(200):
+                sender.sendto(numbers.to_bytes(4, "little"), ("127.0.0.1", port))
+                numbers += 1
+                time.sleep(0.001)
+            if part < 2:
+                recorder.process.send_signal(signal.SIGHUP)
+                wait_until(lambda part=part: len(list(logs.glob("*.mcap"))) == part + 2, "next part")  # type: ignore[misc]
+        assert recorder.stop() == 0
+    paths = sorted(logs.glob("*.mcap"))
+    assert [path.stem.rsplit("_", 1)[1] for path in paths] == ["0", "1", "2"]
+    content = read_log(*paths)
+    assert [int.from_bytes(data, "little") for _, data in content.units["scanner/left"]] == list(range(numbers))
+    closed = content.events("part_closed")
+    assert [event["text"] for event in closed] == [path.name for path in paths[1:]]
+    for path in paths[:-1]:
+        assert read_log(path).messages["/events"][-1][1]["code"] == "part_closed"
+    for path in paths:
+        assert official_counts(path)["/scanner/left/raw"] > 0
+
+
+def test_two_recorders_in_one_directory(tmp_path: Path, logs: Path) -> None:
+    config = session_table(logs) + SREP.format(port=free_udp_port())
+    with Recorder(tmp_path, config):
+        second = Recorder(tmp_path / "second", session_table(logs) + SREP.format(port=free_udp_port()))
+        assert second.process.wait(30) == 3
+        assert second.stderr().strip().count("\n") == 0
+        assert "another recorder" in second.stderr()
+        second.notify.close()
+
+
+def test_running_recorder_has_not_imported_what_processing_needs(
+    tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")  # the running process lists every module it imports
+    link, fifo = tmp_path / "rover", tmp_path / "pps"
+    config = session_table(logs) + SREP.format(port=free_udp_port()) + ROVER.format(path=link, fifo=fifo)
+    with Recorder(tmp_path, config) as recorder:
+        assert recorder.stop() == 0
+    lines = [line for line in recorder.stderr().splitlines() if line.startswith("import time:")]
+    imported = {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}
+    assert {"numpy", "daemon", "drivers", "georef"} <= imported
+    assert not imported & {"numba", "scipy", "pyproj", "laspy", "matplotlib", "calib"}
