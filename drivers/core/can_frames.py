@@ -1,0 +1,71 @@
+"""CAN frames as Linux lays them out in memory: ``struct can_frame`` and ``struct canfd_frame`` (linux/can.h).
+
+This is the layout of a CAN unit in the log (LOG_FORMAT, ``x-swath-can``) and on a SocketCAN socket. The bus knows no
+byte order of the identifier; in the log it is little-endian.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from georef.records import ByteRows, StructArray
+
+CAN_EFF_FLAG = 0x8000_0000  # 29-bit identifier
+CAN_RTR_FLAG = 0x4000_0000  # remote request: carries no data
+CAN_ERR_FLAG = 0x2000_0000  # error frame: the controller speaks, not a node
+CAN_SFF_MASK = 0x0000_07FF
+CAN_EFF_MASK = 0x1FFF_FFFF
+
+CAN_FRAME_BYTES = 16  # CAN_MTU
+CANFD_FRAME_BYTES = 72  # CANFD_MTU
+CANFD_FDF = 0x04  # flags byte: this is an FD frame
+CANFD_BRS = 0x01  # flags byte: sent with the second bit rate
+
+CAN_FRAME_DTYPE = np.dtype(
+    [("can_id", "<u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", 2), ("data", "u1", 8)]
+)
+CANFD_FRAME_DTYPE = np.dtype(
+    [("can_id", "<u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", 2), ("data", "u1", 64)]
+)
+CANFD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # ISO 11898-1, data length code
+
+
+def frame_id(identifier: int, *, extended: bool) -> int:
+    """The ``can_id`` word of a data frame: identifier with its flag.
+
+    Raises:
+        ValueError: the identifier has more bits than its format.
+    """
+    mask = CAN_EFF_MASK if extended else CAN_SFF_MASK
+    if not 0 <= identifier <= mask:
+        raise ValueError(f"CAN identifier 0x{identifier:X} does not fit {29 if extended else 11} bits")
+    return identifier | (CAN_EFF_FLAG if extended else 0)
+
+
+def encode_can_frame(
+    identifier: int, data: bytes, *, extended: bool = False, fd: bool = False, remote: bool = False
+) -> bytes:
+    """One unit of 16 bytes (classic) or 72 bytes (``fd``) as the log and SocketCAN hold it.
+
+    Raises:
+        ValueError: the identifier or the data do not fit.
+    """
+    can_id = frame_id(identifier, extended=extended) | (CAN_RTR_FLAG if remote else 0)
+    if fd and len(data) not in CANFD_LENGTHS:
+        raise ValueError(f"a CAN FD frame cannot carry {len(data)} bytes")
+    if not fd and len(data) > 8:
+        raise ValueError(f"a classic CAN frame carries 8 bytes, not {len(data)}")
+    frame = np.zeros(1, dtype=CANFD_FRAME_DTYPE if fd else CAN_FRAME_DTYPE)
+    frame["can_id"] = can_id
+    frame["length"] = len(data)
+    frame["flags"] = CANFD_FDF if fd else 0
+    frame["data"][0, : len(data)] = np.frombuffer(data, dtype=np.uint8)
+    return frame.tobytes()
+
+
+def decode_can_frames(units: ByteRows) -> StructArray | None:
+    """View units of one length as frames; None where the length is neither 16 nor 72 bytes."""
+    dtype = {CAN_FRAME_BYTES: CAN_FRAME_DTYPE, CANFD_FRAME_BYTES: CANFD_FRAME_DTYPE}.get(units.shape[1])
+    if dtype is None:
+        return None
+    return np.ascontiguousarray(units).view(dtype).reshape(-1)

@@ -1,0 +1,177 @@
+"""Which frames make one inertial sample, and the unwrapping of the counters they carry.
+
+A device sends one sample in several frames. `SampleGrouper` splits the run of frames into samples by one of three
+rules, whole batches at a time, and keeps the frames of the unfinished sample for the next batch, so that the result
+does not depend on where a batch ends:
+
+- ``last``: the closing part (the one with the counter) ends a sample;
+- ``first``: the opening part begins one, the sample is complete when the next begins;
+- ``repeat``: a sample ends when every part was there, or before the first part that repeats.
+
+A sample is good when each part was there exactly once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import ByteRows, Int64Array
+
+GroupRule = Literal["last", "first", "repeat"]
+IndexArray = NDArray[np.intp]
+
+
+@dataclass(slots=True)
+class Frames:
+    """Frames of configured parts in the order of their arrival.
+
+    Attributes:
+        part: (n,) index of the part each frame is.
+        host_time_ns: (n,).
+        data: (n, 8 or 64) the data bytes.
+    """
+
+    part: NDArray[np.int8]
+    host_time_ns: Int64Array
+    data: ByteRows
+
+    def take(self, index: NDArray[np.intp] | slice) -> Frames:
+        """Some of the frames."""
+        return Frames(self.part[index], self.host_time_ns[index], self.data[index])
+
+    def after(self, earlier: Frames) -> Frames:
+        """These frames, behind earlier ones."""
+        if not len(earlier.part):
+            return self
+        return Frames(
+            np.concatenate([earlier.part, self.part]),
+            np.concatenate([earlier.host_time_ns, self.host_time_ns]),
+            np.concatenate([earlier.data, self.data]),
+        )
+
+
+def no_frames(width: int) -> Frames:
+    """An empty run of frames with ``width`` data bytes."""
+    return Frames(np.empty(0, np.int8), np.empty(0, np.int64), np.empty((0, width), np.uint8))
+
+
+@dataclass(slots=True)
+class Samples:
+    """Good samples and what was dropped.
+
+    Attributes:
+        frames: the frames that `index` points into.
+        index: (parts, m) which frame is each part of each sample.
+        closed_at: (m,) which frame completed the knowledge of the sample; ``len(frames.part)`` at the end.
+        incomplete, duplicate: samples dropped for a missing part, for two of a kind.
+    """
+
+    frames: Frames
+    index: IndexArray
+    closed_at: IndexArray
+    incomplete: int
+    duplicate: int
+
+
+class SampleGrouper:
+    """Splits frames into samples; see the module's text."""
+
+    def __init__(self, parts: int, rule: GroupRule, key_part: int, width: int) -> None:
+        """Args: number of parts, the rule, the part that closes or opens (last, first), data bytes of a frame."""
+        self._parts = parts
+        self._rule = rule
+        self._key_part = key_part
+        self._pending = no_frames(width)
+        self._seen: list[int] = []
+
+    def split(self, frames: Frames, *, at_end: bool = False) -> Samples:
+        """Take the next frames; return the samples they completed (``at_end``: the last one too, rule ``first``)."""
+        frames = frames.after(self._pending)
+        group, closed = self._groups(frames.part)
+        if at_end and self._rule == "first" and len(group):
+            closed = int(group[-1]) + 1
+        done = int(np.searchsorted(group, closed, side="left"))
+        samples = self._good(frames, group[:done], closed)
+        self._pending = self._thin(frames.take(slice(done, None)))
+        return samples
+
+    def _groups(self, part: NDArray[np.int8]) -> tuple[IndexArray, int]:
+        """Number of the group each frame belongs to, ascending, and how many groups are closed."""
+        if self._rule == "repeat":
+            return self._groups_by_repeat(part)
+        key = part == self._key_part
+        count = np.cumsum(key)
+        closed = int(count[-1]) if len(count) else 0
+        if self._rule == "last":
+            return count - key, closed
+        return count, closed  # group 0: frames before the first opening, closed by it
+
+    def _groups_by_repeat(self, part: NDArray[np.int8]) -> tuple[IndexArray, int]:
+        """Groups by the rule of the first repeat: starts are chained, regular runs in one step."""
+        n, parts = len(part), self._parts
+        if parts == 1 or n == 0:
+            return np.arange(n), n
+        following = _next_start(part, parts)
+        regular = following == np.arange(n) + parts
+        starts = _chain(following, regular, parts)
+        group = np.zeros(n, np.intp)
+        group[starts[1:]] = 1
+        group = np.cumsum(group)
+        last_complete = len(np.unique(part[starts[-1] :])) == parts
+        return group, len(starts) - (0 if last_complete else 1)
+
+    def _good(self, frames: Frames, group: IndexArray, closed: int) -> Samples:
+        """Keep the closed groups with each part exactly once; count the others."""
+        part = frames.part[: len(group)]
+        counts = np.bincount(group * self._parts + part, minlength=closed * self._parts).reshape(-1, self._parts)
+        some, each = counts.any(axis=1), (counts > 0).all(axis=1)
+        good = (counts == 1).all(axis=1)
+        kept = good[group] if len(group) else np.empty(0, bool)
+        index = np.empty((self._parts, int(good.sum())), np.intp)
+        for number in range(self._parts):
+            index[number] = np.flatnonzero(kept & (part == number))
+        ends = np.searchsorted(group, np.flatnonzero(good), side="right")  # first frame after each good group
+        return Samples(
+            frames=frames,
+            index=index,
+            closed_at=ends if self._rule == "first" else ends - 1,
+            incomplete=int((some & ~each).sum()),
+            duplicate=int((each & ~good).sum()),
+        )
+
+    def _thin(self, pending: Frames) -> Frames:
+        """At most two frames of each part say all that is needed of an unfinished sample."""
+        if len(pending.part) <= 2 * self._parts:
+            return pending
+        keep = np.concatenate([np.flatnonzero(pending.part == number)[:2] for number in range(self._parts)])
+        return pending.take(np.sort(keep))
+
+
+def _next_start(part: NDArray[np.int8], parts: int) -> IndexArray:
+    """For a group that began at each frame: where the next would begin (n where it is still open)."""
+    n = len(part)
+    previous = np.full(n, -1, np.intp)  # the previous frame of the same part
+    for number in range(parts):
+        where = np.flatnonzero(part == number)
+        previous[where[1:]] = where[:-1]
+    return np.searchsorted(np.maximum.accumulate(previous), np.arange(n), side="left")
+
+
+def _chain(following: IndexArray, regular: NDArray[np.bool_], parts: int) -> IndexArray:
+    """Follow the starts from frame 0; a run of groups of ``parts`` frames is one step."""
+    n = len(following)
+    rows = -(-n // parts)
+    ends = np.full(rows * parts, rows, np.intp)  # row of the first irregular group at or after, by phase
+    ends[:n] = np.where(regular, rows, np.arange(n) // parts)
+    ends = np.minimum.accumulate(ends.reshape(rows, parts)[::-1], axis=0)[::-1].reshape(-1)
+    pieces, start = [], 0
+    while start < n:
+        phase = start % parts
+        stop = min(int(ends[start]) * parts + phase, n - 1 - (n - 1 - phase) % parts)
+        pieces.append(np.arange(start, stop + 1, parts))
+        start = int(following[stop])
+    return np.concatenate(pieces)
