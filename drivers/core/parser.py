@@ -35,6 +35,8 @@ class ParserCounters:
         bad_messages: frames with a good checksum that could not be decoded (length, content).
         bytes_skipped: bytes that belong to no frame.
         errors: specific errors by code, for example ``bad_length``, ``sequence_gap``.
+        bytes_framed: bytes of frames with a good checksum. Of a stream, after `Parser.close`:
+            ``bytes == bytes_framed + bytes_skipped``.
     """
 
     bytes: int = 0
@@ -43,6 +45,7 @@ class ParserCounters:
     bad_messages: int = 0
     bytes_skipped: int = 0
     errors: Counter[str] = field(default_factory=Counter)
+    bytes_framed: int = 0
 
 
 class Parser(ABC):

@@ -1,0 +1,382 @@
+"""What every parser is put through on a real recording: cut anywhere, byte by byte, damaged; the same truth each time.
+
+Streams (`check_stream`, `check_damage`): units end anywhere, so the same bytes give the same records and counters
+however they are cut. Packets (`check_packets`, `check_packet_damage`): units are whole, only batches vary.
+
+Records are compared in a canonical form: single events in their order, rows of array records (`ImuSamples`, …) in
+their order by type, whatever batches they came in. NaN equals NaN; padding of aligned dtypes does not count.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import random
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.core.parser import Parser
+from georef.records import (
+    Chunk,
+    ChunkBatch,
+    DeviceClockSamples,
+    ImuSamples,
+    InsSolution,
+    Record,
+    ScannerReturns,
+    StructArray,
+)
+
+Factory = Callable[[], Parser]
+SOURCE = "gnss/test"
+STREAM_HOST_NS = 1_000_000_000  # one host time for all reads, so that it cannot tell cuts apart
+ARRAY_RECORDS = (ImuSamples, InsSolution, ScannerReturns, DeviceClockSamples)
+
+CUT_WINDOW_BYTES = 8 * 1024
+BYTEWISE_BYTES = 64 * 1024
+CUT_TAIL_BYTES = 2 * 1024  # fed behind a cut: longer than any message that could straddle it
+CHECKPOINT_BYTES = 256
+RANDOM_CUTS = 500
+
+
+class Outcome(NamedTuple):
+    """What a parser gave, comparable with ``==``."""
+
+    events: list[Any]
+    rows: dict[str, list[bytes]]
+    counters: dict[str, Any]
+
+
+class Message(NamedTuple):
+    """Where a message lies in a recording and what the parser counts it as."""
+
+    start: int
+    end: int
+    name: str
+
+
+# --- canonical form -------------------------------------------------------------------------------------------------
+
+
+def canonical(value: Any) -> Any:
+    """A value that compares by content: arrays by dtype, shape and bytes, NaN equal to NaN, dataclasses by fields."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, value.shape, *packed_rows(value.reshape(-1)))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return (type(value).__name__, *((f.name, canonical(getattr(value, f.name))) for f in fields))
+    if isinstance(value, dict):
+        return tuple(sorted((str(key), canonical(item)) for key, item in value.items()))
+    if isinstance(value, list | tuple):
+        return tuple(canonical(item) for item in value)
+    if isinstance(value, float | np.floating):
+        return "nan" if np.isnan(value) else float(value)
+    return value
+
+
+def packed_rows(rows: StructArray) -> list[bytes]:
+    """(n,) array, structured or plain, as one byte string a row without padding."""
+    if rows.dtype.names is None:
+        return [row.tobytes() for row in rows]
+    packed = np.empty(rows.shape, dtype=[(name, rows.dtype[name]) for name in rows.dtype.names])
+    for name in rows.dtype.names:
+        packed[name] = rows[name]
+    return [row.tobytes() for row in packed]
+
+
+def outcome(records: Iterable[Record], parser: Parser) -> Outcome:
+    """Canonical records and counters."""
+    events: list[Any] = []
+    rows: dict[str, list[bytes]] = {}
+    for record in records:
+        if isinstance(record, ARRAY_RECORDS):
+            rows.setdefault(type(record).__name__, []).extend(packed_rows(record.rows))
+        else:
+            events.append(canonical(record))
+    counters = dataclasses.asdict(parser.counters)
+    counters["messages"] = +parser.counters.messages
+    counters["errors"] = +parser.counters.errors
+    return Outcome(events, rows, counters)
+
+
+# --- streams --------------------------------------------------------------------------------------------------------
+
+
+def feed_pieces(parser: Parser, pieces: Iterable[bytes], *, close: bool = True) -> list[Record]:
+    """Feed the pieces as reads of one port; with ``close`` the tail is released too."""
+    records: list[Record] = []
+    for piece in pieces:
+        records += parser.feed(Chunk(SOURCE, STREAM_HOST_NS, piece))
+    return records + parser.close() if close else records
+
+
+def run_stream(make: Factory, pieces: Iterable[bytes]) -> Outcome:
+    """A fresh parser's outcome on the pieces, closed."""
+    parser = make()
+    return outcome(feed_pieces(parser, pieces), parser)
+
+
+def assert_bytes_accounted(parser: Parser, fed: int) -> None:
+    """Every byte fed to a closed stream parser was in a good frame or was skipped."""
+    counters = parser.counters
+    assert counters.bytes == fed
+    assert counters.bytes_framed + counters.bytes_skipped == fed, counters
+    assert min(counters.bytes_framed, counters.bytes_skipped, counters.bad_checksums, counters.bad_messages) >= 0
+
+
+def random_pieces(data: bytes, seed: int, largest: int = 4096) -> list[bytes]:
+    """The data cut into reads of 1 to ``largest`` bytes, small ones as frequent as large ones."""
+    rng = random.Random(seed)
+    pieces, position = [], 0
+    while position < len(data):
+        size = max(1, int(largest ** rng.random()))
+        pieces.append(data[position : position + size])
+        position += size
+    return pieces
+
+
+def check_random_reads(make: Factory, data: bytes, seeds: Sequence[int] = (1, 2, 3)) -> None:
+    """Whole and in random read sizes: same records, same counters."""
+    whole = run_stream(make, [data])
+    for seed in seeds:
+        assert run_stream(make, random_pieces(data, seed)) == whole, f"differs when cut with seed {seed}"
+
+
+def check_bytewise(make: Factory, data: bytes) -> None:
+    """Byte by byte over the first 64 KiB."""
+    head = data[:BYTEWISE_BYTES]
+    assert run_stream(make, (head[i : i + 1] for i in range(len(head)))) == run_stream(make, [head])
+
+
+def check_cuts(make: Factory, data: bytes, positions: Iterable[int]) -> None:
+    """Cut in two at each position: same records and counters up to well behind the cut, tail released.
+
+    A parser that has taken everything up to a checkpoint is copied, so that a cut costs the bytes around it only.
+    """
+    base, taken = make(), 0
+    for start, group in itertools.groupby(sorted(positions), lambda position: position - position % CHECKPOINT_BYTES):
+        feed_pieces(base, [data[taken:start]], close=False)
+        taken = start
+        end = min(len(data), start + CHECKPOINT_BYTES + CUT_TAIL_BYTES)
+        reference = deepcopy(base)
+        expected = outcome(feed_pieces(reference, [data[start:end]]), reference)
+        for position in group:
+            parser = deepcopy(base)
+            got = outcome(feed_pieces(parser, [data[start:position], data[position:end]]), parser)
+            assert got == expected, f"differs when cut at byte {position}"
+
+
+def check_every_cut(make: Factory, data: bytes, window: int = CUT_WINDOW_BYTES) -> None:
+    """Cut in two at every position of the first ``window`` bytes."""
+    check_cuts(make, data, range(min(window, len(data)) + 1))
+
+
+def check_random_cuts(make: Factory, data: bytes, count: int = RANDOM_CUTS, seed: int = 7) -> None:
+    """Cut in two at random positions of the whole recording."""
+    rng = random.Random(seed)
+    check_cuts(make, data, {rng.randrange(len(data) + 1) for _ in range(count)})
+
+
+def check_stream(make: Factory, data: bytes) -> Outcome:
+    """All ways of cutting; returns the outcome of the whole, for the test's own expectations."""
+    assert data, "an empty recording proves nothing"
+    parser = make()
+    whole = outcome(feed_pieces(parser, [data]), parser)
+    assert_bytes_accounted(parser, len(data))
+    assert sum(whole.counters["messages"].values()) > 0, "no message in this recording"
+    check_random_reads(make, data)
+    check_every_cut(make, data)
+    check_random_cuts(make, data)
+    check_bytewise(make, data)
+    return whole
+
+
+# --- damaged streams ------------------------------------------------------------------------------------------------
+
+
+def find_messages(make: Factory, data: bytes) -> list[Message]:
+    """Where the messages lie: fed byte by byte, a message ends where the parser counts it.
+
+    Messages that came out together (released behind a false sync) are left out: their places are not known so.
+    """
+    parser = make()
+    found: list[Message] = []
+    for end in range(1, len(data) + 1):
+        framed, before = parser.counters.bytes_framed, sum(parser.counters.messages.values())
+        feed_pieces(parser, [data[end - 1 : end]], close=False)
+        length = parser.counters.bytes_framed - framed
+        if length and sum(parser.counters.messages.values()) - before == 1:
+            alone = make()
+            feed_pieces(alone, [data[end - length : end]])
+            if sum(alone.counters.messages.values()) == 1:
+                found.append(Message(end - length, end, next(iter(alone.counters.messages))))
+    return found
+
+
+class Damage(NamedTuple):
+    """At ``position`` one byte is changed (``flip`` ≠ 0) and ``garbage`` goes in before it."""
+
+    position: int
+    flip: int
+    garbage: bytes
+
+
+def damage_strategy(size: int) -> st.SearchStrategy[list[Damage]]:
+    """Up to eight places of damage; the garbage likes the bytes that frames begin with."""
+    syncs = st.sampled_from(
+        [
+            b"$",
+            b"!",
+            b"$$GP",
+            b"\xb5b",
+            b"\xb5b\x01\x07\xff\xff",
+            b"\xd3",
+            b"\xd3\x03\xff",
+            b"\xaaD\x12\x1c",
+            b"\xaaD\x13",
+        ]
+    )
+    garbage = st.one_of(st.just(b""), syncs, st.binary(max_size=40))
+    place = st.builds(Damage, st.integers(0, size - 1), st.integers(0, 255), garbage)
+    return st.lists(place, min_size=1, max_size=8, unique_by=lambda damage: damage.position)
+
+
+def damaged(data: bytes, damages: Sequence[Damage]) -> bytes:
+    """The data with all damages done."""
+    pieces, position = [], 0
+    for damage in sorted(damages):
+        pieces += [data[position : damage.position], damage.garbage, bytes([data[damage.position] ^ damage.flip])]
+        position = damage.position + 1
+    return b"".join([*pieces, data[position:]])
+
+
+def untouched(messages: Sequence[Message], damages: Sequence[Damage]) -> Counter[str]:
+    """Names of the messages no damage lies in (garbage right before a message is outside of it)."""
+    names: Counter[str] = Counter()
+    for message in messages:
+        if not any(
+            (damage.flip and message.start <= damage.position < message.end)
+            or (damage.garbage and message.start < damage.position < message.end)
+            for damage in damages
+        ):
+            names[message.name] += 1
+    return names
+
+
+def check_damage(make: Factory, data: bytes, *, examples: int = 60, window: int = 6 * 1024) -> None:
+    """Bytes flipped and garbage between: never raises, accounts for every byte, finds what was not touched."""
+    head = data[:window]
+    messages = find_messages(make, head)
+    assert messages, "no message in this recording"
+
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @given(damages=damage_strategy(len(head)), seed=st.integers(0, 1000))
+    def property_holds(damages: list[Damage], seed: int) -> None:
+        broken = damaged(head, damages)
+        parser = make()
+        got = outcome(feed_pieces(parser, random_pieces(broken, seed)), parser)
+        assert_bytes_accounted(parser, len(broken))
+        missing = untouched(messages, damages) - parser.counters.messages
+        assert not missing, f"undamaged messages not found: {missing}"
+        assert got == run_stream(make, [broken])
+
+    property_holds()
+
+
+def check_garbage(make: Factory, *, examples: int = 60) -> None:
+    """Random bytes, with frame beginnings among them: never raises, accounts for every byte."""
+    starts = st.sampled_from(
+        [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
+    )
+    pieces = st.lists(st.one_of(st.binary(max_size=200), starts), max_size=20)
+
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @given(pieces=pieces)
+    def property_holds(pieces: list[bytes]) -> None:
+        parser = make()
+        feed_pieces(parser, pieces)
+        assert_bytes_accounted(parser, sum(map(len, pieces)))
+
+    property_holds()
+
+
+# --- packets --------------------------------------------------------------------------------------------------------
+
+
+def packet_batches(units: Sequence[bytes], largest: Callable[[], int]) -> list[ChunkBatch]:
+    """Consecutive units of equal length as batches of at most ``largest()`` rows; host time 1 ms a unit."""
+    batches: list[ChunkBatch] = []
+    position = 0
+    while position < len(units):
+        limit, end = max(1, largest()), position + 1
+        while end < len(units) and end - position < limit and len(units[end]) == len(units[position]):
+            end += 1
+        rows = np.frombuffer(b"".join(units[position:end]), dtype=np.uint8).reshape(end - position, -1)
+        host = STREAM_HOST_NS + 1_000_000 * np.arange(position, end, dtype=np.int64)
+        batches.append(ChunkBatch(SOURCE, host, rows))
+        position = end
+    return batches
+
+
+def run_packets(make: Factory, units: Sequence[bytes], largest: Callable[[], int]) -> Outcome:
+    """A fresh parser's outcome on the units in such batches, closed."""
+    parser = make()
+    records: list[Record] = []
+    for batch in packet_batches(units, largest):
+        records += parser.feed_batch(batch)
+    return outcome(records + parser.close(), parser)
+
+
+def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = (1, 2, 3)) -> Outcome:
+    """Largest batches, one by one through `feed`, and random batch sizes: same records, same counters."""
+    assert units, "an empty recording proves nothing"
+    whole = run_packets(make, units, lambda: len(units))
+    assert whole.counters["bytes"] == sum(map(len, units))
+    assert sum(whole.counters["messages"].values()) > 0, "no message in this recording"
+    parser = make()
+    single: list[Record] = []
+    for index, unit in enumerate(units):
+        single += parser.feed(Chunk(SOURCE, STREAM_HOST_NS + 1_000_000 * index, unit))
+    assert outcome(single + parser.close(), parser) == whole, "differs when fed one by one"
+    for seed in seeds:
+        rng = random.Random(seed)
+        got = run_packets(make, units, lambda rng=rng: int(100 ** rng.random()))  # type: ignore[misc]
+        assert got == whole, f"differs in batches of seed {seed}"
+    return whole
+
+
+def check_packet_damage(make: Factory, units: Sequence[bytes], *, examples: int = 60) -> None:
+    """Units cut short, made longer, flipped: never raises, whatever the batches, and every byte fed is counted."""
+    few = list(units[:40])
+
+    @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @given(
+        changes=st.lists(
+            st.tuples(st.integers(0, len(few) - 1), st.integers(0, 2000), st.integers(0, 255), st.binary(max_size=4)),
+            min_size=1,
+            max_size=10,
+        ),
+        seed=st.integers(0, 1000),
+        kind=st.sampled_from(["flip", "cut", "longer"]),
+    )
+    def property_holds(changes: list[tuple[int, int, int, bytes]], seed: int, kind: str) -> None:
+        broken = list(few)
+        for index, position, flip, extra in changes:
+            unit = bytearray(broken[index])
+            if kind == "flip" and unit:
+                unit[position % len(unit)] ^= flip
+            broken[index] = (
+                bytes(unit[:position]) if kind == "cut" else bytes(unit) + (extra if kind == "longer" else b"")
+            )
+        rng = random.Random(seed)
+        got = run_packets(make, broken, lambda: int(100 ** rng.random()))
+        assert got.counters["bytes"] == sum(map(len, broken))
+        assert got == run_packets(make, broken, lambda: 1)
+
+    property_holds()
