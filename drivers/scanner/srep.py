@@ -1,0 +1,402 @@
+"""SREP/1: ranges and encoder readings of line scanners over UDP (the project's open datagram, PROTOCOLS).
+
+One datagram: header (48 bytes), N pulses of 8 + 8·R bytes, CRC-32. Little-endian. Device time is the scanner's tick
+counter in nanoseconds, floor(ticks · 10⁹ / tick_hz), exact; its seconds count modulo 2³² (136 years) so that every
+u64 counter fits.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, join_rows
+from georef.records import (
+    DEVICE_CLOCK_DTYPE,
+    RETURN_DTYPE,
+    RETURN_FLAG_PPS_LOCKED,
+    ByteRows,
+    DeviceClockSamples,
+    DeviceStatus,
+    Int64Array,
+    Record,
+    ScannerReturns,
+    StructArray,
+)
+
+MAGIC = 0x50455253  # "SREP" in memory order
+VERSION = 1
+MAX_RETURN_SLOTS = 15
+FLAG_PPS_LOCKED = 1
+FLAG_RANGE_GATE = 2
+FLAG_LASER_ON = 4
+ZONE_UNKNOWN = 255
+RANGE_UNIT_M = 1e-4
+PULSE_WIDTH_UNIT_NS = 0.01
+
+HEADER_DTYPE = np.dtype(
+    [
+        ("magic", "<u4"),
+        ("version", "u1"),
+        ("flags", "u1"),
+        ("pulses", "<u2"),
+        ("sequence", "<u4"),
+        ("scanner_id", "<u2"),
+        ("return_slots", "u1"),
+        ("mta_zone", "u1"),
+        ("pps_count", "<u4"),
+        ("tick_hz", "<u4"),
+        ("pps_ticks", "<u8"),
+        ("first_ticks", "<u8"),
+        ("encoder_counts", "<u4"),
+        ("prf_mhz", "<u4"),
+    ]
+)
+HEADER_BYTES = HEADER_DTYPE.itemsize
+CRC = struct.Struct("<I")
+PULSE_HEAD_BYTES = 8
+SLOT_BYTES = 8
+_SECONDS = 1 << 32
+_NS = 1_000_000_000
+
+
+@cache
+def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
+    """Layout of one pulse record with R return slots: 8 + 8·R bytes."""
+    slot = np.dtype([("range", "<u4"), ("intensity", "<u2"), ("pulse_width", "<u2")])
+    return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", slot, (return_slots,))])
+
+
+def datagram_bytes(pulses: int, return_slots: int) -> int:
+    """The only right length of a datagram."""
+    return HEADER_BYTES + pulses * (PULSE_HEAD_BYTES + SLOT_BYTES * return_slots) + CRC.size
+
+
+@dataclass(frozen=True, slots=True)
+class SrepHeader:
+    """What a datagram says beside its pulses; names and units of the protocol page."""
+
+    sequence: int = 0
+    scanner_id: int = 0
+    flags: int = 0
+    mta_zone: int = 0
+    pps_count: int = 0
+    tick_hz: int = 10_000_000
+    pps_ticks: int = 0
+    first_ticks: int = 0
+    encoder_counts: int = 524_288
+    prf_mhz: int = 0
+
+
+def encode_datagram(
+    header: SrepHeader,
+    ticks: ArrayLike,
+    encoder: ArrayLike,
+    range_0p1mm: ArrayLike,
+    intensity: ArrayLike = 0,
+    pulse_width_10ps: ArrayLike = 0,
+) -> bytes:
+    """One datagram.
+
+    Args:
+        header: all fields of the header but N and R.
+        ticks: (N,) u32 since first_ticks.
+        encoder: (N,) i32 counts.
+        range_0p1mm: (N, R) u32, 0 = no return; its shape gives N and R.
+        intensity, pulse_width_10ps: (N, R) u16, or one value for all.
+    """
+    ranges = np.asarray(range_0p1mm, dtype=np.uint32)
+    head = np.zeros(1, dtype=HEADER_DTYPE)
+    head["magic"], head["version"] = MAGIC, VERSION
+    head["pulses"], head["return_slots"] = ranges.shape
+    for name in SrepHeader.__dataclass_fields__:
+        head[name] = getattr(header, name)
+    body = np.zeros(len(ranges), dtype=pulse_dtype(ranges.shape[1]))
+    body["ticks"], body["encoder"] = ticks, encoder
+    body["slot"]["range"], body["slot"]["intensity"], body["slot"]["pulse_width"] = ranges, intensity, pulse_width_10ps
+    data = head.tobytes() + body.tobytes()
+    return data + CRC.pack(zlib.crc32(data))
+
+
+def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:
+    """Tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
+    hz = tick_hz.astype(np.uint64)
+    seconds, rest = np.divmod(ticks, hz)
+    return ((seconds % np.uint64(_SECONDS)) * np.uint64(_NS) + rest * np.uint64(_NS) // hz).astype(np.int64)
+
+
+class ScanAngle:
+    """Encoder reading to scan angle θ_encoder and facet (PROTOCOLS, "Encoder to scan angle").
+
+    Args:
+        config: the scanner's table; ``mirror_factor`` is mandatory, ``geometry.facets`` is for a polygon.
+
+    Raises:
+        DriverSettingsError: a key is absent or wrong.
+    """
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        factor = config.get("mirror_factor")
+        if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor) or factor == 0:
+            raise DriverSettingsError(
+                f"mirror_factor: got {factor!r}, want 2 for a flat mirror turned about an axis in its own plane, "
+                "1 for a 45° mirror or an optical angle"
+            )
+        self._factor = float(factor)
+        self._facets = 0
+        geometry = config.get("geometry") or {}
+        if geometry.get("type") == "polygon":
+            facets = geometry.get("facets")
+            if isinstance(facets, bool) or not isinstance(facets, int) or not 2 <= facets <= 65535:
+                raise DriverSettingsError(f"geometry.facets: got {facets!r}, want the polygon's number of facets")
+            self._facets = facets
+
+    def angles(
+        self, encoder: NDArray[np.int32], encoder_counts: NDArray[np.uint32]
+    ) -> tuple[NDArray[np.float64], NDArray[Any] | int]:
+        """Scan angles (n, N) in radians and facets (n, N) of readings (n, N) with counts a revolution (n, 1)."""
+        if not self._facets:
+            return encoder * (2 * np.pi * self._factor / encoder_counts), 0
+        counts = encoder_counts.astype(np.int64)
+        facet, within = np.divmod(encoder.astype(np.int64) * self._facets, counts)
+        angle = (within / counts - 0.5) * (4 * np.pi / self._facets)  # 2 · (shaft angle − facet centre)
+        return angle, (facet % self._facets).astype(np.uint16)
+
+
+class SrepParser(PacketParser):
+    """Decodes datagrams; counts ``bad_length``, ``bad_magic``, ``bad_version``, ``bad_header`` and the CRC's failures.
+
+    Args:
+        settings: config keys ``mirror_factor``, ``geometry``.
+        clock_only: give clock samples (one in 50 ms of host time) and status, no returns; only the CRCs of those
+            datagrams, and of those that break the sequence, are then computed.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, clock_only: bool = False) -> None:
+        super().__init__()
+        self._scan_angle = ScanAngle(settings.config)
+        self._tracker = SequenceTracker(self.counters.errors)
+        self._thinner = SampleThinner() if clock_only else None
+        self._last_sequence: int | None = None
+        self._last_status: tuple[int, ...] | None = None
+
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Decode datagrams of equal length; see `PacketParser.parse_units`."""
+        self.counters.bytes += units.size
+        good, chosen = self._check(host_time_ns, units)
+        if not good.any():
+            return []
+        if not good.all():
+            host_time_ns, units, chosen = host_time_ns[good], units[good], chosen[good]
+        header = _headers(units)
+        self.counters.messages["srep"] += len(units)
+        unwrapped, fresh = self._tracker.follow(
+            header["sequence"], nanoseconds(header["first_ticks"], header["tick_hz"]), header["pps_count"]
+        )
+        if not (fresh & chosen).all():
+            keep = fresh & chosen
+            host_time_ns, units, header, unwrapped = host_time_ns[keep], units[keep], header[keep], unwrapped[keep]
+        if not len(units):
+            return []
+        records: list[Record] = list(self._status(host_time_ns, header))
+        records.append(DeviceClockSamples(_clock_samples(host_time_ns, header, units)))
+        if self._thinner is None:
+            rows = self._returns(host_time_ns, header, units, unwrapped)
+            if len(rows):
+                records.append(ScannerReturns(rows))
+        return records
+
+    def _check(self, host_time_ns: Int64Array, units: ByteRows) -> tuple[BoolArray, BoolArray]:
+        """Which units are whole datagrams, and which of them are decoded; the others are counted."""
+        n, length = units.shape
+        chosen = np.ones(n, dtype=np.bool_) if self._thinner is None else self._thinner.choose(host_time_ns)
+        if length < HEADER_BYTES + CRC.size:
+            self._refuse("bad_length", n)
+            return np.zeros(n, dtype=np.bool_), chosen
+        header = _headers(units)
+        good = np.ones(n, dtype=np.bool_)
+        for code, passes in _header_checks(header, length):
+            self._refuse(code, int((good & ~passes).sum()))
+            if code == "bad_magic":
+                self.counters.bytes_skipped += length * int((~passes).sum())
+            good &= passes
+        verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
+        for row in np.flatnonzero(verify).tolist():
+            unit = units[row]
+            if zlib.crc32(unit[: -CRC.size]) != CRC.unpack(unit[-CRC.size :])[0]:
+                good[row] = False
+                self.counters.bad_checksums += 1
+        return good, chosen
+
+    def _breaks(self, sequence: NDArray[np.uint32], good: BoolArray) -> BoolArray:
+        """Where a datagram does not follow the one before, beginning with the last of the batch before."""
+        follows = np.zeros(len(sequence), dtype=np.bool_)
+        follows[1:] = (np.diff(sequence) == 1) & good[1:] & good[:-1]
+        if self._last_sequence is not None:
+            follows[0] = int(sequence[0]) == (self._last_sequence + 1) % _SECONDS
+        self._last_sequence = int(sequence[-1]) if good[-1] else None
+        return ~follows
+
+    def _refuse(self, code: str, count: int) -> None:
+        if count:
+            self.counters.errors[code] += count
+            self.counters.bad_messages += count
+
+    def _status(self, host_time_ns: Int64Array, header: StructArray) -> list[DeviceStatus]:
+        """A status for each datagram whose flags, id or pulse rate differ from the one before."""
+        keys = np.stack([header[name].astype(np.int64) for name in ("scanner_id", "flags", "prf_mhz")], axis=1)
+        changed = np.ones(len(keys), dtype=np.bool_)
+        changed[1:] = (keys[1:] != keys[:-1]).any(axis=1)
+        changed[0] = tuple(keys[0].tolist()) != self._last_status
+        self._last_status = tuple(keys[-1].tolist())
+        return [_status(int(host_time_ns[row]), *keys[row].tolist()) for row in np.flatnonzero(changed).tolist()]
+
+    def _returns(
+        self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
+    ) -> StructArray:
+        """Returns of all datagrams, in order, decoded in blocks of one layout."""
+        blocks = []
+        for start, stop in _same_layout(header):
+            part = slice(start, stop)
+            blocks.append(self._block(host_time_ns[part], header[part], units[part], unwrapped[part]))
+        return join_rows(blocks)
+
+    def _block(
+        self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
+    ) -> StructArray:
+        """Returns of datagrams that have N, R and tick_hz in common."""
+        n, pulses, slots = len(units), int(header["pulses"][0]), int(header["return_slots"][0])
+        if not pulses:
+            return np.empty(0, dtype=RETURN_DTYPE)
+        body = units[:, HEADER_BYTES : -CRC.size].view(pulse_dtype(slots))
+        angle, facet = self._scan_angle.angles(body["encoder"], header["encoder_counts"][:, np.newaxis])
+        number = np.arange(pulses, dtype=np.uint64)
+        shape = (n, pulses)
+
+        def every_pulse(values: NDArray[Any]) -> NDArray[Any]:
+            return np.broadcast_to(values[:, np.newaxis], shape).reshape(-1)
+
+        locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
+        slot = body["slot"]
+        return ReturnSlots(
+            range_raw=slot["range"].reshape(-1, slots),
+            range_unit_m=RANGE_UNIT_M,
+            intensity=slot["intensity"].reshape(-1, slots),
+            per_slot={"pulse_width_ns": (slot["pulse_width"], PULSE_WIDTH_UNIT_NS)},
+            per_pulse={
+                "host_time_ns": every_pulse(host_time_ns),
+                "device_time_ns": _pulse_times(header, body["ticks"]).reshape(-1),
+                "encoder_rad": angle.reshape(-1),
+                "pulse_id": ((unwrapped.astype(np.uint64) << np.uint64(16))[:, np.newaxis] + number).reshape(-1),
+                "channel": facet if isinstance(facet, int) else facet.reshape(-1),
+                "mta_zone": every_pulse(header["mta_zone"]),
+                "flags": every_pulse(locked),
+            },
+        ).rows()
+
+
+def _headers(units: ByteRows) -> StructArray:
+    return np.ascontiguousarray(units[:, :HEADER_BYTES]).view(HEADER_DTYPE).reshape(-1)
+
+
+def _header_checks(header: StructArray, length: int) -> list[tuple[str, BoolArray]]:
+    """What a header must say, by the code its failure is counted under; (n,) True where it does."""
+    pulses, slots = header["pulses"].astype(np.int64), header["return_slots"].astype(np.int64)
+    return [
+        ("bad_magic", header["magic"] == MAGIC),
+        ("bad_version", header["version"] == VERSION),
+        ("bad_length", datagram_bytes(1, 0) - PULSE_HEAD_BYTES + pulses * (8 + 8 * slots) == length),
+        (
+            "bad_header",
+            (slots >= 1)
+            & (slots <= MAX_RETURN_SLOTS)
+            & (header["tick_hz"] > 0)
+            & ((header["encoder_counts"] > 0) | (pulses == 0)),
+        ),
+    ]
+
+
+def _same_layout(header: StructArray) -> list[tuple[int, int]]:
+    """Bounds of runs of datagrams with equal N, R and tick_hz, none of more than `BLOCK_SLOTS` slots (or one row)."""
+    layout = np.stack([header[name].astype(np.int64) for name in ("pulses", "return_slots", "tick_hz")], axis=1)
+    edges = [0, *(np.flatnonzero((layout[1:] != layout[:-1]).any(axis=1)) + 1).tolist(), len(header)]
+    bounds = []
+    for start, stop in pairwise(edges):
+        step = max(1, BLOCK_SLOTS // max(1, int(layout[start, 0] * layout[start, 1])))
+        bounds += [(at, min(at + step, stop)) for at in range(start, stop, step)]
+    return bounds
+
+
+def _pulse_times(header: StructArray, ticks: NDArray[np.uint32]) -> Int64Array:
+    """Device times (n, N) of pulses ``ticks`` (n, N) after each datagram's first, of datagrams with one tick_hz.
+
+    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64.
+    """
+    hz = int(header["tick_hz"][0])
+    seconds, rest = np.divmod(header["first_ticks"], np.uint64(hz))
+    base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * _NS
+    after = ticks + rest.astype(np.int64)[:, np.newaxis]
+    after = after * (_NS // hz) if _NS % hz == 0 else after * _NS // hz
+    after += base[:, np.newaxis]
+    return after
+
+
+def _clock_samples(host_time_ns: Int64Array, header: StructArray, units: ByteRows) -> StructArray:
+    """One `DEVICE_CLOCK_DTYPE` row a datagram: the counter at its last pulse beside the latched one."""
+    rows = np.empty(len(header), dtype=DEVICE_CLOCK_DTYPE)
+    last_ticks = header["first_ticks"].copy()
+    fired = header["pulses"] > 0
+    for slots in np.unique(header["return_slots"][fired]).tolist():
+        at = units.shape[1] - CRC.size - PULSE_HEAD_BYTES - SLOT_BYTES * slots
+        same = fired & (header["return_slots"] == slots)
+        last_ticks[same] += np.ascontiguousarray(units[same, at : at + 4]).view("<u4")[:, 0]
+    latched = header["pps_count"] > 0
+    rows["host_time_ns"] = host_time_ns
+    rows["device_time_ns"] = nanoseconds(last_ticks, header["tick_hz"])
+    rows["pps_time_ns"] = np.where(latched, nanoseconds(header["pps_ticks"], header["tick_hz"]), -1)
+    rows["pps_count"] = header["pps_count"]
+    rows["locked"] = header["flags"] & FLAG_PPS_LOCKED
+    return rows
+
+
+def _status(host_time_ns: int, scanner_id: int, flags: int, prf_mhz: int) -> DeviceStatus:
+    return DeviceStatus(
+        host_time_ns,
+        {
+            "scanner_id": scanner_id,
+            "pps_locked": bool(flags & FLAG_PPS_LOCKED),
+            "range_gate_active": bool(flags & FLAG_RANGE_GATE),
+            "laser_on": bool(flags & FLAG_LASER_ON),
+            "prf_hz": prf_mhz / 1000,
+        },
+        message="srep",
+    )
+
+
+def _clock_parser(settings: DeviceSettings) -> SrepParser:
+    return SrepParser(settings, clock_only=True)
+
+
+DRIVERS = (
+    Driver(
+        protocol="srep",
+        kind="scanner",
+        transports=("udp",),
+        yields=(ScannerReturns, DeviceClockSamples, DeviceStatus),
+        summary="line scanners by the open SREP/1 datagram: time, encoder, ranges, PPS latch",
+        make_parser=SrepParser,
+        make_time_parser=_clock_parser,
+        needs=("mirror_factor",),
+    ),
+)
