@@ -1,0 +1,63 @@
+"""Time: three clocks (host, device, GPS), one place. docs/time.md says how it works and what to wire.
+
+Imports nothing of the project but `georef.records`; knows no clock and no I/O.
+"""
+
+from georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
+from georef.timescales.gps_time import (
+    DAY_NS,
+    GPS_EPOCH,
+    HOUR_NS,
+    LEAP_SECOND_TABLE,
+    LEAP_TABLE_VALID_UNTIL,
+    SECOND_NS,
+    WEEK_NS,
+    WEEK_S,
+    complete_time,
+    full_week,
+    gps_ns_from_unix,
+    gps_ns_from_utc,
+    gps_ns_from_week,
+    gps_ns_past_hour,
+    las_adjusted_s,
+    nearest_gps_ns,
+    table_leap_seconds,
+    unix_ns_from_gps,
+    utc_from_gps,
+    week_difference_ns,
+    week_from_gps,
+    whole_gps_ns,
+)
+from georef.timescales.host_timeline import HostTimeline
+from georef.timescales.pps_clock import PpsClock
+
+__all__ = [
+    "DAY_NS",
+    "GPS_EPOCH",
+    "HOUR_NS",
+    "LEAP_SECOND_TABLE",
+    "LEAP_TABLE_VALID_UNTIL",
+    "SECOND_NS",
+    "WEEK_NS",
+    "WEEK_S",
+    "ClockEvent",
+    "ClockStatus",
+    "HostTimeline",
+    "PpsClock",
+    "Severity",
+    "TimeState",
+    "complete_time",
+    "full_week",
+    "gps_ns_from_unix",
+    "gps_ns_from_utc",
+    "gps_ns_from_week",
+    "gps_ns_past_hour",
+    "las_adjusted_s",
+    "nearest_gps_ns",
+    "table_leap_seconds",
+    "unix_ns_from_gps",
+    "utc_from_gps",
+    "week_difference_ns",
+    "week_from_gps",
+    "whole_gps_ns",
+]

@@ -1,0 +1,61 @@
+"""What a clock says about itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class TimeState(StrEnum):
+    """How well the host's clock is known in GPS time."""
+
+    NO_TIME = "no_time"  # nothing has said the time yet
+    COARSE = "coarse"  # by messages only, some tenths of a second; or which second is not certain
+    LOCKED = "locked"  # PPS edges, and their seconds are known
+    HOLDOVER = "holdover"  # no edge for some seconds; sigma grows
+    LOST = "lost"  # too long without
+
+
+class Severity(StrEnum):
+    """Of an event, as in ``/events``."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEvent:
+    """Something the log should keep. host_ns is on the clock's own host scale."""
+
+    host_ns: int
+    severity: Severity
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStatus:
+    """A clock at one host time.
+
+    Attributes:
+        state: see `TimeState`. sigma_ns: of gps_from_host there; inf without time.
+        offset_ns: GPS − host; None without time. drift_ppm: of the host clock, positive: fast; None without edges.
+        noise_ns: sigma of the edges' stamps as the data show it; None without edges.
+        source: who names the seconds ("gnss/rover RMC"), "wall_clock", or empty. ambiguous: why the second is not certain.
+        leap_seconds, leap_origin: GPS − UTC in use, and who said so: receiver, second_60, configured, table, guess; None: not needed yet.
+        edges_used: edges in the line. edges_refused, messages_refused: counts by reason.
+    """
+
+    state: TimeState
+    sigma_ns: float
+    offset_ns: int | None = None
+    drift_ppm: float | None = None
+    noise_ns: float | None = None
+    source: str = ""
+    ambiguous: str = ""
+    leap_seconds: int | None = None
+    leap_origin: str = ""
+    edges_used: int = 0
+    edges_refused: dict[str, int] = field(default_factory=dict)
+    messages_refused: dict[str, int] = field(default_factory=dict)

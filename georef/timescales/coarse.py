@@ -1,0 +1,79 @@
+"""Time without edges: from the arrival of messages, or from the wall clock. Good to some tenths of a second."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from georef.timescales.gps_time import SECOND_NS
+
+MEMORY_S = 60
+TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their second
+COARSE_SIGMA_NS = 300_000_000.0
+AMBIGUOUS_SIGMA_NS = 1e9
+STEADY_READINGS = 3
+STEADY_SPAN_NS = 5 * SECOND_NS
+WALL_STEP_NS = 50_000_000  # a change of wall − host beyond this (and 500 ppm) starts the wall clock's probation anew
+WALL_MAX_AGE_NS = 120 * SECOND_NS
+WALL_DECIDES_SIGMA_S = 0.1
+
+
+class CoarseClock:
+    """GPS − host from the least delayed of the last minute's messages."""
+
+    def __init__(self) -> None:
+        self._offsets: deque[tuple[int, int]] = deque(maxlen=256)  # host ns, named second − arrival
+        self.last_host_ns: int | None = None
+
+    def add(self, host_ns: int, gps_ns: int) -> None:
+        """A message arrived at host_ns, naming the second gps_ns as just passed."""
+        self._offsets.append((host_ns, gps_ns - host_ns))
+        self.last_host_ns = host_ns
+        while host_ns - self._offsets[0][0] > MEMORY_S * SECOND_NS:
+            self._offsets.popleft()
+
+    def shift(self, seconds: int) -> None:
+        """All seconds named so far were off by this (the leap count was)."""
+        self._offsets = deque(((host, offset + seconds * SECOND_NS) for host, offset in self._offsets), maxlen=256)
+
+    def offset_ns(self) -> int | None:
+        """GPS − host: of those near the median the least delayed, less a typical delay."""
+        if not self._offsets:
+            return None
+        ordered = sorted(offset for _, offset in self._offsets)
+        median = ordered[len(ordered) // 2]
+        return max(offset for offset in ordered if offset - median <= 2 * SECOND_NS) + TYPICAL_DELAY_NS
+
+
+class WallClock:
+    """The host's wall clock against its continuous clock, and whether something disciplines it."""
+
+    def __init__(self) -> None:
+        self._host_ns = 0
+        self._offset_ns: int | None = None
+        self._sigma_s = 0.0
+        self._disciplined = False
+        self._steady_since_ns = 0
+        self._steady = 0
+
+    def set(self, host_ns: int, realtime_ns: int, disciplined: bool, sigma_s: float) -> None:
+        """One reading. A step, or a reading without discipline, starts its probation anew."""
+        offset = realtime_ns - host_ns
+        previous = self._offset_ns
+        allowed = WALL_STEP_NS + abs(host_ns - self._host_ns) // 2000
+        if previous is None or not disciplined or abs(offset - previous) > allowed:
+            self._steady, self._steady_since_ns = 0, host_ns
+        self._steady += 1
+        self._host_ns, self._offset_ns, self._disciplined, self._sigma_s = host_ns, offset, disciplined, sigma_s
+
+    def utc_offset_ns(self, host_ns: int) -> int | None:
+        """Wall − host where it may decide between seconds: disciplined, steady, recent, sigma ≤ 0.1 s."""
+        if self._offset_ns is None or not self._disciplined or self._sigma_s > WALL_DECIDES_SIGMA_S:
+            return None
+        if self._steady < STEADY_READINGS or self._host_ns - self._steady_since_ns < STEADY_SPAN_NS:
+            return None
+        return self._offset_ns if abs(host_ns - self._host_ns) <= WALL_MAX_AGE_NS else None
+
+    @property
+    def sigma_ns(self) -> float:
+        """Sigma of the last reading."""
+        return self._sigma_s * SECOND_NS

@@ -1,0 +1,181 @@
+"""Which second an edge was: integer-offset votes, one voter a kind of message.
+
+Every message gives ``offset = second − edge number`` for the edge it names. A delay of nearly one second or more would make
+it name the next edge, so the age of the messages is watched, and voters are compared with each other.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+VOTES = 15
+MIN_VOTES = 5
+MAJORITY = 0.8
+SURE_AGE_S = 0.5  # up to this age five votes of one mind are enough
+LATE_AGE_S = 0.7  # a steady delay above this may be one second and a bit less or more
+VOTER_FORGOTTEN_S = 60  # a voter silent for so many edges has no say
+
+
+class VoterKey(NamedTuple):
+    """One kind of message of one source."""
+
+    source: str
+    message: str
+    names_next: bool
+    utc: bool
+    bound: bool
+
+
+class LeapTrust(IntEnum):
+    """How far the leap count behind a vote can be believed."""
+
+    GUESSED = 0  # neither receiver nor configuration nor a table that reaches so far: no label rests on it
+    ASSUMED = 1  # configuration or table: used until a receiver says
+    SAID = 2  # a receiver said it, or the message needs none
+
+
+class Vote(NamedTuple):
+    """offset: second − edge number; age_s: of the message since the edge before it; leap: behind its second."""
+
+    offset: int
+    age_s: float
+    leap: LeapTrust
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the voters say together.
+
+    Attributes:
+        offset: the offset decided on, or the best guess where ambiguous; None: nobody is sure enough.
+        ambiguous: why it cannot be decided, empty where it is.
+        basis: "bound", "vote" or "wall_clock".
+        key: the voter (for the log). leap: the weakest leap count behind it.
+        late: ambiguous only because all messages come late; they agree with each other.
+    """
+
+    offset: int | None = None
+    ambiguous: str = ""
+    basis: str = ""
+    key: VoterKey | None = None
+    leap: LeapTrust = LeapTrust.SAID
+    late: bool = False
+
+
+class Voter:
+    """The last votes of one kind of message."""
+
+    def __init__(self, key: VoterKey) -> None:
+        self.key = key
+        self.votes: deque[Vote] = deque(maxlen=VOTES)
+        self.last_index = -(1 << 62)
+        self.late_offset: int | None = None
+        self.offset: int | None = None
+        self.late = False
+        self.undecided = 0
+
+    def add(self, index: int, vote: Vote) -> None:
+        """Take a vote for edge `index`. Two of one kind and two minds at one edge: one was stalled, neither counts."""
+        if index == self.last_index:
+            if self.votes and self.votes[-1].offset != vote.offset:
+                self.votes.pop()
+                self._count()
+            return
+        self.last_index = index
+        self.votes.append(vote)
+        self._count()
+
+    def shift(self, seconds: int) -> None:
+        """Move the votes that rest on a leap count no receiver had said: now one has."""
+        said = LeapTrust.SAID
+        moved = [v if v.leap is said else Vote(v.offset + seconds, v.age_s, said) for v in self.votes]
+        self.votes = deque(moved, maxlen=VOTES)
+        if self.late_offset is not None:
+            self.late_offset += seconds
+        self._count()
+
+    def _count(self) -> None:
+        """Set `offset` (None: no majority) and `late`."""
+        votes = self.votes
+        counts: dict[int, int] = {}
+        for vote in votes:
+            counts[vote.offset] = counts.get(vote.offset, 0) + 1
+        best = max(counts, key=counts.__getitem__) if counts else 0
+        agreeing = counts.get(best, 0)
+        self.undecided = self.undecided + 1 if len(votes) == VOTES and agreeing < MAJORITY * VOTES else 0
+        self.offset = None
+        if len(votes) < MIN_VOTES or agreeing < MAJORITY * len(votes):
+            return
+        ages = sorted(vote.age_s for vote in votes if vote.offset == best)
+        if len(votes) < VOTES and not self.key.bound and (agreeing < len(votes) or ages[-1] > SURE_AGE_S):
+            return
+        self.offset = best
+        self.late = not self.key.bound and ages[len(ages) // 2] > LATE_AGE_S
+        if self.late:
+            self.late_offset = best
+
+
+class Labeller:
+    """The voters of one edge train and the label they gave it."""
+
+    def __init__(self) -> None:
+        self.voters: dict[VoterKey, Voter] = {}
+        self.label: int | None = None  # GPS second of edge 0
+        self.verdict = Verdict()
+        self.basis = Verdict()  # the verdict that gave the label
+        self.conflict = ""
+
+    def vote(self, key: VoterKey, index: int, vote: Vote) -> None:
+        """Take one vote for edge `index`."""
+        voter = self.voters.get(key)
+        if voter is None:
+            voter = self.voters[key] = Voter(key)
+        voter.add(index, vote)
+
+    def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:
+        """The verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
+        sure = [v for v in self.voters.values() if v.offset is not None and index - v.last_index <= VOTER_FORGOTTEN_S]
+        bound = [v for v in sure if v.key.bound]
+        if bound and all(v.offset == bound[0].offset for v in bound):
+            return self._by(bound[0], "bound")
+        doubt = self._doubt(sure, bound, index)
+        fresh = [v for v in sure if not v.late]
+        if not doubt and fresh:
+            gps_scale = any(not v.key.utc for v in fresh)
+            if wall_offset is None or wall_offset == fresh[0].offset or (gps_scale and wall_leap is not LeapTrust.SAID):
+                return self._by(fresh[0], "vote")
+            doubt = f"messages and the disciplined wall clock differ by {wall_offset - (fresh[0].offset or 0)} s"
+        if not doubt:
+            return Verdict()
+        if wall_offset is not None and any(v.offset is not None or v.undecided for v in self.voters.values()):
+            return Verdict(wall_offset, "", "wall_clock", None, wall_leap)
+        late = bool(sure) and all(v.late and v.offset == sure[0].offset for v in sure)
+        return Verdict(sure[0].offset if sure else None, doubt, late=late)
+
+    @staticmethod
+    def _by(voter: Voter, basis: str) -> Verdict:
+        leap = min(vote.leap for vote in voter.votes if vote.offset == voter.offset)
+        return Verdict(voter.offset, "", basis, voter.key, leap)
+
+    def _doubt(self, sure: list[Voter], bound: list[Voter], index: int) -> str:
+        """Why the voters that are sure of their offset cannot be believed together; empty: they can."""
+        if not sure:
+            lost = [v for v in self.voters.values() if v.undecided > VOTES and index - v.last_index <= VOTES]
+            return f"{lost[0].key.source} {lost[0].key.message} keeps to no second" if lost else ""
+        first = sure[0]
+        for other in sure:
+            if other.offset != first.offset:
+                difference = (other.offset or 0) - (first.offset or 0)
+                return f"{_name(other)} is {difference:+d} s against {_name(first)}"
+            if not other.late and other.late_offset is not None and other.late_offset != other.offset:
+                return f"{_name(other)} changed its second after coming late"
+        if not bound and all(v.late for v in sure):
+            return f"{_name(first)} comes steadily more than {LATE_AGE_S} s after its edge"
+        return ""
+
+
+def _name(voter: Voter) -> str:
+    return f"{voter.key.source} {voter.key.message}".strip()

@@ -1,0 +1,94 @@
+"""GPS − UTC as far as anybody has said it: the receivers, a second 23:59:60 seen, the configuration, the table."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from georef.records import TimeScale, TimeTag
+from georef.timescales.gps_time import DAY_NS, table_leap_seconds
+from georef.timescales.labelling import LeapTrust
+
+
+class LeapSeconds(NamedTuple):
+    """A leap count and where it comes from: receiver, second_60, configured, table or guess."""
+
+    seconds: int
+    origin: str
+
+    @property
+    def trust(self) -> LeapTrust:
+        """How far a label may rest on it."""
+        if self.origin in ("receiver", "second_60"):
+            return LeapTrust.SAID
+        return LeapTrust.GUESSED if self.origin == "guess" else LeapTrust.ASSUMED
+
+
+@dataclass(frozen=True, slots=True)
+class LeapChange:
+    """A receiver said another count than the one in use. before: that one. said_before: a receiver had said that, too."""
+
+    source: str
+    before: int
+    now: int
+    said_before: bool
+
+
+class LeapBook:
+    """Who said which leap count."""
+
+    def __init__(self, assumed: int | None) -> None:
+        self.assumed = assumed
+        self._said: dict[str, int] = {}
+        self._inserted: dict[str, tuple[dt.date, int]] = {}  # source: first day of the new count, the count
+
+    def said_by(self, source: str) -> int | None:
+        """What this source itself has said."""
+        return self._said.get(source)
+
+    def on(self, source: str, date: dt.date) -> LeapSeconds:
+        """The count for a UTC message of a source on a date."""
+        inserted = self._inserted.get(source)
+        if inserted is not None and date >= inserted[0]:
+            return LeapSeconds(inserted[1], "second_60")
+        return self._without_insertion(source, date)
+
+    def _without_insertion(self, source: str, date: dt.date) -> LeapSeconds:
+        said = self._said.get(source, next(iter(self._said.values()), None))
+        if said is not None:
+            return LeapSeconds(said, "receiver")
+        if self.assumed is not None:
+            return LeapSeconds(self.assumed, "configured")
+        seconds, known = table_leap_seconds(date)
+        return LeapSeconds(seconds, "table" if known else "guess")
+
+    def hear(self, source: str, tag: TimeTag) -> LeapChange | None:
+        """Note what a tag says about leap seconds; the change, where it differs from what was in use."""
+        if tag.scale is TimeScale.UTC and tag.date is not None and tag.time_ns >= DAY_NS:
+            self._see_second_60(source, tag.date, tag.leap_seconds)
+        said = tag.leap_seconds
+        if said is None or said == self._said.get(source):
+            return None
+        date = tag.date if tag.date is not None else dt.date.max
+        before = self.on(source, date) if date is not dt.date.max else self._latest(source)
+        said_before = source in self._said
+        self._said[source] = said
+        inserted = self._inserted.get(source)
+        if inserted is not None and inserted[1] == said:
+            del self._inserted[source]
+            return None
+        if before.seconds == said:
+            return None
+        return LeapChange(source, before.seconds, said, said_before)
+
+    def _latest(self, source: str) -> LeapSeconds:
+        inserted = self._inserted.get(source)
+        return LeapSeconds(inserted[1], "second_60") if inserted else self._without_insertion(source, dt.date.max)
+
+    def _see_second_60(self, source: str, date: dt.date, said: int | None) -> None:
+        """A second 23:59:60 on the last day of a month: from the next day on there is one more."""
+        next_day = date + dt.timedelta(days=1)
+        if next_day.day == 1 and source not in self._inserted:
+            before = said if said is not None else self._without_insertion(source, date).seconds
+            self._inserted[source] = (next_day, before + 1)

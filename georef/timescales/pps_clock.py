@@ -1,0 +1,477 @@
+"""The host's clock in GPS time: PPS edges give the fraction, time messages the second.
+
+Edges pass a gate around the line's prediction (`edge_train`), the line carries an honest sigma (`line_fit`), every message votes
+for a whole number of seconds (`labelling`). A label once accepted is held; whatever contradicts it is an event and COARSE, never
+a silent change. All times given are on one continuous host scale (CLOCK_MONOTONIC_RAW, see `host_timeline`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
+from georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
+from georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
+from georef.timescales.edge_train import MAX_REFUSED_IN_A_ROW, NOISY_AFTER_EDGES, EdgeTrain, find_chain
+from georef.timescales.gps_time import (
+    SECOND_NS,
+    gps_ns_from_unix,
+    nearest_gps_ns,
+    utc_from_gps,
+    whole_gps_ns,
+)
+from georef.timescales.history import gps_of_trains
+from georef.timescales.labelling import LeapTrust, Verdict, Vote, VoterKey
+from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds
+
+WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
+HOLDOVER_AFTER_NS = 5_500_000_000
+LOST_SIGMA_NS = 1_000_000.0
+COARSE_FOR_NS = 60 * SECOND_NS
+RECENT_MESSAGES = 128
+RECENT_EDGES = 24
+MESSAGES_KEPT_NS = 30 * SECOND_NS
+MAX_QUANTISATION_AGE_NS = 1_100_000_000
+SAME_SECOND_NS = SECOND_NS // 2
+PHASE_JUMP_NS = 1_000_000
+BASIS_RANK = {"": 0, "vote": 1, "wall_clock": 2, "bound": 3}
+
+
+class _Said(NamedTuple):
+    """A message as it votes: arrival, voter, second named, trust in its leap count."""
+
+    host_ns: int
+    key: VoterKey
+    second: int
+    leap: LeapTrust
+
+
+class PpsClock:
+    """Maps host time to GPS time with a sigma and a state; fed edge by edge and message by message."""
+
+    def __init__(
+        self,
+        assumed_leap_seconds: int | None = None,
+        names_edge: NamesEdge | None = None,
+        delay_ns: int = 0,
+        *,
+        keep_history: bool = False,
+        lost_sigma_ns: float = LOST_SIGMA_NS,
+    ) -> None:
+        """assumed_leap_seconds: GPS − UTC until a receiver says. names_edge: override of what the messages say of themselves.
+
+        delay_ns: cable and capture delay, subtracted from every edge. keep_history: one knot a second is kept for
+        post-processing; otherwise the last quarter of an hour. lost_sigma_ns: HOLDOVER ends there.
+        """
+        self.leaps = LeapBook(assumed_leap_seconds)
+        self._names_edge = names_edge
+        self._delay_ns = delay_ns
+        self._keep_history = keep_history
+        self._lost_sigma_ns = lost_sigma_ns
+        self._train: EdgeTrain | None = None
+        self._candidate: EdgeTrain | None = None
+        self._former: list[EdgeTrain] = []
+        self._coarse = CoarseClock()
+        self._wall = WallClock()
+        self._leap: LeapSeconds | None = None
+        self._edges: deque[int] = deque(maxlen=RECENT_EDGES)
+        self._edges_unlocked = 0
+        self._messages: deque[_Said] = deque(maxlen=RECENT_MESSAGES)
+        self._quantisation: tuple[int, int, float] | None = None  # host ns, second, ns
+        self._events: list[ClockEvent] = []
+        self._warned: set[str] = set()
+        self._edges_used = 0
+        self.edges_refused: dict[str, int] = {}
+        self.messages_refused: dict[str, int] = {}
+
+    # ---- edges
+
+    def add_edge(self, host_ns: int, sequence: int = 0) -> None:
+        """One edge at a host time. sequence (the kernel's) is not needed: the edge's place is its time."""
+        del sequence
+        host = host_ns - self._delay_ns
+        if self._edges and host <= self._edges[-1]:
+            self._refuse_edge("backwards")
+            return
+        host = self._without_quantisation(host)
+        self._edges.append(host)
+        train = self._train
+        if train is not None:
+            reason = train.offer(host)
+            if reason is None:
+                self._edges_used += 1
+                self._candidate = None
+                return
+            self._refuse_edge(reason)
+            if train.refused_in_a_row <= MAX_REFUSED_IN_A_ROW:
+                return
+        self._follow_candidate(host)
+
+    def _refuse_edge(self, reason: str) -> None:
+        self.edges_refused[reason] = self.edges_refused.get(reason, 0) + 1
+
+    def _without_quantisation(self, host_ns: int) -> int:
+        """The edge less the receiver's own error, where a message before it told that."""
+        told = self._quantisation
+        if told is None or not 0 < host_ns - told[0] <= MAX_QUANTISATION_AGE_NS:
+            return host_ns
+        train = self._train
+        if train is not None and train.labeller.label is not None:
+            named = told[1] - train.labeller.label
+            if abs(train.index_at(host_ns) - named) > 0.1:
+                return host_ns
+        self._quantisation = None
+        return host_ns - round(told[2])
+
+    def _follow_candidate(self, host_ns: int) -> None:
+        """Look for a train among the edges not used, and let it replace the current one when it may."""
+        candidate = self._candidate
+        if candidate is not None:
+            reason = candidate.offer(host_ns)
+            if candidate.refused_in_a_row <= MAX_REFUSED_IN_A_ROW:
+                if reason is None:
+                    self._replace_if_labelled()
+                return
+            self._candidate = None
+        self._edges_unlocked += 1
+        chain = find_chain(list(self._edges), noisy=self._edges_unlocked > NOISY_AFTER_EDGES)
+        if chain is None:
+            if self._train is None:
+                self._refuse_edge("no_train_yet")
+            return
+        self._edges_unlocked = 0
+        train = EdgeTrain(chain, keep_history=self._keep_history)
+        self._tell_recent_messages(train)
+        if self._train is None or self._train.labeller.label is None:
+            if self._train is not None:
+                self._event(host_ns, Severity.WARNING, "pps_relocked", "another train of edges than before")
+            self._train = train
+            self._edges_used += train.used
+            self._decide(train, host_ns)
+        else:
+            self._candidate = train
+            self._replace_if_labelled()
+
+    def _tell_recent_messages(self, train: EdgeTrain) -> None:
+        for said in self._messages:
+            if said.host_ns >= train.first_knot_ns:
+                self._vote(train, said)
+
+    def _replace_if_labelled(self) -> None:
+        """The candidate takes over once its seconds are known and do not contradict the ones held."""
+        old, new = self._train, self._candidate
+        if old is None or new is None:
+            return
+        host = new.last_host_ns
+        verdict = self._verdict(new, host)
+        if verdict.offset is None or verdict.ambiguous or verdict.leap is LeapTrust.GUESSED:
+            return
+        held = _gps_float(old, host)
+        jump_ns = (verdict.offset + new.index_at(host) - held) * SECOND_NS
+        rank = BASIS_RANK[verdict.basis] > BASIS_RANK[old.labeller.basis.basis]
+        if abs(jump_ns) >= SAME_SECOND_NS and not rank:
+            self._set_conflict(old, host, f"after the edges changed the messages are {jump_ns / SECOND_NS:+.1f} s off")
+            return
+        severity = Severity.WARNING if abs(jump_ns) >= PHASE_JUMP_NS else Severity.INFO
+        self._event(host, severity, "pps_relocked", f"edges moved by {jump_ns / 1e6:+.3f} ms against holdover")
+        new.labeller.label, new.labeller.basis = verdict.offset, verdict
+        self._former.append(old)
+        if not self._keep_history:
+            del self._former[:-2]
+        self._edges_used += new.used
+        self._train, self._candidate = new, None
+
+    # ---- messages
+
+    def add_message(self, source: str, message: TimeMessage) -> None:
+        """One time message of a source (``gnss/rover``)."""
+        if not message.valid:
+            self._refuse_message("invalid")
+            return
+        tag = message.time
+        change = self.leaps.hear(source, tag)
+        if change is not None:
+            self._leap_changed(message.host_time_ns, change)
+        fraction = (tag.time_ns + SECOND_NS // 2) % SECOND_NS - SECOND_NS // 2
+        if abs(fraction) > WHOLE_SECOND_TOLERANCE_NS:
+            self._refuse_message("off_second")
+            return
+        placed = self._place(source, tag, message.host_time_ns)
+        if placed is None:
+            self._refuse_message("unplaced")
+            return
+        gps_ns, trust = placed
+        second = round(gps_ns / SECOND_NS)
+        names_next = (self._names_edge or message.names_edge) is NamesEdge.NEXT
+        self._note_quantisation(message, second, names_next)
+        key = VoterKey(source, message.message, names_next, tag.scale is TimeScale.UTC, message.bound)
+        said = _Said(message.host_time_ns, key, second, trust)
+        self._messages.append(said)
+        self._coarse.add(said.host_ns, (second - names_next) * SECOND_NS)
+        for train in (self._train, self._candidate):
+            if train is not None and self._vote(train, said) and train is self._train:
+                self._decide(train, said.host_ns)
+
+    def _refuse_message(self, reason: str) -> None:
+        self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
+
+    def _place(self, source: str, tag: TimeTag, host_ns: int) -> tuple[int, LeapTrust] | None:
+        """GPS ns of a tag and the trust in its leap count; by what is known so far where it lacks week or date."""
+        if tag.scale is TimeScale.GPS and tag.week is not None:
+            return whole_gps_ns(tag, None) or 0, LeapTrust.SAID
+        near = self._best_guess(host_ns)
+        if tag.scale is TimeScale.GPS:
+            gps = None if near is None else nearest_gps_ns(tag, near, None)
+            return None if gps is None else (gps, LeapTrust.SAID)
+        date = tag.date
+        if date is None and near is not None:
+            date = utc_from_gps(near, 18)[0]
+        if date is None:
+            return None
+        leap = self.leaps.on(source, date)
+        if tag.leap_seconds is not None:
+            leap = LeapSeconds(tag.leap_seconds, "receiver")
+        self._leap = leap
+        gps = whole_gps_ns(tag, leap.seconds)
+        if gps is None and near is not None:
+            gps = nearest_gps_ns(tag, near, leap.seconds)
+        return None if gps is None else (gps, leap.trust)
+
+    def _best_guess(self, host_ns: int) -> int | None:
+        """GPS ns at a host time by the best there is, without regard to its quality."""
+        train = self._train
+        if train is not None and train.labeller.label is not None:
+            return round(_gps_float(train, host_ns) * 1e6) * 1000
+        offset = self._coarse.offset_ns()
+        return None if offset is None else host_ns + offset
+
+    def _note_quantisation(self, message: TimeMessage, second: int, names_next: bool) -> None:
+        """Keep the error of the edge to come; correct the edge just taken."""
+        if message.quantisation_ns == 0.0:
+            return
+        if names_next:
+            self._quantisation = (message.host_time_ns, second, message.quantisation_ns)
+            return
+        train = self._train
+        if train is not None and train.labeller.label == second - train.bank.knot.index:
+            train.amend_last(-message.quantisation_ns)
+
+    def _vote(self, train: EdgeTrain, said: _Said) -> bool:
+        """Let a message vote on a train. Where the train stood at its arrival follows from the line, not from what came first."""
+        place = train.index_at(said.host_ns)
+        index = math.floor(place)
+        if index < 0:
+            return False
+        named = index + 1 if said.key.names_next else index
+        train.labeller.vote(said.key, index, Vote(said.second - named, place - index, said.leap))
+        return True
+
+    # ---- labels
+
+    def _verdict(self, train: EdgeTrain, host_ns: int) -> Verdict:
+        wall = self._wall.utc_offset_ns(host_ns)
+        index = math.floor(train.index_at(host_ns))
+        if wall is None:
+            return train.labeller.decide(index, None, LeapTrust.GUESSED)
+        date, _ = utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)
+        leap = self.leaps.on("", date)
+        offset = gps_ns_from_unix(host_ns + wall, leap.seconds) / SECOND_NS - train.index_at(host_ns)
+        if abs(offset - round(offset)) > 0.3:
+            return train.labeller.decide(index, None, LeapTrust.GUESSED)
+        return train.labeller.decide(index, round(offset), leap.trust)
+
+    def _decide(self, train: EdgeTrain, host_ns: int) -> None:
+        """Label the train, hold its label, or say why its seconds are not certain."""
+        labeller = train.labeller
+        verdict = labeller.verdict = self._verdict(train, host_ns)
+        if verdict.offset is None and not verdict.ambiguous:
+            return
+        if verdict.leap is LeapTrust.GUESSED and not verdict.ambiguous:
+            self._warn_once(
+                host_ns, "leap_unknown", "UTC only, and neither receiver nor configuration says leap seconds"
+            )
+            return
+        if labeller.label is None:
+            if verdict.ambiguous:
+                self._set_conflict(train, host_ns, verdict.ambiguous)
+            else:
+                self._clear_conflict(train, host_ns)
+                labeller.label, labeller.basis = verdict.offset, verdict
+                self._event(host_ns, Severity.INFO, "second_known", f"by {_basis_text(verdict)}")
+        elif verdict.offset == labeller.label and (not verdict.ambiguous or verdict.late):
+            if verdict.late:
+                self._warn_once(host_ns, "messages_late", verdict.ambiguous)
+            else:
+                self._confirm(train, host_ns, verdict)
+        elif not verdict.ambiguous and BASIS_RANK[verdict.basis] > BASIS_RANK[labeller.basis.basis]:
+            self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, f"by {_basis_text(verdict)}")
+            labeller.basis = verdict
+            self._clear_conflict(train, host_ns)
+        else:
+            difference = 0 if verdict.offset is None else verdict.offset - labeller.label
+            text = verdict.ambiguous or f"{_basis_text(verdict)} is {difference:+d} s against the second held"
+            self._set_conflict(train, host_ns, text)
+
+    def _confirm(self, train: EdgeTrain, host_ns: int, verdict: Verdict) -> None:
+        self._clear_conflict(train, host_ns)
+        basis = train.labeller.basis
+        if (BASIS_RANK[verdict.basis], verdict.leap) > (BASIS_RANK[basis.basis], basis.leap):
+            train.labeller.basis = verdict
+
+    def _set_conflict(self, train: EdgeTrain, host_ns: int, text: str) -> None:
+        if not train.doubtful:
+            self._event(host_ns, Severity.ERROR, "second_ambiguous", text)
+        train.doubtful = True
+        train.labeller.conflict = text
+
+    def _clear_conflict(self, train: EdgeTrain, host_ns: int) -> None:
+        if train.doubtful:
+            self._event(host_ns, Severity.INFO, "second_confirmed", "the contradiction has ended")
+        train.doubtful = False
+        train.labeller.conflict = ""
+
+    def _relabel(self, train: EdgeTrain, host_ns: int, seconds: int, why: str) -> None:
+        train.labeller.label = (train.labeller.label or 0) + seconds
+        text = f"all seconds since these edges began move by {seconds:+d} s, {why}"
+        self._event(host_ns, Severity.ERROR, "relabelled", text)
+
+    def _leap_changed(self, host_ns: int, change: LeapChange) -> None:
+        """A receiver says another leap count: what rested on the assumed one moves, in one logged step."""
+        text = f"{change.source} says GPS − UTC is {change.now} s, in use was {change.before} s"
+        self._event(host_ns, Severity.WARNING, "leap_seconds_changed", text)
+        if change.said_before:
+            return
+        seconds = change.now - change.before
+        said = LeapTrust.SAID
+        self._messages = deque(
+            (m if m.leap is said else _Said(m.host_ns, m.key, m.second + seconds, said) for m in self._messages),
+            maxlen=RECENT_MESSAGES,
+        )
+        if not self._coarse_is_gps():
+            self._coarse.shift(seconds)
+        for train in (self._train, self._candidate, *self._former):
+            if train is None:
+                continue
+            for key, voter in train.labeller.voters.items():
+                if key.utc:
+                    voter.shift(seconds)
+            if train.labeller.label is not None and train.labeller.basis.leap is not said:
+                self._relabel(train, host_ns, seconds, "for the leap seconds the receiver says")
+                train.labeller.basis = _with_leap_said(train.labeller.basis, seconds)
+
+    def _coarse_is_gps(self) -> bool:
+        return any(not said.key.utc for said in self._messages)
+
+    # ---- wall clock
+
+    def set_wall_clock(self, host_ns: int, realtime_ns: int, *, disciplined: bool, sigma_s: float) -> None:
+        """One reading of CLOCK_REALTIME beside the host scale; it decides between seconds only where disciplined and steady."""
+        self._wall.set(host_ns, realtime_ns, disciplined, sigma_s)
+
+    # ---- answers
+
+    def status(self, host_ns: int) -> ClockStatus:
+        """State, sigma and counts at a host time."""
+        state, offset, sigma = self._state(host_ns)
+        train = self._train
+        verdict = train.labeller.basis if train is not None else Verdict()
+        return ClockStatus(
+            state=state,
+            sigma_ns=sigma,
+            offset_ns=offset,
+            drift_ppm=train.bank.knot.drift_ns_s / 1e3 if train is not None else None,
+            noise_ns=train.bank.noise_ns if train is not None else None,
+            source=_basis_text(verdict),
+            ambiguous=train.labeller.conflict if train is not None else "",
+            leap_seconds=self._leap.seconds if self._leap is not None else None,
+            leap_origin=self._leap.origin if self._leap is not None else "",
+            edges_used=self._edges_used,
+            edges_refused=dict(self.edges_refused),
+            messages_refused=dict(self.messages_refused),
+        )
+
+    def _state(self, host_ns: int) -> tuple[TimeState, int | None, float]:
+        """State, GPS − host and sigma at a host time."""
+        train = self._train
+        if train is not None and train.labeller.label is not None and not train.doubtful:
+            gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
+            offset, sigma_ns = int(gps[0]) - host_ns, float(sigma[0])
+            if host_ns - train.last_host_ns <= HOLDOVER_AFTER_NS:
+                return TimeState.LOCKED, offset, sigma_ns
+            if sigma_ns <= self._lost_sigma_ns:
+                return TimeState.HOLDOVER, offset, sigma_ns
+            return TimeState.LOST, offset, sigma_ns
+        return self._coarse_state(host_ns)
+
+    def _coarse_state(self, host_ns: int) -> tuple[TimeState, int | None, float]:
+        ambiguous = self._train is not None and self._train.doubtful
+        sigma = AMBIGUOUS_SIGMA_NS if ambiguous else COARSE_SIGMA_NS
+        wall = self._wall.utc_offset_ns(host_ns)
+        offset, last = self._coarse.offset_ns(), self._coarse.last_host_ns
+        if last is not None and offset is not None and host_ns - last <= COARSE_FOR_NS:
+            return TimeState.COARSE, offset, sigma
+        if wall is not None:
+            leap = self.leaps.on("", utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)[0])
+            self._leap = self._leap or leap
+            return TimeState.COARSE, gps_ns_from_unix(wall, leap.seconds), max(self._wall.sigma_ns, sigma)
+        if last is None or offset is None:
+            return TimeState.NO_TIME, None, math.inf
+        return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)
+
+    def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+        """GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where there are later ones.
+
+        Without time the sigma is inf and the GPS time 0.
+        """
+        host = np.atleast_1d(np.asarray(host_ns, dtype=np.int64))
+        if not host.size:
+            return host.copy(), np.zeros(0)
+        if any(train.labeller.label is not None for train in self._trains()):
+            return self._by_trains(host)
+        _, offset, sigma = self._coarse_state(int(host.max()))
+        if offset is None:
+            return np.zeros_like(host), np.full(host.shape, math.inf)
+        return host + offset, np.full(host.shape, sigma)
+
+    def _trains(self) -> list[EdgeTrain]:
+        return [*self._former, self._train] if self._train is not None else []
+
+    def _by_trains(self, host: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+        return gps_of_trains([train for train in self._trains() if train.labeller.label is not None], host)
+
+    # ---- events
+
+    def drain_events(self) -> list[ClockEvent]:
+        """What happened since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def _event(self, host_ns: int, severity: Severity, code: str, text: str) -> None:
+        self._events.append(ClockEvent(host_ns, severity, code, text))
+        del self._events[:-1000]
+
+    def _warn_once(self, host_ns: int, code: str, text: str) -> None:
+        if code not in self._warned:
+            self._warned.add(code)
+            self._event(host_ns, Severity.WARNING, code, text)
+
+
+def _gps_float(train: EdgeTrain, host_ns: int) -> float:
+    """GPS seconds of a labelled train at a host time, to 0.3 µs."""
+    return (train.labeller.label or 0) + train.index_at(host_ns)
+
+
+def _basis_text(verdict: Verdict) -> str:
+    if verdict.key is None:
+        return verdict.basis
+    return f"{verdict.key.source} {verdict.key.message}".strip()
+
+
+def _with_leap_said(verdict: Verdict, seconds: int) -> Verdict:
+    offset = None if verdict.offset is None else verdict.offset + seconds
+    return Verdict(offset, verdict.ambiguous, verdict.basis, verdict.key, LeapTrust.SAID, verdict.late)
