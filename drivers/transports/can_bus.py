@@ -68,6 +68,10 @@ class PythonCanTransport(DescriptorTransport):
         spec = self._spec
         try:
             self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
+        except NameError as error:  # how a python-can interface says that its maker's library is not installed
+            raise TransportError(
+                f"{self.name}: the library of the {spec.interface} adapter is not installed"
+            ) from error
         except (can.CanError, OSError, ImportError, *_UNREADABLE) as error:
             raise TransportError(f"{self.name}: cannot open the CAN bus: {_one_line(error)}") from error
         self._fd = _descriptor(self._bus)
@@ -193,11 +197,13 @@ def _descriptor(bus: can.BusABC) -> int:
 
 
 def _one_line(error: BaseException) -> str:
-    """The error's text and, where it hides what happened, that of its cause."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    cause = error.__cause__
-    reason = "" if cause is None else " ".join(str(cause).split())
-    return text if not reason or reason in text else f"{text}: {reason}"
+    """What happened in the end: the system's word where there is one below the interface's own."""
+    root = error
+    while root.__cause__ is not None or root.__context__ is not None:
+        root = root.__cause__ or root.__context__ or root
+    if isinstance(root, OSError) and root.strerror:
+        return root.strerror
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _blocks(frames: list[bytes], stamps: list[int] | None) -> list[UnitBlock]:

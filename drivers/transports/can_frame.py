@@ -10,18 +10,21 @@ import struct
 
 import can
 
+from drivers.core.can_frames import (
+    CAN_EFF_FLAG,
+    CAN_EFF_MASK,
+    CAN_ERR_FLAG,
+    CAN_FRAME_BYTES,
+    CAN_RTR_FLAG,
+    CAN_SFF_MASK,
+    CANFD_BRS,
+    CANFD_FDF,
+    CANFD_FRAME_BYTES,
+)
+
 HEADER = struct.Struct("<IBBxx")
-FRAME_BYTES = 16  # CAN_MTU
-FD_FRAME_BYTES = 72  # CANFD_MTU
-EXTENDED_FLAG = 0x8000_0000  # CAN_EFF_FLAG
-REMOTE_FLAG = 0x4000_0000  # CAN_RTR_FLAG
-ERROR_FLAG = 0x2000_0000  # CAN_ERR_FLAG
-EXTENDED_MASK = 0x1FFF_FFFF
-STANDARD_MASK = 0x7FF
-ERROR_BUS_OFF = 0x40  # <linux/can/error.h>, CAN_ERR_BUSOFF
-FD_BIT_RATE_SWITCH = 0x01  # CANFD_BRS
+ERROR_BUS_OFF = 0x40  # <linux/can/error.h>, CAN_ERR_BUSOFF, in the identifier of an error frame
 FD_ERROR_STATE = 0x02  # CANFD_ESI
-FD_FRAME = 0x04  # CANFD_FDF
 
 
 def pack_frame(message: can.Message) -> bytes:
@@ -31,11 +34,11 @@ def pack_frame(message: can.Message) -> bytes:
         ValueError: the message does not fit a frame (its identifier or its length).
     """
     flags = (
-        (EXTENDED_FLAG if message.is_extended_id else 0)
-        | (REMOTE_FLAG if message.is_remote_frame else 0)
-        | (ERROR_FLAG if message.is_error_frame else 0)
+        (CAN_EFF_FLAG if message.is_extended_id else 0)
+        | (CAN_RTR_FLAG if message.is_remote_frame else 0)
+        | (CAN_ERR_FLAG if message.is_error_frame else 0)
     )
-    largest = EXTENDED_MASK if message.is_extended_id or message.is_error_frame else STANDARD_MASK
+    largest = CAN_EFF_MASK if message.is_extended_id or message.is_error_frame else CAN_SFF_MASK
     data = b"" if message.is_remote_frame else bytes(message.data)
     length = message.dlc if message.is_remote_frame else len(data)
     if not 0 <= message.arbitration_id <= largest or not 0 <= length <= (64 if message.is_fd else 8):
@@ -43,8 +46,8 @@ def pack_frame(message: can.Message) -> bytes:
     if not message.is_fd:
         return HEADER.pack(message.arbitration_id | flags, length, 0) + data.ljust(8, b"\0")
     fd_flags = (
-        FD_FRAME
-        | (FD_BIT_RATE_SWITCH if message.bitrate_switch else 0)
+        CANFD_FDF
+        | (CANFD_BRS if message.bitrate_switch else 0)
         | (FD_ERROR_STATE if message.error_state_indicator else 0)
     )
     return HEADER.pack(message.arbitration_id | flags, length, fd_flags) + data.ljust(64, b"\0")
@@ -56,20 +59,20 @@ def unpack_frame(frame: bytes) -> can.Message:
     Raises:
         ValueError: not 16 or 72 bytes, or a length field beyond the data.
     """
-    if len(frame) not in (FRAME_BYTES, FD_FRAME_BYTES):
-        raise ValueError(f"a CAN frame has {FRAME_BYTES} or {FD_FRAME_BYTES} bytes, not {len(frame)}")
+    if len(frame) not in (CAN_FRAME_BYTES, CANFD_FRAME_BYTES):
+        raise ValueError(f"a CAN frame has {CAN_FRAME_BYTES} or {CANFD_FRAME_BYTES} bytes, not {len(frame)}")
     identifier, length, fd_flags = HEADER.unpack_from(frame)
     if length > len(frame) - HEADER.size:
         raise ValueError(f"a CAN frame of {len(frame)} bytes cannot hold {length} bytes of data")
-    extended, error = bool(identifier & EXTENDED_FLAG), bool(identifier & ERROR_FLAG)
-    is_fd, remote = len(frame) == FD_FRAME_BYTES, bool(identifier & REMOTE_FLAG)
+    extended, error = bool(identifier & CAN_EFF_FLAG), bool(identifier & CAN_ERR_FLAG)
+    is_fd, remote = len(frame) == CANFD_FRAME_BYTES, bool(identifier & CAN_RTR_FLAG)
     return can.Message(
-        arbitration_id=identifier & (EXTENDED_MASK if extended or error else STANDARD_MASK),
+        arbitration_id=identifier & (CAN_EFF_MASK if extended or error else CAN_SFF_MASK),
         is_extended_id=extended,
         is_remote_frame=remote,
         is_error_frame=error,
         is_fd=is_fd,
-        bitrate_switch=is_fd and bool(fd_flags & FD_BIT_RATE_SWITCH),
+        bitrate_switch=is_fd and bool(fd_flags & CANFD_BRS),
         error_state_indicator=is_fd and bool(fd_flags & FD_ERROR_STATE),
         dlc=length,
         data=None if remote else frame[HEADER.size : HEADER.size + length],

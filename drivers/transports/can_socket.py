@@ -14,6 +14,7 @@ import time
 
 import numpy as np
 
+from drivers.core.can_frames import CAN_ERR_FLAG, CANFD_FRAME_BYTES
 from drivers.transports.base import TransportError, UnitBlock
 from drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
 from drivers.transports.mmsg import DropCounter, MessageReader, ask_receive_buffer, ask_stamps
@@ -31,8 +32,6 @@ _CAN_RAW = 1
 _SOL_CAN_RAW = 101
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
-_FD_FRAME_BYTES = 72
-_ERROR_FLAG = 0x2000_0000
 _ERROR_CLASSES = 0x1FFF_FFFF  # CAN_ERR_MASK: every class of error frame
 _ERROR_BUS_OFF = 0x40
 _ALL_ERRORS = struct.pack("@I", _ERROR_CLASSES)
@@ -54,7 +53,7 @@ class SocketCanTransport(DescriptorTransport):
         self._batch_s = batch_s
         self._sock: socket.socket | None = None
         self._drops: DropCounter | None = None
-        self._reader = MessageReader(_FD_FRAME_BYTES, SLOTS, peers=False)
+        self._reader = MessageReader(CANFD_FRAME_BYTES, SLOTS, peers=False)
 
     def _open_device(self) -> int:
         try:
@@ -134,7 +133,7 @@ class SocketCanTransport(DescriptorTransport):
 
     def _count_errors(self, block: UnitBlock) -> None:
         identifiers = block.units[:, :4].copy().view("<u4")[:, 0]
-        errors = identifiers[(identifiers & _ERROR_FLAG) != 0]
+        errors = identifiers[(identifiers & CAN_ERR_FLAG) != 0]
         self.counters.error_frames += len(errors)
         self.counters.bus_off += int(np.count_nonzero(errors & _ERROR_BUS_OFF))
 

@@ -31,9 +31,16 @@ def udp_port_holder(port: int) -> str:
 
 def _has_link(folder: Path, target: str) -> bool:
     try:
-        return any(os.readlink(entry) == target for entry in folder.iterdir())
+        return any(_link(entry) == target for entry in folder.iterdir())
     except OSError:  # not ours to look into, or gone meanwhile
         return False
+
+
+def _link(entry: Path) -> str:
+    try:
+        return os.readlink(entry)
+    except FileNotFoundError:  # closed meanwhile, such as the descriptor the listing itself was read by
+        return ""
 
 
 def _command(pid: int) -> str:

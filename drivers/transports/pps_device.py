@@ -73,7 +73,7 @@ class KernelPps(PpsSource):
                 f'{self._path}: not permitted to this user; install the udev rule (KERNEL=="pps[0-9]*", '
                 'GROUP="swath", MODE="0660") or add the user to the device\'s group'
             )
-        if error.errno in (errno.ENOTTY, errno.EINVAL):
+        if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
             return f"{self._path}: is no PPS device"
         return f"{self._path}: PPS device failed: {error.strerror}"
 

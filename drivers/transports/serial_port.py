@@ -96,7 +96,8 @@ class SerialTransport(DescriptorTransport):
             return f"{self.name}: {self._path} is in use by {process_holding(os.path.realpath(self._path))}"
         if number in (errno.EIO, errno.ENXIO, errno.ENODEV):
             return f"{self.name}: nothing is connected to {self._path}"
-        return f"{self.name}: cannot open {self._path} as a serial port: {' '.join(str(error).split())}"
+        reason = os.strerror(number) if number else " ".join(str(error).split())
+        return f"{self.name}: cannot open {self._path} as a serial port: {reason}"
 
     def _close_device(self) -> None:
         port, self._port = self._port, None

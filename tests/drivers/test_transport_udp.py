@@ -1,0 +1,353 @@
+"""UDP over real sockets of this machine: order, stamps, exact losses, filters, and errors that say what is wrong."""
+
+from __future__ import annotations
+
+import ctypes
+import random
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.transports.base import TransportError, UnitBlock
+from drivers.transports.udp_socket import UdpTransport
+from drivers.transports.uri import parse_transport
+
+GROUP = "239.74.163.77"
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def transport(options: str = "", host: str = "127.0.0.1", port: int | None = None) -> UdpTransport:
+    return UdpTransport(parse_transport(f"udp:{host}:{port or free_port()}{options}"))
+
+
+def port_of(udp: UdpTransport) -> int:
+    return udp._spec.port
+
+
+@pytest.fixture
+def sender() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        yield sock
+
+
+def collect(udp: UdpTransport, units: int) -> list[UnitBlock]:
+    """Blocks until ``units`` came or 5 s were silent."""
+    blocks: list[UnitBlock] = []
+    while sum(len(block.units) for block in blocks) < units:
+        more = udp.receive(5.0)
+        if not more:
+            break
+        blocks += more
+    return blocks
+
+
+def payloads(blocks: list[UnitBlock]) -> list[bytes]:
+    return [row.tobytes() for block in blocks for row in block.units]
+
+
+def test_burst_of_mixed_lengths_comes_whole_and_in_order(sender: socket.socket) -> None:
+    rng = random.Random(1)
+    sent = [rng.randbytes(rng.choice([1, 512, 512, 1206, 1206, 1206, 8448])) for _ in range(3000)]
+    udp = transport()
+    udp.open()
+    for data in sent:
+        sender.sendto(data, ("127.0.0.1", port_of(udp)))
+    blocks = collect(udp, len(sent))
+    assert payloads(blocks) == sent
+    for block in blocks:
+        assert block.peer == sender.getsockname()
+        assert block.units.flags.c_contiguous
+    assert udp.poll_counters().lost_kernel == 0
+    udp.close()
+
+
+def test_empty_and_largest_datagrams_are_units_like_others(sender: socket.socket) -> None:
+    udp = transport()
+    udp.open()
+    sent = [b"", b"\xa5" * 65507, b"", b"", b"\x5a" * 65507]
+    for data in sent:
+        sender.sendto(data, ("127.0.0.1", port_of(udp)))
+    blocks = collect(udp, len(sent))
+    assert payloads(blocks) == sent
+    assert [block.units.shape for block in blocks] == [(1, 0), (1, 65507), (2, 0), (1, 65507)]
+    udp.close()
+
+
+def test_runs_of_equal_length_are_one_block(sender: socket.socket) -> None:
+    udp = transport()
+    udp.open()
+    for index in range(200):
+        sender.sendto(index.to_bytes(2, "big") * 603, ("127.0.0.1", port_of(udp)))
+    blocks = udp.receive(5.0)
+    assert [block.units.shape for block in blocks] == [(200, 1206)]
+    assert np.array_equal(blocks[0].units[:, 1], np.arange(200))
+    udp.close()
+
+
+def test_blocks_stay_as_they_are_when_more_is_read(sender: socket.socket) -> None:
+    udp = transport()
+    udp.open()
+    sender.sendto(b"first", ("127.0.0.1", port_of(udp)))
+    first = udp.receive(5.0)
+    sender.sendto(b"other", ("127.0.0.1", port_of(udp)))
+    assert payloads(udp.receive(5.0)) == [b"other"]
+    assert payloads(first) == [b"first"]
+    udp.close()
+
+
+def test_stamps_are_the_kernels_and_ordered(sender: socket.socket) -> None:
+    udp = transport()
+    udp.open()
+    before = time.time_ns()
+    for _ in range(300):
+        sender.sendto(b"x" * 1206, ("127.0.0.1", port_of(udp)))
+    after_sending = time.time_ns()
+    time.sleep(0.05)  # a stamp of the read would fall after this
+    stamps = np.concatenate([block.kernel_realtime_ns for block in collect(udp, 300)])
+    assert stamps.dtype == np.int64
+    assert len(stamps) == 300
+    assert np.all(np.diff(stamps) >= 0)
+    assert before <= stamps[0]
+    assert stamps[-1] <= after_sending
+    udp.close()
+
+
+def test_two_senders_are_told_apart(sender: socket.socket) -> None:
+    udp = transport(host="0.0.0.0")
+    udp.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.2", 0))
+        for number in range(50):
+            sender.sendto(b"a%d" % (number % 10), ("127.0.0.1", port_of(udp)))
+            other.sendto(b"b%d" % (number % 10), ("127.0.0.1", port_of(udp)))
+        peers = [sender.getsockname(), other.getsockname()]
+    blocks = collect(udp, 100)
+    for peer, letter in zip(peers, (b"a", b"b"), strict=True):
+        assert payloads([b for b in blocks if b.peer == peer]) == [letter + b"%d" % (n % 10) for n in range(50)]
+    udp.close()
+
+
+@pytest.mark.parametrize("length", [200, 1206, 8448])
+def test_received_and_lost_are_exactly_what_was_sent(sender: socket.socket, length: int) -> None:
+    udp = transport("?buffer_mb=1")
+    udp.open()
+    sent = 6000
+    for _ in range(sent):
+        sender.sendto(bytes(length), ("127.0.0.1", port_of(udp)))
+    received = sum(len(block.units) for block in iter_until_silent(udp))
+    lost = udp.poll_counters().lost_kernel
+    assert lost > 0
+    assert received > 0
+    assert received + lost == sent
+    for _ in range(sent):  # and again: the count is a total
+        sender.sendto(bytes(length), ("127.0.0.1", port_of(udp)))
+    received += sum(len(block.units) for block in iter_until_silent(udp))
+    udp.close()
+    assert received + udp.poll_counters().lost_kernel == 2 * sent
+
+
+def iter_until_silent(udp: UdpTransport) -> Iterator[UnitBlock]:
+    while blocks := udp.receive(0.2):
+        yield from blocks
+
+
+def test_reopened_counts_from_nothing(sender: socket.socket) -> None:
+    udp = transport("?buffer_mb=1")
+    udp.open()
+    for _ in range(3000):
+        sender.sendto(bytes(1206), ("127.0.0.1", port_of(udp)))
+    udp.close()
+    assert udp.poll_counters().lost_kernel > 0
+    udp.open()
+    assert udp.poll_counters().lost_kernel == 0
+    udp.close()
+
+
+def test_source_filter_lets_one_sender_through_and_counts_the_rest(sender: socket.socket) -> None:
+    udp = transport("?source=127.0.0.2", host="0.0.0.0")
+    udp.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scanner:
+        scanner.bind(("127.0.0.2", 0))
+        for number in range(20):
+            sender.sendto(b"stranger", ("127.0.0.1", port_of(udp)))
+            scanner.sendto(b"%02d" % number, ("127.0.0.1", port_of(udp)))
+    assert payloads(collect(udp, 20)) == [b"%02d" % number for number in range(20)]
+    assert udp.poll_counters().refused == 20
+    udp.close()
+
+
+def multicast_sender(address: str) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind((address, 0))
+    sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+    return sock
+
+
+@pytest.mark.parametrize("where", ["?group={}&interface=lo", "?group={}"])
+def test_multicast_group_and_nothing_else(sender: socket.socket, where: str) -> None:
+    udp = transport(where.format(GROUP))  # without an interface the local address, 127.0.0.1, names it
+    udp.open()
+    with multicast_sender("127.0.0.1") as scanner:
+        sender.sendto(b"unicast", ("127.0.0.1", port_of(udp)))
+        scanner.sendto(b"other group", ("239.74.163.78", port_of(udp)))
+        scanner.sendto(b"group", (GROUP, port_of(udp)))
+        assert payloads(collect(udp, 1)) == [b"group"]
+    assert udp.receive(0.05) == []
+    udp.close()
+
+
+def test_multicast_source_filter() -> None:
+    udp = transport(f"?group={GROUP}&source=127.0.0.3")
+    udp.open()
+    with multicast_sender("127.0.0.2") as stranger, multicast_sender("127.0.0.3") as scanner:
+        stranger.sendto(b"stranger", (GROUP, port_of(udp)))
+        scanner.sendto(b"scanner", (GROUP, port_of(udp)))
+        assert payloads(collect(udp, 1)) == [b"scanner"]
+    assert udp.receive(0.05) == []
+    udp.close()
+
+
+def test_two_may_listen_to_a_group() -> None:
+    first = transport(f"?group={GROUP}")
+    second = transport(f"?group={GROUP}", port=port_of(first))
+    first.open()
+    second.open()
+    with multicast_sender("127.0.0.1") as scanner:
+        scanner.sendto(b"to all", (GROUP, port_of(first)))
+    assert payloads(collect(first, 1)) == payloads(collect(second, 1)) == [b"to all"]
+    first.close()
+    second.close()
+
+
+def test_port_in_use_names_the_holder() -> None:
+    first = transport()
+    first.open()
+    second = transport(port=port_of(first))
+    with pytest.raises(TransportError, match=f"port {port_of(first)} is in use by this program itself"):
+        second.open()
+    first.close()
+    second.open()  # the refused one can be tried again
+    second.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "host", "says"),
+    [
+        ("", "203.0.113.7", "this machine has no address 203.0.113.7"),
+        ("?interface=nosuch0", "0.0.0.0", "no network interface nosuch0"),
+        (f"?group={GROUP}&interface=nosuch0", "0.0.0.0", "no network interface nosuch0"),
+    ],
+)
+def test_what_cannot_be_opened_says_why(options: str, host: str, says: str) -> None:
+    udp = transport(options, host=host)
+    with pytest.raises(TransportError, match=says):
+        udp.open()
+    with pytest.raises(TransportError, match="is closed"):
+        udp.receive(0.0)
+    udp.close()
+
+
+def test_granted_buffer_is_read_back_in_the_unit_it_was_asked_in() -> None:
+    udp = transport("?buffer_mb=1")
+    udp.open()
+    assert udp.counters.receive_buffer_asked_bytes == 1 << 20
+    assert udp.counters.receive_buffer_bytes == 1 << 20
+    udp.close()
+
+
+def test_buffer_that_is_not_granted_shows_in_the_counters() -> None:
+    """A thread without CAP_NET_ADMIN gets what net.core.rmem_max allows."""
+    limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    udp = transport("?buffer_mb=1023")
+
+    def open_without_capabilities() -> None:
+        drop_capabilities()
+        udp.open()
+
+    thread = threading.Thread(target=open_without_capabilities)
+    thread.start()
+    thread.join()
+    assert udp.counters.receive_buffer_asked_bytes == 1023 << 20
+    assert udp.counters.receive_buffer_bytes == limit
+    udp.close()
+
+
+def drop_capabilities() -> None:
+    """Take all effective capabilities from the calling thread (capset(2), version 3)."""
+    header, empty = struct.pack("=Ii", 0x20080522, 0), bytes(24)
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.capset(header, empty) == 0, ctypes.get_errno()
+
+
+def test_silence_is_an_empty_list_after_the_time_given() -> None:
+    udp = transport()
+    udp.open()
+    started = time.monotonic()
+    assert udp.receive(0.1) == []
+    assert time.monotonic() - started >= 0.09
+    assert udp.receive(0.0) == []
+    udp.close()
+
+
+def test_close_from_another_thread_ends_a_blocked_receive() -> None:
+    udp = transport()
+    udp.open()
+    got: list[object] = []
+    thread = threading.Thread(target=lambda: got.append(udp.receive(60.0)))
+    thread.start()
+    time.sleep(0.1)
+    udp.close()
+    thread.join(timeout=30.0)
+    assert got == [[]]
+    udp.close()
+    with pytest.raises(TransportError, match="is closed"):
+        udp.receive(1.0)
+
+
+def test_send_reaches_the_sender_filtered_for() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
+        device.bind(("127.0.0.2", 0))
+        udp = transport("?source=127.0.0.2", port=device.getsockname()[1])
+        udp.open()
+        udp.send(b"start")
+        device.settimeout(5.0)
+        assert device.recv(100) == b"start"
+        udp.close()
+
+
+def test_send_without_anyone_to_send_to() -> None:
+    udp = transport()
+    udp.open()
+    with pytest.raises(TransportError, match="has nobody to send to"):
+        udp.send(b"x")
+    udp.close()
+
+
+def test_reader_survives_many_senders(sender: socket.socket) -> None:
+    """A device that takes a new port for every datagram keeps its order, and its ports are right."""
+    udp = transport()
+    udp.open()
+    expected = []
+    for number in range(300):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as once:
+            once.sendto(number.to_bytes(2, "big"), ("127.0.0.1", port_of(udp)))
+            expected.append((number, once.getsockname()[1]))
+    blocks = collect(udp, 300)
+    got = [
+        (int.from_bytes(row.tobytes(), "big"), block.peer[1]) for block in blocks for row in block.units if block.peer
+    ]
+    assert got == expected
+    udp.close()

@@ -1,0 +1,132 @@
+"""Transport strings: what is right is read, what is wrong is one line that says what would be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers.transports.can_bus import PythonCanTransport, keyword_value
+from drivers.transports.can_socket import SocketCanTransport
+from drivers.transports.pps_device import FixedPps, KernelPps, SerialDcdPps
+from drivers.transports.serial_port import SerialTransport
+from drivers.transports.udp_socket import UdpTransport
+from drivers.transports.uri import open_transport, parse_pps, parse_transport
+
+
+def test_udp_with_every_option() -> None:
+    text = "udp:0.0.0.0:2368?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=8"
+    spec = parse_transport(text)
+    assert (spec.kind, spec.host, spec.port, spec.text) == ("udp", "0.0.0.0", 2368, text)
+    assert spec.options == {
+        "group": "239.1.2.3",
+        "source": "192.168.1.201",
+        "interface": "eth1",
+        "buffer_mb": "8",
+    }
+    assert isinstance(open_transport(spec), UdpTransport)
+
+
+def test_serial_path_and_flags() -> None:
+    spec = parse_transport("serial:/dev/serial/by-id/usb-u-blox:00?baud=921600&parity=E&rtscts=yes&xonxoff=0")
+    assert (spec.kind, spec.address) == ("serial", "/dev/serial/by-id/usb-u-blox:00")
+    assert spec.flag("rtscts")
+    assert not spec.flag("xonxoff")
+    assert not spec.flag("dsrdtr")
+    assert isinstance(open_transport(spec), SerialTransport)
+
+
+@pytest.mark.parametrize(
+    ("text", "interface", "channel", "transport"),
+    [
+        ("can:socketcan:can0?bitrate=1000000", "socketcan", "can0", SocketCanTransport),
+        ("can:udp_multicast:ff15:7079:7468::73?port=43113", "udp_multicast", "ff15:7079:7468::73", PythonCanTransport),
+        ("can:slcan:/dev/ttyUSB0?bitrate=500000", "slcan", "/dev/ttyUSB0", PythonCanTransport),
+    ],
+)
+def test_can(text: str, interface: str, channel: str, transport: type) -> None:
+    spec = parse_transport(text)
+    assert (spec.interface, spec.channel) == (interface, channel)
+    assert isinstance(open_transport(spec), transport)
+
+
+def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
+    spec = parse_transport("gnss:rover")
+    assert (spec.kind, spec.address) == ("gnss", "rover")
+    with pytest.raises(ValueError, match="nothing to open"):
+        open_transport(spec)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "want serial:<path>"),
+        ("tcp:1.2.3.4:5", "want serial:<path>"),
+        ("udp", "want serial:<path>"),
+        ("udp:2368", "want udp:<IPv4 address>:<port>"),
+        ("udp:localhost:2368", "want udp:<IPv4 address>:<port>"),
+        ("udp:0.0.0.0:70000", "port '70000' should be 1 to 65535"),
+        ("udp:0.0.0.0:0", "port '0' should be 1 to 65535"),
+        ("udp:0.0.0.0:٢٣", "should be 1 to 65535"),
+        ("udp:0.0.0.0:2368?grop=239.1.1.1", "unknown option 'grop'; udp knows: group, source, interface, buffer_mb"),
+        ("udp:0.0.0.0:2368?group=10.0.0.1", "group=10.0.0.1 should be an IPv4 multicast address"),
+        ("udp:0.0.0.0:2368?source=scanner", "source=scanner should be the sender's IPv4 address"),
+        ("udp:0.0.0.0:2368?buffer_mb=4000", "buffer_mb=4000 should be whole mebibytes, 1 to 1023"),
+        ("udp:0.0.0.0:2368?", "option '' should be <keyword>=<value>"),
+        ("udp:0.0.0.0:2368?group", "option 'group' should be <keyword>=<value>"),
+        ("udp:0.0.0.0:2368?buffer_mb=1&buffer_mb=2", "option 'buffer_mb' stands twice"),
+        ("serial:", "want serial:<path>"),
+        ("serial:/dev/ttyUSB0?baud=fast", "baud=fast should be a positive whole number"),
+        ("serial:/dev/ttyUSB0?baud=-1", "baud=-1 should be a positive whole number"),
+        ("serial:/dev/ttyUSB0?parity=even", "parity=even should be N, E, O, M or S"),
+        ("serial:/dev/ttyUSB0?stopbits=3", "stopbits=3 should be 1, 1.5 or 2"),
+        ("serial:/dev/ttyUSB0?rtscts=maybe", "rtscts=maybe should be yes or no"),
+        ("can:can0", "want can:<interface>:<channel>"),
+        ("can:sockecan:can0", "unknown CAN interface 'sockecan'; python-can has: "),
+        ("can:socketcan:can0?bitrat=5", "unknown option 'bitrat'"),
+        ("gnss:", "want gnss:<name>"),
+        ("gnss:rover?baud=5", "want gnss:<name>"),
+    ],
+)
+def test_wrong_text_says_what_would_be_right(text: str, says: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse_transport(text)
+    assert says in str(caught.value)
+    assert repr(text) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_texts_for_one_device_are_the_same_device(tmp_path: Path) -> None:
+    link = tmp_path / "gnss"
+    link.symlink_to("/dev/null")
+    assert parse_transport(f"serial:{link}").device == parse_transport("serial:/dev/null?baud=9600").device
+    first = parse_transport("udp:0.0.0.0:2368?group=239.1.2.3").device
+    assert first != parse_transport("udp:0.0.0.0:2368?group=239.1.2.4").device
+    assert first == parse_transport("udp:192.168.1.1:2368?group=239.1.2.3&buffer_mb=3").device
+
+
+def test_pps_sources() -> None:
+    assert isinstance(parse_pps("/dev/pps0"), KernelPps)
+    assert isinstance(parse_pps("serial-dcd:/dev/ttyS0", edge="clear"), SerialDcdPps)
+    assert isinstance(parse_pps("fixed:edges.txt"), FixedPps)
+
+
+@pytest.mark.parametrize("text", ["", "pps0", "fixed:", "serial-dcd:ttyS0", "gpio:4"])
+def test_wrong_pps_text_says_what_would_be_right(text: str) -> None:
+    with pytest.raises(ValueError, match="want /dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"):
+        parse_pps(text)
+
+
+def test_wrong_pps_edge() -> None:
+    with pytest.raises(ValueError, match="want assert or clear"):
+        parse_pps("/dev/pps0", edge="rising")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("500000", 500000), ("0x10", 16), ("0.5", 0.5), ("true", True), ("No", False), ("/dev/ttyUSB0", "/dev/ttyUSB0")],
+)
+def test_options_become_what_python_can_expects(text: str, value: object) -> None:
+    got = keyword_value(text)
+    assert got == value
+    assert type(got) is type(value)
