@@ -223,13 +223,12 @@ class SrepParser(PacketParser):
         chosen = np.ones(n, dtype=np.bool_) if self._thinner is None else self._thinner.choose(host_time_ns)
         if length < HEADER_BYTES + CRC.size:
             self._refuse("bad_length", n)
+            self.counters.bytes_skipped += n * length
             return np.zeros(n, dtype=np.bool_), chosen
         header = _headers(units)
         good = np.ones(n, dtype=np.bool_)
         for code, passes in _header_checks(header, length):
             self._refuse(code, int((good & ~passes).sum()))
-            if code == "bad_magic":
-                self.counters.bytes_skipped += length * int((~passes).sum())
             good &= passes
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
         for row in np.flatnonzero(verify).tolist():
@@ -237,6 +236,8 @@ class SrepParser(PacketParser):
             if zlib.crc32(unit[: -CRC.size]) != CRC.unpack(unit[-CRC.size :])[0]:
                 good[row] = False
                 self.counters.bad_checksums += 1
+        self.counters.bytes_framed += length * int(good.sum())
+        self.counters.bytes_skipped += length * int((~good).sum())
         return good, chosen
 
     def _breaks(self, sequence: NDArray[np.uint32], good: BoolArray) -> BoolArray:

@@ -17,6 +17,7 @@ from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import find_driver
 from drivers.scanner.srep import SrepHeader, SrepParser, datagram_bytes, encode_datagram
 from georef.records import Chunk, ChunkBatch, DeviceClockSamples, DeviceStatus, Record, ScannerReturns, StructArray
+from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.srep_cases import TEST_VECTOR, reference_decode, scan_lines, split_datagrams
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "srep"
@@ -121,7 +122,7 @@ def test_scan_lines_agree_with_the_reference() -> None:
     assert len(rows) == 1823
     assert_as_reference(rows, datagrams, 2.0)
     assert parser.counters.messages["srep"] == 24
-    assert parser.counters.bytes == sum(map(len, datagrams))
+    assert parser.counters.bytes == parser.counters.bytes_framed == sum(map(len, datagrams))
     assert not parser.counters.errors  # the sequence wraps in the middle: no gap
     assert clocks_of(records)["pps_time_ns"].tolist()[:4] == [-1, -1, -1, 99_999_000_000]
     assert [r.values["pps_locked"] for r in records if isinstance(r, DeviceStatus)] == [False, True]
@@ -143,6 +144,13 @@ def test_batches_may_be_cut_anywhere(sizes: list[int]) -> None:
     assert whole.counters == cut.counters
     assert cut.counters.errors["sequence_gap"] == 4
     assert cut.counters.bad_checksums == 1
+
+
+def test_recording_through_the_harness() -> None:
+    check_packets(make_parser, scan_lines(60, 20))
+    check_packets(lambda: make_parser(clock_only=True), scan_lines(60, 20))
+    check_packet_damage(make_parser, scan_lines(12, 4))
+    check_packet_damage(lambda: make_parser(clock_only=True), scan_lines(12, 4))
 
 
 def test_strided_rows_of_a_log_chunk_are_read() -> None:
@@ -212,7 +220,7 @@ def test_one_flipped_bit_gives_no_returns(datagram: bytes, data: st.DataObject) 
     parser = make_parser()
     assert feed_all(parser, [bytes(broken)]) == []
     assert parser.counters.bad_checksums + parser.counters.bad_messages == 1
-    assert parser.counters.bytes == len(broken)
+    assert parser.counters.bytes == parser.counters.bytes_skipped == len(broken)
 
 
 def test_cut_datagrams_are_counted() -> None:
