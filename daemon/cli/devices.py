@@ -42,14 +42,15 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("kind", "protocol", "by", "yields", "needs", ""):
+    for title in ("kind", "protocol", "by", "needs", "what, and what it yields"):
         table.add_column(title, no_wrap=title in ("kind", "protocol"))
     kind = ""
     for row in listed:
         first = row["kind"] if row["kind"] != kind else ""
         kind = row["kind"]
-        cells = [", ".join(row[key]) for key in ("transports", "yields", "needs")]
-        table.add_row(first, row["protocol"], *cells, row["summary"])
+        what = Text(row["summary"]) + Text("\n" + ", ".join(row["yields"]), style="dim")
+        table.add_row(first, row["protocol"], ", ".join(row["transports"]), ", ".join(row["needs"]), what)
     Console().print(table)

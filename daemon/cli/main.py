@@ -23,6 +23,7 @@ import typer
 from daemon.errors import ExitCode, UserError
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
+PIPE_CLOSED = 141  # 128 + SIGPIPE
 
 HELP = """Airborne laser scanning: from the sensors' wires into a log that survives.
 
@@ -105,7 +106,7 @@ def run_app(arguments: list[str]) -> int:
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
-        return int(ExitCode.PROBLEM)
+        return PIPE_CLOSED
     except Exception as error:  # the last resort: everything a command did not foresee
         return _end_unforeseen(error)
     return int(result) if isinstance(result, int) else int(ExitCode.OK)

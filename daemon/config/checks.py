@@ -127,11 +127,11 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
     except ValueError as error:
         yield f"{section}.{error}"
     else:
-        if spec.kind not in driver.transports:
-            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
-        elif spec.kind == "gnss" and spec.address not in config.gnss:
+        if spec.kind == "gnss" and spec.address not in config.gnss:
             known = ", ".join(config.gnss) or "none"
             yield f'{section}.transport: got "{table.transport}", want the name of a [gnss.<name>]; there are: {known}'
+        elif spec.kind not in driver.transports:
+            yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
     if isinstance(table, ScannerConfig) and table.auxiliary:
         try:
             auxiliary = parse_transport(table.auxiliary)

@@ -1,0 +1,79 @@
+"""`swath check`: is the configuration right, and does every device answer?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from daemon.errors import ExitCode
+
+if TYPE_CHECKING:
+    from daemon.check import Report
+    from daemon.config import Config
+
+
+def command(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
+    offline: Annotated[bool, typer.Option("--offline", help="Validate only; open nothing.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long to listen.", min=0.1, max=3600.0)] = 5.0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Validate CONFIG, then open every device and say of each: opens, bytes, records, time, what is wrong."""
+    from daemon.config import load_config
+
+    loaded = load_config(config)
+    if offline:
+        _print_valid(loaded, as_json)
+        return
+    reports = _listen(loaded, seconds)
+    if as_json:
+        found = {"config": str(config), "ok": all(not report.problems for report in reports)}
+        print(json.dumps(found | {"devices": [report.plain() for report in reports]}, indent=2))
+    else:
+        _print_reports(reports)
+    if any(report.problems for report in reports):
+        raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _listen(config: Config, seconds: float) -> list[Report]:
+    from rich.console import Console
+
+    from daemon.check import check_everything
+
+    with Console(stderr=True).status(f"listening for {seconds:g} s"):
+        return check_everything(config, seconds)
+
+
+def _print_valid(config: Config, as_json: bool) -> None:
+    sources = [f"pps/{name}" for name in config.pps] + [device.source for device in config.devices()]
+    if as_json:
+        print(json.dumps({"config": str(config.path), "ok": True, "sources": sources}, indent=2))
+    else:
+        print(f"{config.path}: valid; {len(sources)} sources: {', '.join(sources) or 'none'}")
+
+
+def _print_reports(reports: list[Report]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for title in ("source", "protocol", "opens", "bytes", "records", "time", ""):
+        table.add_column(title, justify="right" if title == "bytes" else "left", no_wrap=title in ("source", "opens"))
+    for report in reports:
+        records = ", ".join(f"{name} {count}" for name, count in report.records.most_common())
+        count = f"{report.bytes:,}" if report.bytes else ""
+        verdict = Text("wrong", style="red") if report.problems else Text("ok", style="green")
+        opens = "yes" if report.opens else "no"
+        table.add_row(report.source, report.protocol, opens, count, records, report.time, verdict)
+    console = Console()
+    console.print(table)
+    for report in reports:
+        for problem in report.problems:
+            console.print(f"{report.source}: {problem}", style="red", markup=False, highlight=False, soft_wrap=True)
+        for note in report.notes:
+            console.print(f"{report.source}: {note}", style="dim", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,306 @@
+"""The configuration: the complete example, every bad one with its lines, the page that documents it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from daemon.config import Config, Tables, load_config, parse_config
+from daemon.config.checks import rotation_problem, same_wire
+from daemon.config.loading import MAX_CONFIG_BYTES, _model_in
+from daemon.errors import ConfigError, ExitCode, UserError
+from drivers.core.registry import all_drivers
+from drivers.transports.uri import parse_transport
+
+ROOT = Path(__file__).parents[2]
+FIXTURES = ROOT / "fixtures/config"
+AIRCRAFT = FIXTURES / "aircraft.toml"
+BAD = sorted((FIXTURES / "bad").glob("*.toml"))
+
+
+def expected_lines(path: Path) -> list[str]:
+    """What a bad file says of itself that must be said of it."""
+    words = {
+        "here": str(path.parent),
+        "gnss": ", ".join(sorted(all_drivers("gnss"))),
+        "scanner": ", ".join(sorted(all_drivers("scanner"))),
+        "nmea": ", ".join(all_drivers("gnss")["nmea"].transports),
+    }
+    lines = re.findall(r"^# expect: (.*)$", path.read_text(), flags=re.MULTILINE)
+    return [f"{path}: {line.format(**words) if '{' in line else line}" for line in lines]
+
+
+def with_session(text: str) -> str:
+    return f'[session]\nname = "x"\n{text}'
+
+
+class TestWholeFile:
+    def test_the_example_is_valid_and_keeps_its_values(self) -> None:
+        config = load_config(AIRCRAFT)
+        assert config.session.name == "thurgau-north"
+        assert config.session.directory == "/var/lib/swath"
+        assert config.gnss["rover"].lever_arm_m == [0.10, -0.05, -1.20]
+        assert config.imu["main"].signals is not None
+        assert config.imu["main"].signals.sample_ticks == "SAMPLE.ticks"
+        assert config.scanner["left"].range_max_m == 3000.0
+        assert config.output.epoch == 2026.9
+        assert config.text == AIRCRAFT.read_text()
+
+    def test_the_example_names_every_key_there_is(self) -> None:
+        table = tomllib.loads(AIRCRAFT.read_text())
+        assert set(_absent_keys(Tables, table, "")) == {  # each excludes something that stands there
+            "scanner.*.geometry.facets",
+            "scanner.*.geometry.file",
+            "scanner.*.gimbal.stages.source",
+            "attitude.xi_arcsec",
+            "attitude.eta_arcsec",
+        }
+
+    def test_a_session_alone_is_enough_and_has_the_documented_defaults(self, tmp_path: Path) -> None:
+        config = parse_config(with_session(""), tmp_path / "a.toml")
+        session = config.session
+        assert (session.split_size_mb, session.split_minutes, session.fsync_s, session.reserve_mb) == (2048, 30, 1, 512)
+        assert (session.directory, session.compression) == ("/var/lib/swath", "auto")
+        assert list(config.devices()) == []
+        assert config.atmosphere.pressure_hpa == 1013.25
+
+    def test_a_relative_log_directory_is_relative_to_the_file(self, tmp_path: Path) -> None:
+        config = parse_config(with_session('directory = "logs"'), tmp_path / "a.toml")
+        assert config.session.directory == str(tmp_path / "logs")
+
+    def test_whole_numbers_stand_for_numbers_but_text_does_not(self, tmp_path: Path) -> None:
+        assert parse_config(with_session("fsync_s = 2"), tmp_path / "a.toml").session.fsync_s == 2.0
+        with pytest.raises(ConfigError, match='fsync_s: got "2", want a number'):
+            parse_config(with_session('fsync_s = "2"'), tmp_path / "a.toml")
+
+    def test_loading_stays_light(self) -> None:
+        """No DBC configured: no cantools; and never what georeferencing needs."""
+        code = (
+            "import sys; from pathlib import Path; from daemon.config import parse_config; "
+            'parse_config(\'[session]\\nname="x"\\n[scanner.left]\\ntransport="udp:0.0.0.0:2368"\\n'
+            "protocol=\"srep\"\\nmirror_factor=2\\n', Path('/tmp/a.toml')); "
+            "print([m for m in ('cantools', 'scipy', 'numba', 'pyproj', 'serial', 'mcap', 'rich') if m in sys.modules])"
+        )
+        run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+        assert run.stdout.strip() == "[]"
+
+
+class TestBadFiles:
+    @pytest.mark.parametrize("path", BAD, ids=[path.stem for path in BAD])
+    def test_each_finding_is_its_one_line(self, path: Path) -> None:
+        expected = expected_lines(path)
+        assert expected, f"{path} says nothing of what to expect"
+        with pytest.raises(ConfigError) as caught:
+            load_config(path)
+        assert sorted(caught.value.lines) == sorted(expected)
+        assert caught.value.exit_code is ExitCode.USAGE
+        assert all("\n" not in line for line in caught.value.lines)
+
+    def test_no_such_file(self, tmp_path: Path) -> None:
+        with pytest.raises(UserError, match=r"nowhere\.toml: No such file or directory") as caught:
+            load_config(tmp_path / "nowhere.toml")
+        assert caught.value.exit_code is ExitCode.USAGE
+
+    def test_a_directory(self, tmp_path: Path) -> None:
+        with pytest.raises(UserError, match="Is a directory"):
+            load_config(tmp_path)
+
+    def test_not_text(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.toml"
+        path.write_bytes(b"[session]\nname = \xff\xfe\n")
+        with pytest.raises(ConfigError, match="line 2: not UTF-8"):
+            load_config(path)
+
+    def test_a_log_given_by_mistake_is_not_read_whole(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        with path.open("wb") as stream:
+            stream.truncate(MAX_CONFIG_BYTES * 1000)
+        with pytest.raises(ConfigError, match="larger than"):
+            load_config(path)
+
+    def test_a_serial_device_behind_a_symbolic_link_is_the_same_device(self, tmp_path: Path) -> None:
+        main, secondary = os.openpty()
+        try:
+            device = os.ttyname(secondary)
+            link = tmp_path / "rover"
+            link.symlink_to(device)
+            text = with_session(
+                f'[gnss.a]\ntransport = "serial:{device}"\nprotocol = "nmea"\n'
+                f'[gnss.b]\ntransport = "serial:{link}"\nprotocol = "nmea"\n'
+            )
+            with pytest.raises(ConfigError) as caught:
+                parse_config(text, tmp_path / "a.toml")
+        finally:
+            os.close(main)
+            os.close(secondary)
+        want = f"gnss.a.transport and gnss.b.transport: both use the device {device}; give each its own"
+        assert caught.value.lines == [f"{tmp_path}/a.toml: {want}"]
+
+    def test_a_pps_on_the_line_of_its_receiver_is_fine(self, tmp_path: Path) -> None:
+        text = with_session(
+            '[pps.main]\nsource = "serial-dcd:/dev/ttyS0"\n'
+            '[gnss.a]\ntransport = "serial:/dev/ttyS0"\nprotocol = "nmea"\npps = "main"\n'
+        )
+        assert parse_config(text, tmp_path / "a.toml").gnss["a"].pps == "main"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("udp:0.0.0.0:2368", "udp:0.0.0.0:2368?buffer_mb=4", True),
+        ("udp:0.0.0.0:2368", "udp:192.168.1.5:2368", True),
+        ("udp:192.168.1.5:2368", "udp:192.168.2.5:2368", False),
+        ("udp:0.0.0.0:2368?group=239.1.2.3", "udp:0.0.0.0:2368?group=239.1.2.4", False),
+        ("udp:0.0.0.0:2368?group=239.1.2.3", "udp:0.0.0.0:2368?group=239.1.2.3", True),
+        ("udp:0.0.0.0:2368", "udp:0.0.0.0:2369", False),
+        ("can:socketcan:can0", "can:socketcan:can0?bitrate=500000", True),
+        ("can:socketcan:can0", "can:socketcan:can1", False),
+        ("can:slcan:/dev/null", "serial:/dev/null?baud=9600", True),
+        ("serial:/dev/null", "can:socketcan:can0", False),
+    ],
+)
+def test_which_wires_are_one(one: str, other: str, same: bool) -> None:
+    assert same_wire(parse_transport(one), parse_transport(other)) is same
+    assert same_wire(parse_transport(other), parse_transport(one)) is same
+
+
+def test_rotations_of_seven_digits_pass_and_others_do_not() -> None:
+    assert rotation_problem([[0.7071068, -0.7071068, 0], [0.7071068, 0.7071068, 0], [0, 0, 1]]) is None
+    assert rotation_problem([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) is None
+    assert "length" in str(rotation_problem([[0.70711, -0.70711, 0], [0.70711, 0.70711, 0], [0, 0, 1]]))
+    assert "mirroring" in str(rotation_problem([[0, 1, 0], [1, 0, 0], [0, 0, 1]]))
+    assert "length 0" in str(rotation_problem([[0, 0, 0], [0, 1, 0], [0, 0, 1]]))
+
+
+class TestDevices:
+    @pytest.fixture
+    def config(self) -> Config:
+        return load_config(AIRCRAFT)
+
+    def test_devices_carry_all_a_recorder_needs(self, config: Config) -> None:
+        devices = {device.source: device for device in config.devices()}
+        assert list(devices) == ["gnss/rover", "imu/main", "scanner/left"]
+        imu, scanner = devices["imu/main"], devices["scanner/left"]
+        assert (imu.transport.kind, imu.transport.address) == ("can", "socketcan:can0")
+        assert imu.files == {"dbc": FIXTURES / "imu.dbc"}
+        assert imu.settings.files == {"dbc": (FIXTURES / "imu.dbc").read_bytes()}
+        assert imu.settings.config["signals"]["pps_ticks"] == "SYNC.pps_ticks"
+        assert scanner.auxiliary is not None
+        assert scanner.auxiliary.port == 8308
+        assert scanner.pps == "main"
+        assert scanner.settings.source == "scanner/left"
+        assert scanner.settings.config["mirror_factor"] == 1.0
+
+    def test_a_device_inside_a_gnss_stream_has_no_wire_of_its_own(self, tmp_path: Path) -> None:
+        text = with_session(
+            '[gnss.rover]\ntransport = "serial:/dev/ttyUSB0"\nprotocol = "novatel"\n'
+            '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
+        )
+        if "novatel" not in all_drivers("imu"):
+            with pytest.raises(ConfigError, match="no imu protocol 'novatel'"):
+                parse_config(text, tmp_path / "a.toml")
+            return
+        devices = list(parse_config(text, tmp_path / "a.toml").devices())
+        assert devices[1].transport.kind == "gnss"
+
+    def test_attachments_are_named_as_the_log_format_says(self, config: Config) -> None:
+        attachments = {name: data for name, _, data in config.attachments()}
+        assert attachments == {
+            "config.toml": AIRCRAFT.read_bytes(),
+            "dbc/imu.dbc": (FIXTURES / "imu.dbc").read_bytes(),
+            "calibration/left.toml": (FIXTURES / "left.toml").read_bytes(),
+        }
+
+    def test_a_geometry_file_keeps_its_suffix(self, tmp_path: Path) -> None:
+        (tmp_path / "head-77.json").write_text("{}")
+        text = with_session(
+            '[scanner.left]\ntransport = "udp:0.0.0.0:1"\nprotocol = "srep"\nmirror_factor = 2\n'
+            '[scanner.left.geometry]\nfile = "head-77.json"\n'
+        )
+        config = parse_config(text, tmp_path / "a.toml")
+        assert ("geometry/left.json", "application/json", b"{}") in config.attachments()
+        assert next(config.devices()).settings.files == {"geometry": b"{}"}
+
+
+class TestPage:
+    """docs/configuration.md and the models say the same."""
+
+    PAGE = (ROOT / "docs/configuration.md").read_text()
+
+    def test_every_key_stands_in_its_section_and_no_other(self) -> None:
+        assert _page_keys(self.PAGE) == _model_keys()
+
+    def test_bounds_and_meanings_are_the_models(self) -> None:
+        for section, model in _sections(Tables, "").items():
+            for key, field in model.model_fields.items():
+                if _model_in(field.annotation) is not None and field.description is None:
+                    continue
+                row = _page_row(self.PAGE, section, key)
+                assert (field.description or "").replace("|", "\\|") in row, f"[{section}] {key}"
+                for item in field.metadata:
+                    for attribute in ("ge", "gt", "le", "lt"):
+                        bound = getattr(item, attribute, None)
+                        assert bound is None or f"{bound:.10g}" in row, f"[{section}] {key}: {bound}"
+
+
+def _sections(model: type[BaseModel], prefix: str) -> dict[str, type[BaseModel]]:
+    """Section names as the page writes them, and their models."""
+    found: dict[str, type[BaseModel]] = {}
+    for key, field in model.model_fields.items():
+        inner = _model_in(field.annotation)
+        if inner is None:
+            continue
+        name = f"{prefix}{key}"
+        if str(field.annotation).startswith("dict["):
+            name += ".<name>"
+        found[name] = inner
+        found |= _sections(inner, f"{name}.")
+    return found
+
+
+def _model_keys() -> dict[str, list[str]]:
+    return {section: list(model.model_fields) for section, model in _sections(Tables, "").items()}
+
+
+def _page_keys(page: str) -> dict[str, list[str]]:
+    keys: dict[str, list[str]] = {}
+    for block in re.split(r"^### ", page, flags=re.MULTILINE)[1:]:
+        heading = re.match(r"\[([^\]]+)\]", block)
+        if heading:
+            keys[heading[1]] = re.findall(r"^\| `(\w+)` \|", block, flags=re.MULTILINE)
+    return keys
+
+
+def _page_row(page: str, section: str, key: str) -> str:
+    block = page.split(f"### [{section}]\n", 1)[1].split("\n### ", 1)[0]
+    row = re.search(rf"^\| `{key}` \|.*$", block, flags=re.MULTILINE)
+    assert row, f"[{section}] {key} is not on the page"
+    return row[0]
+
+
+def _absent_keys(model: type[BaseModel], table: dict[str, object], prefix: str) -> list[str]:
+    """Keys of the models that a file does not use."""
+    absent: list[str] = []
+    for key, field in model.model_fields.items():
+        if key not in table:
+            absent.append(f"{prefix}{key}")
+            continue
+        inner, value = _model_in(field.annotation), table[key]
+        if inner is None:
+            continue
+        if str(field.annotation).startswith("dict["):
+            assert isinstance(value, dict)
+            absent += _absent_keys(inner, next(iter(value.values())), f"{prefix}{key}.*.")
+        elif isinstance(value, list):
+            absent += _absent_keys(inner, value[0], f"{prefix}{key}.")
+        else:
+            assert isinstance(value, dict)
+            absent += _absent_keys(inner, value, f"{prefix}{key}.")
+    return absent
