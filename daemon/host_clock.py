@@ -172,13 +172,12 @@ def read_clock_discipline() -> ClockDiscipline:
     return ClockDiscipline(timex.freq / _FREQ_PPM_SCALE, int(timex.status), timex.maxerror * 1e-6)
 
 
-def read_clock_sample() -> dict[str, int | float]:
+def read_clock_sample(discipline: ClockDiscipline) -> dict[str, int | float]:
     """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status."""
     pair = read_clock_pair()
     before = time.monotonic_ns()
     raw = time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
     after = time.monotonic_ns()
-    discipline = read_clock_discipline()
     shift = (before + after) // 2 - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
     return {
         "realtime_ns": pair.realtime_ns,

@@ -23,7 +23,7 @@ from daemon.config import Config, DeviceEntry
 from daemon.errors import ExitCode, UserError
 from daemon.events import Events, Severity
 from daemon.health import sentence, stuck_threads
-from daemon.host_clock import HostClock, read_clock_sample
+from daemon.host_clock import HostClock, read_clock_discipline, read_clock_sample
 from daemon.log.format import SessionInfo
 from daemon.parts import Attachment, Parts
 from daemon.recorder import Recorder, RecorderSettings, Writing
@@ -107,7 +107,7 @@ def assemble(config: Config) -> Assembly:
         fsync_s=config.session.fsync_s,
         reserve_bytes=int(config.session.reserve_mb * 1e6),
     )
-    timekeeper = TimeKeeper(events)
+    timekeeper = TimeKeeper(events, clock.offset_ns)
     recorder = Recorder(
         parts, settings, queue, channels, events, clock, lambda source: timekeeper.status(source, clock.now_ns())
     )
@@ -241,10 +241,11 @@ class RecorderProcess:
     def _sample_clock(self) -> float:
         """Log the clocks side by side; returns the wall clock's offset from host time in nanoseconds."""
         assembly = self._assembly
-        sample = read_clock_sample()
+        discipline = read_clock_discipline()
+        sample = read_clock_sample(discipline)
         host_ns = int(sample["monotonic_ns"]) + assembly.clock.offset_ns
         realtime_ns = int(sample["realtime_ns"])
-        assembly.timekeeper.clock_sample(realtime_ns, host_ns, int(sample["monotonic_raw_ns"]))
+        assembly.timekeeper.clock_sample(sample, discipline)
         block = assembly.clock_channel.encode(host_ns, dict(sample))
         assembly.shared.queue.put(QueueItem("clock", block), always=True)
         return realtime_ns - host_ns

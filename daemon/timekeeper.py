@@ -5,13 +5,13 @@ Nothing here changes what is logged: a later reading of the log does all of it a
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from daemon.events import Events, Severity
+from daemon.host_clock import ClockDiscipline
 from drivers.core.parser import Parser
 from drivers.transports.base import UnitBlock
 from georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
@@ -31,10 +31,10 @@ class _TimeSource:
 class TimeKeeper:
     """Feeds one `PpsClock` a PPS source (and one a GNSS without PPS); all calls are safe from any thread."""
 
-    def __init__(self, events: Events) -> None:
+    def __init__(self, events: Events, host_minus_monotonic_ns: int) -> None:
         self._events = events
         self._lock = threading.Lock()
-        self._timeline = HostTimeline()
+        self._timeline = HostTimeline(host_minus_monotonic_ns)
         self._clocks: dict[str, PpsClock] = {}  # by the source that shows it: pps/main, gnss/rover
         self._sources: dict[str, _TimeSource] = {}
         self._failed: set[str] = set()
@@ -92,16 +92,21 @@ class TimeKeeper:
 
         def feed(host_ns: int, sequence: int) -> None:
             with self._lock:
-                raw_ns = int(self._timeline.raw_from_host(np.array([host_ns], dtype=np.int64))[0])
-                self._clocks[source].add_edge(raw_ns, sequence)
+                self._clocks[source].add_edge(self._timeline.raw_at(host_ns), sequence)
                 self._drain(source, self._clocks[source])
 
         return feed
 
-    def clock_sample(self, realtime_ns: int, monotonic_host_ns: int, monotonic_raw_ns: int) -> None:
-        """The host's clocks side by side, ten times a second; MONOTONIC already as host time."""
+    def clock_sample(self, sample: Mapping[str, int | float], discipline: ClockDiscipline) -> None:
+        """The host's clocks side by side, ten times a second; the wall clock may name a second where it is kept."""
+        realtime_ns, monotonic_ns = int(sample["realtime_ns"]), int(sample["monotonic_ns"])
+        raw_ns = int(sample["monotonic_raw_ns"])
         with self._lock:
-            self._timeline.add(realtime_ns, monotonic_host_ns, monotonic_raw_ns)
+            self._timeline.add(realtime_ns, monotonic_ns, raw_ns)
+            for clock in set(self._clocks.values()):
+                clock.set_wall_clock(
+                    raw_ns, realtime_ns, disciplined=discipline.disciplined, sigma_s=discipline.max_error_s
+                )
 
     def status(self, source: str, host_ns: int) -> dict[str, object]:
         """``time_state`` and ``time_sigma_ns`` of a gnss or pps source; nothing for the others."""
@@ -109,14 +114,10 @@ class TimeKeeper:
         if clock is None:
             return {}
         with self._lock:
-            raw_ns = int(self._timeline.raw_from_host(np.array([host_ns], dtype=np.int64))[0])
-            status = clock.status(raw_ns)
+            status = clock.status(self._timeline.raw_at(host_ns))
             self._drain(source, clock)
-        sigma = status.sigma_ns
-        return {
-            "time_state": str(status.state),
-            "time_sigma_ns": round(sigma, 1) if sigma is not None and np.isfinite(sigma) else None,
-        }
+        sigma_ns = round(status.sigma_ns, 1) if math.isfinite(status.sigma_ns) else None
+        return {"time_state": status.state.name, "time_sigma_ns": sigma_ns}
 
     def _drain(self, source: str, clock: PpsClock) -> None:
         for event in clock.drain_events():

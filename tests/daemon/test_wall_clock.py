@@ -1,0 +1,67 @@
+"""The wall clock really stepped by an hour, forth and back, while recording. Run by itself: it moves everybody's clock."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.host_clock import read_clock_pair
+from tests.daemon.log_check import read_log
+from tests.daemon.rig import Recorder, free_udp_port, session_table
+
+HOUR_NS = 3600 * 1_000_000_000
+
+
+@contextlib.contextmanager
+def restored_clock() -> Iterator[int]:
+    """Whatever happens inside, the wall clock goes on afterwards as if nothing had."""
+    offset_ns = read_clock_pair().offset_ns
+    try:
+        yield offset_ns
+    finally:
+        time.clock_settime_ns(time.CLOCK_REALTIME, time.monotonic_ns() + offset_ns)
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
+def test_wall_clock_stepped_by_an_hour(tmp_path: Path, step_ns: int) -> None:
+    port, logs = free_udp_port(), tmp_path / "logs"
+    table = f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+    sent_ns: list[int] = []
+    with (
+        Recorder(tmp_path, session_table(logs) + table) as recorder,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        restored_clock() as offset_ns,
+    ):
+        recorder.wait_said("device_opened")
+
+        def send(seconds: float) -> None:
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                sent_ns.append(time.monotonic_ns())
+                sock.sendto(len(sent_ns).to_bytes(4, "little"), ("127.0.0.1", port))
+                time.sleep(0.002)
+
+        send(0.5)
+        time.clock_settime_ns(time.CLOCK_REALTIME, time.monotonic_ns() + offset_ns + step_ns)
+        send(0.5)
+        time.clock_settime_ns(time.CLOCK_REALTIME, time.monotonic_ns() + offset_ns)
+        send(0.5)
+        time.sleep(1.2)
+        assert recorder.stop() == 0
+    content = read_log(logs)
+    (session,) = {path.name.split("_")[0] for path in logs.glob("*.mcap")}
+    times = [time_ns for time_ns, _ in content.units["scanner/left"]]
+    assert len(times) == len(sent_ns), session
+    clocks = [value for _, value in content.messages["/clock"]]
+    start_ns = clocks[0]["realtime_ns"] - clocks[0]["monotonic_ns"]
+    errors_ns = [time_ns - start_ns - sent for time_ns, sent in zip(times, sent_ns, strict=True)]
+    # delivered within the send call: 20 ms are for a loaded machine, an hour would be seen
+    assert all(-1_000_000 < error < 20_000_000 for error in errors_ns), (min(errors_ns), max(errors_ns))
+    assert len(content.events("wall_clock_stepped")) == 2
+    assert content.messages["/status/scanner/left"][-1][1]["stamp_ambiguous"] == 0
