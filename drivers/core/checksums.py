@@ -1,0 +1,93 @@
+"""Checksums of the serial protocols, each fast enough to run on everything that arrives.
+
+The cyclic ones are linear, so a message with its own checksum behind it leaves 0: `crc24q` and `crc32_novatel` of a
+whole frame are 0 when it is intact.
+"""
+
+from __future__ import annotations
+
+import zlib
+from functools import cache
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes: TypeAlias = bytes | bytearray | memoryview
+
+CRC24Q_POLYNOMIAL = 0x1864CFB  # RTCM 10403.3, 4.1.2 (Qualcomm's)
+CRC24Q_STEP_BYTES = 1029  # the longest RTCM3 frame goes through the table at once
+FLETCHER_STEP_BYTES = 8192 + 8  # so does the longest UBX frame
+
+
+def nmea_xor(body: Bytes) -> int:
+    """Exclusive or of the bytes between ``$`` and ``*`` (NMEA 0183, 5.3).
+
+    Folded in halves: shifting a number by half its length and adding it without carry leaves the halves' XOR below.
+    """
+    folded = int.from_bytes(body, "little")
+    width = 1 << max(0, len(body) - 1).bit_length()  # a power of two not below the length
+    while width > 1:
+        width >>= 1
+        folded ^= folded >> (8 * width)
+    return folded & 0xFF
+
+
+@cache
+def _fletcher_weights() -> NDArray[np.uint8]:
+    """How often the second sum counts each of the last n bytes: n … 2, 1, modulo 256."""
+    return np.arange(FLETCHER_STEP_BYTES, 0, -1).astype(np.uint8)
+
+
+@cache
+def _fletcher_ones() -> NDArray[np.uint8]:
+    return np.ones(FLETCHER_STEP_BYTES, dtype=np.uint8)
+
+
+def ubx_fletcher(body: Bytes) -> tuple[int, int]:
+    """CK_A and CK_B over class, id, length and payload (u-blox M8 protocol, 32.4): sums modulo 256, as uint8 wraps."""
+    first = second = 0
+    view = np.frombuffer(body, dtype=np.uint8)
+    for start in range(0, len(view), FLETCHER_STEP_BYTES):
+        part = view[start : start + FLETCHER_STEP_BYTES]
+        count = len(part)
+        second += count * first + int(np.dot(part, _fletcher_weights()[-count:]))
+        first += int(np.dot(part, _fletcher_ones()[:count]))
+    return first & 0xFF, second & 0xFF
+
+
+@cache
+def _crc24q_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
+    """CRC of each byte value followed by k zero bytes, flat over (k descending, value), and the rows' offsets."""
+    row = np.arange(256, dtype=np.uint32) << np.uint32(16)
+    for _ in range(8):
+        row = (row << np.uint32(1)) ^ np.where(row & np.uint32(0x80_0000), np.uint32(CRC24Q_POLYNOMIAL), np.uint32(0))
+    step = row & np.uint32(0xFF_FFFF)
+    table = np.empty((CRC24Q_STEP_BYTES, 256), dtype=np.uint32)
+    table[-1] = step
+    for k in range(CRC24Q_STEP_BYTES - 2, -1, -1):
+        after = table[k + 1]  # one zero byte more: the top byte goes through the table
+        table[k] = ((after << np.uint32(8)) & np.uint32(0xFF_FFFF)) ^ step[after >> np.uint32(16)]
+    return table.reshape(-1), np.arange(CRC24Q_STEP_BYTES, dtype=np.intp) * 256
+
+
+def crc24q(data: Bytes) -> int:
+    """CRC-24Q, initial value 0 (RTCM 10403.3, 4.1.2)."""
+    table, offsets = _crc24q_table()
+    crc = 0
+    for start in range(0, len(data), CRC24Q_STEP_BYTES):
+        part = np.frombuffer(data[start : start + CRC24Q_STEP_BYTES], dtype=np.uint8)
+        places = offsets[-len(part) :] + part
+        for index in range(min(3, len(part)) if crc else 0):  # the register so far lies over the next three bytes
+            places[index] ^= (crc >> (16 - 8 * index)) & 0xFF
+        rest = (crc << (8 * len(part))) & 0xFF_FFFF if len(part) < 3 else 0
+        crc = int(np.bitwise_xor.reduce(table[places])) ^ rest
+    return crc
+
+
+def crc32_novatel(data: Bytes) -> int:
+    """NovAtel's CRC-32 (OEM7 manual, 32-bit CRC): the IEEE polynomial reflected, from 0, no final inversion.
+
+    zlib inverts the register before and after; inverting its seed and its result takes both away.
+    """
+    return zlib.crc32(data, 0xFFFF_FFFF) ^ 0xFFFF_FFFF
