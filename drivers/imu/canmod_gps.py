@@ -1,0 +1,210 @@
+"""CSS Electronics CANmod.gps: an automotive IMU (100 Hz) and a GNSS receiver (1 Hz) on one CAN bus.
+
+A preset over `drivers.imu.dbc` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence inside). The
+device has no counter and no PPS output: its samples are timed by their arrival, and its time message, a second old
+and some 0.5 s late, names the edge before it for a host that has PPS from elsewhere.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from math import radians
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drivers.core.can_frames import decode_can_frames
+from drivers.core.parser import DeviceSettings, Driver
+from drivers.imu.dbc import DbcParser
+from drivers.imu.dbc_signals import SignalLayout, find_signal, load_database
+from georef.records import (
+    ByteRows,
+    DeviceStatus,
+    FixType,
+    GnssFix,
+    ImuSamples,
+    Int64Array,
+    NamesEdge,
+    Record,
+    StructArray,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+
+DBC_PATH = Path(__file__).with_name("canmod-gps.dbc")
+IMU_SIGNALS = {
+    "specific_force": [f"gnss_imu.Acceleration{axis}" for axis in "XYZ"],
+    "angular_rate": [f"gnss_imu.AngularRate{axis}" for axis in "XYZ"],
+}
+IMU_VALID = "gnss_imu.ImuValid"
+GNSS_SIGNALS = {  # message -> its signals that are read
+    "gnss_status": ("FixType", "Satellites"),
+    "gnss_time": ("TimeValid", "TimeConfirmed", "Epoch"),
+    "gnss_pos": ("PositionValid", "Latitude", "Longitude", "PositionAccuracy"),
+    "gnss_altitude": ("AltitudeValid", "Altitude", "AltitudeAccuracy"),
+    "gnss_speed": ("SpeedValid", "Speed", "SpeedAccuracy"),
+}
+FIX_TYPES = {  # VAL_ 1 FixType of the DBC
+    0: FixType.NONE,
+    1: FixType.DEAD_RECKONING,
+    2: FixType.SINGLE,
+    3: FixType.SINGLE,
+    4: FixType.SINGLE,
+    5: FixType.NONE,
+}
+UNIX_EPOCH = dt.date(1970, 1, 1)
+MS_PER_S = 1000
+MS_PER_DAY = 86_400_000
+NS_PER_MS = 1_000_000
+
+
+class GnssMessage(NamedTuple):
+    """One kind of GNSS frame: identifier, least length, signals by name."""
+
+    can_id: int
+    needs_bytes: int
+    signals: dict[str, SignalLayout]
+
+
+class CanmodGpsParser(DbcParser):
+    """`ImuSamples` by the DBC machinery, and the 1 Hz GNSS messages."""
+
+    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
+        """Args: the device's table; ``time_only``: give time messages only, for the recorder."""
+        contents = settings.files.get("dbc") or DBC_PATH.read_bytes()
+        config: dict[str, Any] = {**settings.config, "signals": IMU_SIGNALS, "dbc": DBC_PATH.name}
+        super().__init__(DeviceSettings(settings.source, config, {"dbc": contents}))
+        database = load_database(contents)
+        self._imu_valid = find_signal(database, IMU_VALID, DBC_PATH.name)
+        self._gnss = {name: _gnss_message(database, name) for name in GNSS_SIGNALS}
+        self._time_only = time_only
+        self._time: TimeTag | None = None
+        self._status: dict[str, float] = {}
+
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Decode CAN frames, (n, 16) or (n, 72)."""
+        table = decode_can_frames(units)
+        if table is None:
+            return super().parse_units(host_time_ns, units)
+        if self._time_only:
+            self.counters.bytes += units.size
+            return self._gnss_records(host_time_ns, table)
+        bad = (table["can_id"] == self._imu_valid.can_id) & (self._imu_valid.layout.bits(table["data"]) == 0)
+        rejected = int(np.count_nonzero(bad))
+        if rejected:
+            self.counters.errors["imu_invalid"] += rejected
+            self.counters.bytes += rejected * units.shape[1]
+            host_of_good, good = host_time_ns[~bad], units[~bad]
+            return [*super().parse_units(host_of_good, good), *self._gnss_records(host_time_ns, table)]
+        return [*super().parse_units(host_time_ns, units), *self._gnss_records(host_time_ns, table)]
+
+    def _gnss_records(self, host_time_ns: Int64Array, table: StructArray) -> list[Record]:
+        """The GNSS messages of a batch in the order of their arrival; they come once a second."""
+        found: list[tuple[int, str, dict[str, float]]] = []
+        for name, message in self._gnss.items():
+            where = np.flatnonzero(table["can_id"] == np.uint32(message.can_id))
+            whole = where[table["length"][where] >= message.needs_bytes]
+            if len(whole) < len(where):
+                self.counters.bad_messages += len(where) - len(whole)
+                self.counters.errors["bad_length"] += len(where) - len(whole)
+            if not len(whole):
+                continue
+            self.counters.messages[name] += len(whole)
+            data = table["data"][whole]
+            columns = {key: layout.values(layout.bits(data)).tolist() for key, layout in message.signals.items()}
+            found += [(int(row), name, {key: columns[key][n] for key in columns}) for n, row in enumerate(whole)]
+        records: list[Record] = []
+        for row, name, values in sorted(found, key=lambda item: item[0]):
+            records += self._gnss_record(int(host_time_ns[row]), name, values)
+        return records
+
+    def _gnss_record(self, host_time_ns: int, name: str, values: dict[str, float]) -> list[Record]:
+        """What one GNSS message says."""
+        if name == "gnss_status":
+            self._status = values
+            return []
+        if name == "gnss_time":
+            self._time = utc_tag(values["Epoch"])
+            return [
+                TimeMessage(
+                    host_time_ns, self._time, NamesEdge.PREVIOUS, valid=bool(values["TimeValid"]), message="gnss_time"
+                )
+            ]
+        if self._time_only:
+            return []
+        if name == "gnss_pos":
+            return [self._fix(host_time_ns, values)] if self._time is not None else []
+        return [DeviceStatus(host_time_ns, _status_values(name, values), message=name)]
+
+    def _fix(self, host_time_ns: int, values: dict[str, float]) -> GnssFix:
+        """Position of the epoch of the last time message.
+
+        The maker does not say what surface its altitude refers to, so the fix has no ellipsoidal height; the altitude
+        is in the device's status.
+        """
+        assert self._time is not None
+        accuracy = values["PositionAccuracy"]
+        fix_type = FIX_TYPES.get(int(self._status.get("FixType", 0)), FixType.NONE)
+        valid = bool(values["PositionValid"])
+        return GnssFix(
+            host_time_ns=host_time_ns,
+            time=self._time,
+            lat_rad=radians(values["Latitude"]) if valid else None,
+            lon_rad=radians(values["Longitude"]) if valid else None,
+            height_m=None,
+            position_cov_l=np.diag([accuracy**2 / 2, accuracy**2 / 2, np.nan]) if valid else None,
+            fix_type=fix_type if valid else FixType.NONE,
+            satellites=int(self._status["Satellites"]) if self._status else None,
+            valid=valid,
+            message="gnss_pos",
+        )
+
+
+def _gnss_message(database: Any, name: str) -> GnssMessage:
+    """Layouts of one GNSS message."""
+    found = {key: find_signal(database, f"{name}.{key}", DBC_PATH.name) for key in GNSS_SIGNALS[name]}
+    layouts = {key: signal.layout for key, signal in found.items()}
+    needs = max(layout.needs_bytes for layout in layouts.values())
+    return GnssMessage(next(iter(found.values())).can_id, needs, layouts)
+
+
+def utc_tag(unix_s: float) -> TimeTag:
+    """UTC of a Unix time with the device's 1 ms resolution.
+
+    The device cuts its epoch to milliseconds, so a whole second reads as .000 or .999: both are the whole second.
+    """
+    unix_ms = round(unix_s * MS_PER_S)
+    if unix_ms % MS_PER_S == MS_PER_S - 1:
+        unix_ms += 1
+    days, ms_of_day = divmod(unix_ms, MS_PER_DAY)
+    return TimeTag(TimeScale.UTC, ms_of_day * NS_PER_MS, date=UNIX_EPOCH + dt.timedelta(days=days))
+
+
+def _status_values(name: str, values: dict[str, float]) -> dict[str, float | int | str | bool]:
+    """Altitude and speed with their units in the keys; nothing where the device calls them invalid."""
+    if name == "gnss_altitude" and values["AltitudeValid"]:
+        return {"altitude_m": values["Altitude"], "altitude_accuracy_m": values["AltitudeAccuracy"]}
+    if name == "gnss_speed" and values["SpeedValid"]:
+        return {"speed_mps": values["Speed"], "speed_accuracy_mps": values["SpeedAccuracy"]}
+    return {}
+
+
+def make_time_parser(settings: DeviceSettings) -> CanmodGpsParser:
+    """The recorder's parser: time messages only."""
+    return CanmodGpsParser(settings, time_only=True)
+
+
+DRIVERS = (
+    Driver(
+        protocol="canmod-gps",
+        kind="imu",
+        transports=("can",),
+        yields=(ImuSamples, TimeMessage, GnssFix, DeviceStatus),
+        summary="CSS Electronics CANmod.gps: IMU at 100 Hz, GNSS at 1 Hz",
+        make_parser=CanmodGpsParser,
+        make_time_parser=make_time_parser,
+        names_edge=NamesEdge.PREVIOUS,
+    ),
+)
