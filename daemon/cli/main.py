@@ -107,6 +107,10 @@ def run_app(arguments: list[str]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
         return PIPE_CLOSED
+    except SystemExit as leaving:  # how Rich ends on a closed pipe
+        if isinstance(leaving.__context__, BrokenPipeError):
+            return PIPE_CLOSED
+        raise
     except Exception as error:  # the last resort: everything a command did not foresee
         return _end_unforeseen(error)
     return int(result) if isinstance(result, int) else int(ExitCode.OK)

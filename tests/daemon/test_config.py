@@ -37,6 +37,12 @@ def expected_lines(path: Path) -> list[str]:
     return [f"{path}: {line.format(**words) if '{' in line else line}" for line in lines]
 
 
+def _shortened(lines: list[str], expected: list[str]) -> list[str]:
+    """The lines, cut where an expected one ends in …: what follows is another library's wording."""
+    begins = [line.removesuffix("…") for line in expected if line.endswith("…")]
+    return [next((f"{begin}…" for begin in begins if line.startswith(begin)), line) for line in lines]
+
+
 def with_session(text: str) -> str:
     return f'[session]\nname = "x"\n{text}'
 
@@ -99,7 +105,7 @@ class TestBadFiles:
         assert expected, f"{path} says nothing of what to expect"
         with pytest.raises(ConfigError) as caught:
             load_config(path)
-        assert sorted(caught.value.lines) == sorted(expected)
+        assert sorted(_shortened(caught.value.lines, expected)) == sorted(expected)
         assert caught.value.exit_code is ExitCode.USAGE
         assert all("\n" not in line for line in caught.value.lines)
 

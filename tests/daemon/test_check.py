@@ -1,0 +1,322 @@
+"""`swath check` on real ptys, UDP ports, CAN buses and FIFOs: what answers, what does not, what is something else."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import reduce
+from operator import xor
+from pathlib import Path
+from socket import AF_INET, SOCK_DGRAM, socket
+
+import numpy as np
+import pytest
+
+from daemon.check import Report, _bitrate_problems, check_everything
+from daemon.config import parse_config
+from daemon.identify import describe_tag
+from drivers.scanner.srep import SrepHeader, encode_datagram
+from drivers.transports.uri import parse_transport
+from georef.records import TimeScale, TimeTag
+from tests.daemon.rig import free_udp_port
+
+ROOT = Path(__file__).parents[2]
+LISTEN_S = 1.2
+
+
+def nmea(body: str) -> bytes:
+    """A sentence with its checksum (NMEA 0183: exclusive or of what stands between $ and *)."""
+    return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
+
+
+def epoch(second: int, valid: bool = True) -> bytes:
+    """What a receiver says once a second."""
+    status = "A" if valid else "V"
+    clock = f"1015{second % 60:02}.00"
+    return nmea(f"GPRMC,{clock},{status},4730.0000,N,00900.0000,E,0.0,0.0,211126,,,A") + nmea(
+        f"GPGGA,{clock},4730.0000,N,00900.0000,E,{int(valid)},12,0.8,500.0,M,47.0,M,,"
+    )
+
+
+def srep_datagram(sequence: int, pps_count: int = 3) -> bytes:
+    header = SrepHeader(
+        sequence=sequence,
+        flags=int(pps_count > 0),
+        pps_count=pps_count,
+        pps_ticks=1_000_000,
+        first_ticks=1_500_000 + 1000 * sequence,
+    )
+    ticks = np.arange(10) * 50
+    return encode_datagram(header, ticks, np.arange(10) * 100, np.full((10, 1), 9_000_000))
+
+
+@contextmanager
+def repeating(job: Callable[[int], None], period_s: float = 0.05) -> Iterator[None]:
+    """Call a job again and again in a thread of its own."""
+    stop = threading.Event()
+
+    def run() -> None:
+        number = 0
+        while not stop.wait(period_s):
+            job(number)
+            number += 1
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
+    """A serial device that sends something again and again; its path."""
+    main, secondary = os.openpty()
+    tty.setraw(secondary)
+    os.set_blocking(main, False)
+
+    def write(number: int) -> None:
+        if send is not None:
+            try:
+                os.write(main, send(number))
+            except BlockingIOError:
+                pass
+
+    try:
+        with repeating(write):
+            yield os.ttyname(secondary)
+    finally:
+        os.close(main)
+        os.close(secondary)
+
+
+@contextmanager
+def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
+    """Datagrams to a port of this computer."""
+    with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
+        yield
+
+
+def _send(sender: socket, port: int, data: bytes) -> None:
+    sender.sendto(data, ("127.0.0.1", port))
+
+
+@contextmanager
+def pps_fifo(path: Path, spacing_ns: int = 1_000_000_000) -> Iterator[str]:
+    """A FIFO with edges, faster than real ones so that a test need not wait; their stamps say the spacing."""
+    os.mkfifo(path)
+    fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+    start_ns = time.time_ns() // 1_000_000_000 * 1_000_000_000
+
+    def write(number: int) -> None:
+        os.write(fd, f"{start_ns + number * spacing_ns} {number}\n".encode())
+
+    try:
+        with repeating(write, 0.1):
+            yield f"fixed:{path}"
+    finally:
+        os.close(fd)
+
+
+def check(text: str, folder: Path, seconds: float = LISTEN_S) -> dict[str, Report]:
+    """Reports of a configuration, by source."""
+    config = parse_config(f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{text}', folder / "swath.toml")
+    return {report.source: report for report in check_everything(config, seconds)}
+
+
+def gnss(path: str, protocol: str = "nmea", more: str = "") -> str:
+    return f'[gnss.rover]\ntransport = "serial:{path}?baud=115200"\nprotocol = "{protocol}"\n{more}\n'
+
+
+def srep(port: int, more: str = "") -> str:
+    transport = f"udp:127.0.0.1:{port}?buffer_mb=1"
+    return f'[scanner.left]\ntransport = "{transport}"\nprotocol = "srep"\nmirror_factor = 2\n{more}\n'
+
+
+class TestAllWell:
+    def test_every_device_answers_and_says_its_time(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        with pty(epoch) as path, pps_fifo(tmp_path / "edges") as edges, udp_sender(port, srep_datagram):
+            pps = f'[pps.main]\nsource = "{edges}"\n'
+            reports = check(pps + gnss(path, more='pps = "main"') + srep(port, 'pps = "main"'), tmp_path)
+        assert list(reports) == ["pps/main", "gnss/rover", "scanner/left", "log"]
+        assert {source: report.problems for source, report in reports.items() if report.problems} == {}
+        assert all(report.opens for report in reports.values())
+        assert reports["pps/main"].time == "every 1.0000 s"
+        assert reports["gnss/rover"].records["GnssFix"] > 0
+        assert reports["gnss/rover"].time.startswith("2026-11-21 10:15:")
+        assert reports["scanner/left"].records["ScannerReturns"] == 10 * reports["scanner/left"].units
+        assert reports["scanner/left"].time == "PPS seen"
+
+    def test_the_auxiliary_port_has_its_own_line(self, tmp_path: Path) -> None:
+        port, auxiliary = free_udp_port(), free_udp_port()
+        with udp_sender(port, srep_datagram), udp_sender(auxiliary, lambda _: bytes(512)):
+            more = f'auxiliary = "udp:127.0.0.1:{auxiliary}?buffer_mb=1"'
+            reports = check(srep(port, more), tmp_path, 0.5)
+        assert reports["scanner/left/aux"].bytes == 512 * reports["scanner/left/aux"].units > 0
+        assert reports["scanner/left/aux"].problems == []
+
+
+class TestAbsent:
+    def test_a_device_that_is_not_there(self, tmp_path: Path) -> None:
+        report = check(gnss(str(tmp_path / "ttyNone")), tmp_path, 0.3)["gnss/rover"]
+        assert not report.opens
+        [problem] = report.problems
+        assert "ttyNone" in problem
+
+    def test_a_pps_that_is_not_there(self, tmp_path: Path) -> None:
+        report = check(f'[pps.main]\nsource = "{tmp_path}/pps9"\n', tmp_path, 0.3)["pps/main"]
+        assert not report.opens
+        assert "pps9" in report.problems[0]
+
+    def test_a_silent_device(self, tmp_path: Path) -> None:
+        with pty() as path:
+            report = check(gnss(path), tmp_path, 0.3)["gnss/rover"]
+        assert report.opens
+        assert report.problems == ["silent: opened, but no byte in 0.3 s; is it powered, wired and sending here?"]
+
+    def test_a_pps_without_edges(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "edges")
+        report = check(f'[pps.main]\nsource = "fixed:{tmp_path}/edges"\n', tmp_path, 0.3)["pps/main"]
+        assert report.problems[0].startswith("no assert edge in 0.3 s")
+
+    def test_a_port_that_another_program_has(self, tmp_path: Path) -> None:
+        with socket(AF_INET, SOCK_DGRAM) as holder:
+            holder.bind(("127.0.0.1", 0))
+            port = holder.getsockname()[1]
+            report = check(srep(port), tmp_path, 0.3)["scanner/left"]
+        assert not report.opens
+        assert f"port {port} is in use" in report.problems[0]
+
+
+class TestSomethingElse:
+    def test_a_receiver_of_another_protocol_is_named(self, tmp_path: Path) -> None:
+        with pty(epoch) as path:
+            report = check(gnss(path, "novatel"), tmp_path)["gnss/rover"]
+        assert report.problems == ["answers as nmea, configured as novatel"]
+
+    def test_a_scanner_of_another_protocol_is_named(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        text = srep(port).replace('"srep"', '"velodyne-vlp16"').replace("mirror_factor = 2", "")
+        with udp_sender(port, srep_datagram):
+            identity = "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+            report = check(text + identity, tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as srep, configured as velodyne-vlp16"]
+
+    def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
+        with pty(lambda _: noise) as path:
+            report = check(gnss(path), tmp_path, 0.5)["gnss/rover"]
+        want = "nothing of it is nmea nor any other gnss protocol known; is the baud rate right?"
+        assert report.problems == [want]
+
+    def test_damaged_messages_are_counted(self, tmp_path: Path) -> None:
+        with pty(lambda number: epoch(number) + epoch(number).replace(b"4730", b"4731")) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert any("messages damaged" in problem for problem in report.problems)
+
+
+class TestTime:
+    def test_a_receiver_without_valid_time(self, tmp_path: Path) -> None:
+        with pty(lambda number: epoch(number, valid=False)) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert report.problems == ["its time is not valid (yet)"]
+        assert report.time == "not valid"
+
+    def test_a_scanner_that_sees_no_pps(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        pps = '[pps.main]\nsource = "/dev/pps0"\n'
+        with udp_sender(port, lambda number: srep_datagram(number, pps_count=0)):
+            report = check(pps + srep(port, 'pps = "main"'), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["does not see its PPS (main)"]
+
+    def test_edges_of_another_pulse(self, tmp_path: Path) -> None:
+        with pps_fifo(tmp_path / "edges", spacing_ns=200_000_000) as edges:
+            report = check(f'[pps.main]\nsource = "{edges}"\n', tmp_path)["pps/main"]
+        assert report.problems == ["edges are 0.2000 s apart, want 1 s: noise, or another pulse"]
+
+    @pytest.mark.parametrize(
+        ("tag", "text"),
+        [
+            (TimeTag(TimeScale.GPS, 555_303_000_000_000, week=2443), "GPS week 2443, 555303.0 s"),
+            (TimeTag(TimeScale.GPS, 555_303_000_000_000), "GPS week ?, 555303.0 s"),
+            (TimeTag(TimeScale.UTC, 86_400_000_000_000), "24:00:00 UTC"),
+        ],
+    )
+    def test_a_time_is_said_as_far_as_it_is_known(self, tag: TimeTag, text: str) -> None:
+        assert describe_tag(tag) == text
+
+
+class TestComputer:
+    def test_a_directory_that_is_full(self, tmp_path: Path) -> None:
+        config = parse_config('[session]\nname = "x"\ndirectory = "."\nreserve_mb = 10000000\n', tmp_path / "a.toml")
+        [report] = check_everything(config, 0.1)
+        assert "MB free, reserve_mb is 1e+07" in report.problems[0]
+
+    def test_a_can_bus_of_another_bitrate_is_compared_only_where_there_is_one(self) -> None:
+        assert _bitrate_problems(parse_transport("can:socketcan:nonesuch0?bitrate=500000")) == []
+
+    def test_a_receive_buffer_that_is_not_granted(self, tmp_path: Path) -> None:
+        """In a process without the right to force it, as the service is."""
+        config = tmp_path / "swath.toml"
+        port = free_udp_port()
+        text = srep(port).replace("buffer_mb=1", "buffer_mb=1023")
+        config.write_text(f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{text}')
+        with udp_sender(port, srep_datagram):
+            run = _unprivileged("check", str(config), "--seconds", "0.5", "--json")
+        assert run.returncode == 1, run.stderr
+        found = json.loads(run.stdout)
+        assert found["ok"] is False
+        [problem] = found["devices"][0]["problems"]
+        limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
+        want = f"receive buffer: asked for {1023 << 20} bytes, got {limit}; `sysctl -w net.core.rmem_max={1023 << 20}`"
+        assert problem.startswith(want)
+
+    def test_the_table_has_a_line_a_device_and_a_line_a_problem(self, tmp_path: Path) -> None:
+        config = tmp_path / "swath.toml"
+        port = free_udp_port()
+        config.write_text(
+            f'[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n{gnss(f"{tmp_path}/ttyNone")}{srep(port)}'
+        )
+        with udp_sender(port, srep_datagram):
+            run = subprocess.run(
+                [sys.executable, "-m", "daemon.cli.main", "check", str(config), "--seconds", "0.5"],
+                cwd=ROOT,
+                env=os.environ | {"COLUMNS": "100"},
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+        assert run.returncode == 1
+        lines = run.stdout.splitlines()
+        assert [
+            line.split()[-1] for line in lines if line.lstrip().startswith(("gnss/rover ", "scanner/left ", "log "))
+        ] == [
+            "wrong",
+            "ok",
+            "ok",
+        ]
+        assert sum(line.startswith("gnss/rover: ") for line in lines) == 1
+
+
+def _unprivileged(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line without CAP_NET_ADMIN."""
+    drop = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"] if os.getuid() == 0 else []
+    return subprocess.run(
+        [*drop, sys.executable, "-m", "daemon.cli.main", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
