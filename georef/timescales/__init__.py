@@ -4,6 +4,7 @@ Imports nothing of the project but `georef.records`; knows no clock and no I/O.
 """
 
 from georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
+from georef.timescales.device_clock import DeviceClock, DeviceClockStatus
 from georef.timescales.gps_time import (
     DAY_NS,
     GPS_EPOCH,
@@ -42,6 +43,8 @@ __all__ = [
     "WEEK_S",
     "ClockEvent",
     "ClockStatus",
+    "DeviceClock",
+    "DeviceClockStatus",
     "HostTimeline",
     "PpsClock",
     "Severity",

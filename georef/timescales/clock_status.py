@@ -42,8 +42,10 @@ class ClockStatus:
         state: see `TimeState`. sigma_ns: of gps_from_host there; inf without time.
         offset_ns: GPS − host; None without time. drift_ppm: of the host clock, positive: fast; None without edges.
         noise_ns: sigma of the edges' stamps as the data show it; None without edges.
-        source: who names the seconds ("gnss/rover RMC"), "wall_clock", or empty. ambiguous: why the second is not certain.
-        leap_seconds, leap_origin: GPS − UTC in use, and who said so: receiver, second_60, configured, table, guess; None: not needed yet.
+        source: who names the seconds ("gnss/rover RMC"), "wall_clock", or empty.
+        ambiguous: why the second is not certain; empty where it is.
+        leap_seconds, leap_origin: GPS − UTC in use, and who said so (receiver, second_60, configured, table, guess);
+            None: not needed yet.
         edges_used: edges in the line. edges_refused, messages_refused: counts by reason.
     """
 

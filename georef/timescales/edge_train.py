@@ -1,4 +1,4 @@
-"""One train of PPS edges: found among what the interrupt delivers, followed through a gate, remembered one knot an edge."""
+"""One train of PPS edges: found among what the interrupt delivers, followed through a gate, remembered knot by knot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from georef.records import Int64Array
 from georef.timescales.gps_time import SECOND_NS
 from georef.timescales.labelling import Labeller
-from georef.timescales.line_fit import LineBank, excess_variances
+from georef.timescales.line_fit import SHRINK_HORIZON, LineBank, excess_variances
 
 MAX_DRIFT = 200e-6
 FIRST_LOCK_EDGES = 5
@@ -29,9 +29,10 @@ FIRST_NOISE_NS = 2_000.0  # prior of the stamps' noise, worth two edges beside t
 
 
 def find_chain(edges: Sequence[int], *, noisy: bool) -> list[tuple[int, int]] | None:
-    """Edges of one 1 Hz train that ends with the newest edge: (index, host ns), first index 0; None where there is none yet.
+    """Edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None where there is none yet.
 
-    Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more, and asks for more edges.
+    Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more and asks
+    for more edges.
     """
     wanted = NOISY_LOCK_EDGES if noisy else FIRST_LOCK_EDGES
     chain = [(0, edges[-1])]
@@ -126,6 +127,7 @@ class EdgeTrain:
         numbers = (knot.phase_ns - whole, knot.drift_ns_s, knot.var_phase, knot.var_cross, knot.var_drift, knot.wander)
         self._numbers.extend(numbers)
         self._numbers.extend(knot.excess)
+        self._numbers.append(knot.shrink)
         if not self._keep_history and len(self._whole) > 2 * LIVE_KNOTS:
             del self._whole[:LIVE_KNOTS], self._index[:LIVE_KNOTS], self._doubt[:LIVE_KNOTS]
             del self._numbers[: LIVE_KNOTS * KNOT_NUMBERS]
@@ -155,7 +157,7 @@ class EdgeTrain:
         )
 
 
-KNOT_NUMBERS = 9  # fraction of a ns, drift, three (co)variances, wander, three excess variances
+KNOT_NUMBERS = 10  # fraction of a ns, drift, three (co)variances, wander, three excess variances, shrink
 
 
 class KnotTable:
@@ -180,4 +182,5 @@ class KnotTable:
         xx, xy, yy, wander = self.numbers[k, 2], self.numbers[k, 3], self.numbers[k, 4], self.numbers[k, 5]
         away = np.abs(seconds)
         plain = xx + 2.0 * np.maximum(seconds * xy, 0.0) + away * away * (yy + wander * away / 3.0)
+        plain *= 1.0 + (self.numbers[k, 9] - 1.0) * np.minimum(away / SHRINK_HORIZON, 1.0)
         return np.asarray(plain + excess_variances(self.numbers[k, 6:9], away), dtype=np.float64)

@@ -60,7 +60,7 @@ def table_leap_seconds(date: dt.date) -> tuple[int, bool]:
 
 
 def gps_ns_from_utc(date: dt.date, time_of_day_ns: int, leap_seconds: int) -> int:
-    """GPS ns of a UTC day and time. In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is still the old count."""
+    """GPS ns of a UTC day and time. In a leap second time_of_day_ns ≥ 86 400 s and leap_seconds is the old count."""
     return (date.toordinal() - GPS_EPOCH.toordinal()) * DAY_NS + time_of_day_ns + leap_seconds * SECOND_NS
 
 
@@ -155,8 +155,8 @@ def gps_ns_past_hour(
 ) -> tuple[Int64Array, NDArray[np.bool_]]:
     """Place stamps that count from the UTC hour (Velodyne, locked): GPS ns (n,) and which of them may be believed.
 
-    The hour is the one that comes nearest to the prediction (so within ± 30 min); a stamp is refused where it then differs from
-    it by more than max_residual_ns.
+    The hour is the one that comes nearest to the prediction (so within ± 30 min); a stamp is refused where it then
+    differs from it by more than max_residual_ns.
     """
     near = np.asarray(near_gps_ns, dtype=np.int64)
     offset = np.asarray(past_hour_ns, dtype=np.int64) + leap_seconds * SECOND_NS

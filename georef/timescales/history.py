@@ -1,4 +1,4 @@
-"""GPS time from remembered knots: piecewise, continuous, monotone; between knots the models of both sides are blended."""
+"""GPS time from remembered knots: piecewise, continuous, monotone; between knots both sides' models are blended."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class HostTimeline:
         self._arrays: tuple[Int64Array, NDArray[np.float64], int] | None = None
 
     def add(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
-        """One reading of the three clocks. realtime_ns is taken for completeness: a stepped wall clock changes nothing."""
+        """One reading of the three clocks. realtime_ns has no say: a stepped wall clock changes nothing."""
         del realtime_ns
         host = monotonic_ns + self.host_minus_monotonic_ns
         offset = monotonic_raw_ns - host
@@ -105,4 +105,4 @@ class HostTimeline:
         offsets = np.interp(elapsed, (knots - knots[0]).astype(np.float64), relative)
         slope = self._slope / (1.0 + self._slope) if inverse else self._slope
         beyond = np.maximum(times - knots[-1], 0).astype(np.float64)
-        return first + np.rint(offsets + slope * beyond).astype(np.int64)
+        return np.asarray(first + np.rint(offsets + slope * beyond), dtype=np.int64)

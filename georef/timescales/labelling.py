@@ -1,7 +1,7 @@
 """Which second an edge was: integer-offset votes, one voter a kind of message.
 
-Every message gives ``offset = second − edge number`` for the edge it names. A delay of nearly one second or more would make
-it name the next edge, so the age of the messages is watched, and voters are compared with each other.
+Every message gives ``offset = second − edge number`` for the edge it names. A delay of nearly one second or more would
+make it name the next edge, so the age of the messages is watched, and voters are compared with each other.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class LeapSeconds(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeapChange:
-    """A receiver said another count than the one in use. before: that one. said_before: a receiver had said that, too."""
+    """A receiver said another count than the one in use (before). said_before: a receiver had said that one, too."""
 
     source: str
     before: int

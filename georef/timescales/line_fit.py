@@ -1,12 +1,13 @@
 """The line through the PPS edges: phase and drift of a clock, with an honest sigma.
 
-Edge n is expected at host time ``anchor + n·1 s + x + y·(…)``: x is the phase (ns), y the drift (ns/s, positive: the host
-clock runs fast). How many past edges should count depends on the stamps' noise and on the oscillator: 50 ns stamps want the last
-16 s, user-space stamps of 300 µs several minutes, a crystal on a temperature ramp less again. So the line is not fitted over
-one fixed window: a bank of lines with exponentially fading memory (two-state filters, each assuming another wander of the
-frequency) runs side by side and the data weigh them; what is given is their weighted mean with the spread between them in its
-variance. Robust: an innovation beyond 3 × 1.48 MAD of the last 64 is left out. Both the stamps' noise and the growth of
-prediction errors over 16 s to 256 s are estimated from the data, starting from the priors named here.
+Edge n is expected at host time ``anchor + n·1 s + x``, and x (the phase, ns) grows by y (the drift, ns/s; positive: the
+host clock runs fast). How many past edges should count depends on the stamps' noise and on the oscillator: 50 ns stamps
+want the last 16 s, user-space stamps of 300 µs several minutes, a crystal on a temperature ramp less again. So the line
+is not fitted over one fixed window: a bank of lines with fading memory (two-state filters, each assuming another wander
+of the frequency) runs side by side and the data weigh them; what is given is their weighted mean, with the spread
+between them in its variance. Robust: an innovation beyond 3 × 1.48 MAD of the last 64 is left out. Both the stamps'
+noise and the growth of prediction errors over 16 s to 256 s are estimated from the data, starting from the priors named
+here.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Documented priors. Wander of the frequency, ns/s per √s: 0.3e-9 (a good TCXO at rest) to 1e-7 (a crystal on a ramp of
-# 0.5 ppm/min looks like 3e-8 to 1e-7 over a minute). All are equally likely to begin with.
+# 0.5 ppm/min looks like 3e-8 to 1e-7 over a minute), and how common each is.
 WANDER_GRID = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-SWITCH_PER_S = 1.0 / 600.0  # how often an oscillator changes its behaviour (temperature, airflow)
+WANDER_PRIOR = (0.2, 0.3, 0.3, 0.14, 0.05, 0.01)
+SWITCH_PER_S = 1.0 / 1200.0  # how often an oscillator changes its behaviour (temperature, airflow)
 NOISE_FLOOR_NS = 5.0  # time stamping is never better than this
 DRIFT_PRIOR = 1e5  # 100 ppm in ns/s, sigma before the first edges
 NOISE_MEMORY = 128  # edges
@@ -31,7 +33,9 @@ TRUNCATED_VARIANCE = 0.9733  # of a normal distribution cut at 3 sigma
 OUTLIERS_IN_A_ROW = 4  # after so many they are the truth
 HORIZONS = (16, 64, 256)  # seconds over which past predictions are compared with what came
 HORIZON_MEMORY = 1200  # edges
-SETTLING_EDGES = 48  # before the noise is known nothing is learnt about predictions
+SETTLING_EDGES = 64  # the first predictions say nothing about later ones
+SHRINK_HORIZON = 64
+SHRINK_BOUND = 0.25
 WORST_ERROR = 1e3  # a squared prediction error counts up to this multiple of its variance
 
 
@@ -43,6 +47,7 @@ class Knot:
         index: edge number n. phase_ns, drift_ns_s: x and y there; var_*: their covariance (ns², ns²/s, ns²/s²).
         wander: variance of the frequency's random walk, (ns/s)²/s.
         excess: variance (ns²) by which predictions over HORIZONS were worse than that.
+        shrink: factor (≤ 1) where they were better.
     """
 
     index: int
@@ -53,6 +58,7 @@ class Knot:
     var_drift: float
     wander: float
     excess: tuple[float, ...]
+    shrink: float = 1.0
 
     def phase_at(self, index: float) -> float:
         """Phase (ns) extrapolated to an edge number."""
@@ -61,13 +67,19 @@ class Knot:
     def variance_at(self, index: float) -> float:
         """Variance (ns²) of that phase: as the filters predict it, and what past predictions showed beyond."""
         seconds = abs(index - self.index)
-        return self.plain_variance(seconds) + excess_variance(self.excess, seconds)
+        plain = self.plain_variance(seconds) * shrink_factor(self.shrink, seconds)
+        return plain + excess_variance(self.excess, seconds)
 
     def plain_variance(self, seconds: float) -> float:
         """Variance (ns²) seconds after the knot, as the filters predict it."""
         return self.var_phase + seconds * (
             2.0 * self.var_cross + seconds * (self.var_drift + self.wander * seconds / 3.0)
         )
+
+
+def shrink_factor(shrink: float, seconds: float) -> float:
+    """Factor of the predicted variance after some seconds: 1 at the knot, `shrink` from SHRINK_HORIZON on."""
+    return 1.0 + (shrink - 1.0) * min(seconds / SHRINK_HORIZON, 1.0)
 
 
 def excess_variance(excess: tuple[float, ...], seconds: float) -> float:
@@ -104,6 +116,8 @@ class _Excess:
         self._count = 0.0
         self._excess = 0.0
         self._variance = 0.0
+        self._weight = 0.0
+        self._ratio = 0.0
 
     def add(self, error_ns: float, variance: float, noise: float) -> None:
         """One prediction error, with the variance it should have had and that of the stamp it was compared with."""
@@ -112,6 +126,10 @@ class _Excess:
         share = 1.0 / self._count
         self._excess += (squared - noise - variance - self._excess) * share
         self._variance += (variance - self._variance) * share
+        total = variance + noise
+        weight = (variance / total) ** 2
+        self._weight += (weight - self._weight) * share
+        self._ratio += ((squared - noise) * variance / (total * total) - self._ratio) * share
 
     def variance(self, noise: float) -> float:
         """The excess variance, ns²."""
@@ -120,6 +138,12 @@ class _Excess:
         chance = noise * math.sqrt(2.0 / self._count) + self._variance * math.sqrt(2.0 * self.horizon / self._count)
         shrunk = self._excess * self._count / (self._count + self.horizon)
         return max(0.0, shrunk - chance)
+
+    def shrink(self) -> float:
+        """Measured over predicted variance, at most 1: least squares of e² = R + f·V and a prior."""
+        prior = float(self.horizon)
+        ratio = (prior + self._count * self._ratio) / (prior + self._count * self._weight)
+        return min(max(ratio, SHRINK_BOUND), 1.0)
 
 
 class LineBank:
@@ -136,11 +160,11 @@ class LineBank:
         self._pxx = [self._noise] * size
         self._pxy = [0.0] * size
         self._pyy = [DRIFT_PRIOR**2] * size
-        self._weight = [1.0 / size] * size
+        self._weight = list(WANDER_PRIOR)
         self._normalised: deque[float] = deque(maxlen=MAD_WINDOW)
         self._outliers_in_a_row = 0
         self._excess = tuple(_Excess(horizon) for horizon in HORIZONS)
-        self._taken = 0
+        self._settled_index = index + SETTLING_EDGES
         self._past: deque[Knot] = deque(maxlen=HORIZONS[-1] + 1)
         self._gain_phase = [1.0] * size
         self._gain_drift = [0.0] * size
@@ -162,9 +186,7 @@ class LineBank:
         if self._is_outlier(normalised):
             return False
         self._learn_noise(normalised, variance)
-        self._taken += 1
-        if self._taken > SETTLING_EDGES:
-            self._learn_excess(index, phase_ns)
+        self._learn_excess(index, phase_ns)
         self._filter(index, phase_ns)
         self.knot = self._moments(index)
         self._past.append(self.knot)
@@ -205,6 +227,8 @@ class LineBank:
         past = self._past
         for excess in self._excess:
             wanted = index - excess.horizon
+            if wanted < self._settled_index:
+                return
             place = max(0, len(past) - 1 - (past[-1].index - wanted))  # exact where no edge is missing, else too early
             while place < len(past) and past[place].index < wanted:
                 place += 1
@@ -240,8 +264,8 @@ class LineBank:
         raised = [weight * math.exp(score - best) for weight, score in zip(self._weight, scores, strict=True)]
         total = sum(raised)
         switch = min(0.5, SWITCH_PER_S * seconds)
-        even = switch / len(raised)
-        self._weight = [(1.0 - switch) * weight / total + even for weight in raised]
+        keep = (1.0 - switch) / total
+        self._weight = [keep * weight + switch * prior for weight, prior in zip(raised, WANDER_PRIOR, strict=True)]
 
     def _moments(self, index: int) -> Knot:
         """The bank as one line: weighted mean, and within- plus between-line covariance."""
@@ -258,4 +282,5 @@ class LineBank:
             yy += weight * (pyy + dy * dy)
             wander += weight * q
         excess = tuple(horizon.variance(self._noise) for horizon in self._excess)
-        return Knot(index, mean_x, mean_y, xx, xy, yy, wander, excess)
+        shrink = 1.0 if any(excess) else self._excess[HORIZONS.index(SHRINK_HORIZON)].shrink()
+        return Knot(index, mean_x, mean_y, xx, xy, yy, wander, excess, shrink)

@@ -1,8 +1,9 @@
 """The host's clock in GPS time: PPS edges give the fraction, time messages the second.
 
-Edges pass a gate around the line's prediction (`edge_train`), the line carries an honest sigma (`line_fit`), every message votes
-for a whole number of seconds (`labelling`). A label once accepted is held; whatever contradicts it is an event and COARSE, never
-a silent change. All times given are on one continuous host scale (CLOCK_MONOTONIC_RAW, see `host_timeline`).
+Edges pass a gate around the line's prediction (`edge_train`), the line carries an honest sigma (`line_fit`), every
+message votes for a whole number of seconds (`labelling`). A label once accepted is held; whatever contradicts it is an
+event and COARSE, never a silent change. All times given are on one continuous host scale (CLOCK_MONOTONIC_RAW, see
+`host_timeline`).
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class PpsClock:
         keep_history: bool = False,
         lost_sigma_ns: float = LOST_SIGMA_NS,
     ) -> None:
-        """assumed_leap_seconds: GPS − UTC until a receiver says. names_edge: override of what the messages say of themselves.
+        """assumed_leap_seconds: GPS − UTC until a receiver says. names_edge: override of what messages say themselves.
 
         delay_ns: cable and capture delay, subtracted from every edge. keep_history: one knot a second is kept for
         post-processing; otherwise the last quarter of an hour. lost_sigma_ns: HOLDOVER ends there.
@@ -262,7 +263,7 @@ class PpsClock:
             train.amend_last(-message.quantisation_ns)
 
     def _vote(self, train: EdgeTrain, said: _Said) -> bool:
-        """Let a message vote on a train. Where the train stood at its arrival follows from the line, not from what came first."""
+        """Let a message vote. Which edges surround it follows from the line, not from what came first."""
         place = train.index_at(said.host_ns)
         index = math.floor(place)
         if index < 0:
@@ -292,9 +293,7 @@ class PpsClock:
         if verdict.offset is None and not verdict.ambiguous:
             return
         if verdict.leap is LeapTrust.GUESSED and not verdict.ambiguous:
-            self._warn_once(
-                host_ns, "leap_unknown", "UTC only, and neither receiver nor configuration says leap seconds"
-            )
+            self._warn_once(host_ns, "leap_unknown", "UTC only; neither receiver nor configuration says leap seconds")
             return
         if labeller.label is None:
             if verdict.ambiguous:
@@ -370,7 +369,7 @@ class PpsClock:
     # ---- wall clock
 
     def set_wall_clock(self, host_ns: int, realtime_ns: int, *, disciplined: bool, sigma_s: float) -> None:
-        """One reading of CLOCK_REALTIME beside the host scale; it decides between seconds only where disciplined and steady."""
+        """One reading of CLOCK_REALTIME beside the host scale; decides between seconds where disciplined and steady."""
         self._wall.set(host_ns, realtime_ns, disciplined, sigma_s)
 
     # ---- answers
@@ -424,7 +423,7 @@ class PpsClock:
         return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)
 
     def gps_from_host(self, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
-        """GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where there are later ones.
+        """GPS ns (n,) and sigma ns (n,) of host times (n,): by the line forward, between knots where later ones exist.
 
         Without time the sigma is inf and the GPS time 0.
         """
@@ -437,6 +436,10 @@ class PpsClock:
         if offset is None:
             return np.zeros_like(host), np.full(host.shape, math.inf)
         return host + offset, np.full(host.shape, sigma)
+
+    def leap_seconds_at(self, gps_ns: int) -> int:
+        """GPS − UTC as far as known, for labelling UTC stamps of devices that say no leap count themselves."""
+        return self.leaps.on("", utc_from_gps(gps_ns, 18)[0]).seconds
 
     def _trains(self) -> list[EdgeTrain]:
         return [*self._former, self._train] if self._train is not None else []

@@ -1,0 +1,332 @@
+"""A device's own clock in GPS time: by the PPS edges it latches, by its UTC-hour stamps, or by arrival times alone.
+
+A device that latches the edge in its own counter gives the best time there is; the host only says which second the
+edge was. The label of latched edges is found when asked for, from the host's clock as it then stands, so a late or
+corrected label reaches them.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import Int64Array, StructArray
+from georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hour
+from georef.timescales.pps_clock import PpsClock
+
+MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: further from the edge than this it is refused
+MAX_DRIFT = 200e-6
+SPACING_FLOOR_NS = 2_000.0
+MAX_BRIDGED_S = 1_000  # longer without a latched edge the seconds can no longer be counted by ticks
+REFUSED_IN_A_ROW = 4  # spacings: then the first edge was the wrong one
+STEP_BACK_NS = 50_000_000  # device time going back further is a restart
+LABEL_KNOTS = 31  # latched edges around the time asked for whose labels are compared
+LABEL_MAJORITY = 0.8
+LABEL_MAX_SIGMA_NS = 1e8  # the host's clock must be better than this to say which second
+SLOPE_KNOTS = 16
+LATCH_NOISE_NS = 100.0  # prior: one tick at 10 MHz
+WANDER_NS = 30.0  # prior of a device crystal in flight, ns/s per √s
+BIN_NS = 10 * SECOND_NS
+ARRIVAL_LATENCY_NS = 2_000_000.0  # prior of the least latency of a datagram or frame nobody has calibrated
+HOUR_STAMP_SIGMA_NS = 20_000.0  # maker's figure for a head locked to PPS is some 10 µs to 50 µs
+LIVE_KNOTS = 1800
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceClockStatus:
+    """latched: by its own latch. drift_ppm: of the device, positive: fast; None unknown. segments: restarts + 1."""
+
+    latched: bool
+    drift_ppm: float | None
+    segments: int
+    edges_used: int
+    refused: dict[str, int]
+
+
+class _Latch:
+    """Latched edges of one segment: device time, where the host saw it, and seconds counted since the first."""
+
+    def __init__(self) -> None:
+        self.device = array("q")
+        self.host = array("q")
+        self.seconds = array("q")
+        self.refused_in_a_row = 0
+
+    def add(self, device_ns: int, host_ns: int) -> str | None:
+        """Take an edge, or say why not."""
+        if self.device:
+            spacing = device_ns - self.device[-1]
+            seconds = round(spacing / SECOND_NS)
+            off = abs(spacing - seconds * SECOND_NS)
+            if seconds < 1 or off > max(SPACING_FLOOR_NS, MAX_DRIFT * seconds * SECOND_NS):
+                self.refused_in_a_row += 1
+                return "spacing"
+            self.seconds.append(self.seconds[-1] + seconds)
+        else:
+            self.seconds.append(0)
+        self.refused_in_a_row = 0
+        self.device.append(device_ns)
+        self.host.append(host_ns)
+        return None
+
+    def trim(self) -> None:
+        """Forget all but the last LIVE_KNOTS (called when there are twice as many)."""
+        for column in (self.device, self.host, self.seconds):
+            del column[:-LIVE_KNOTS]
+
+    def slope(self, at: int) -> float:
+        """GPS ns per device ns by the knots that end (or begin, at 0) at knot `at`."""
+        low, high = (max(0, at - SLOPE_KNOTS), at) if at else (0, min(SLOPE_KNOTS, len(self.device) - 1))
+        ticks = self.device[high] - self.device[low]
+        return (self.seconds[high] - self.seconds[low]) * SECOND_NS / ticks if ticks else 1.0
+
+    def noise_ns(self) -> float:
+        """Sigma of the latch by second differences of the last edges (1.48 MAD), beside the prior."""
+        device = np.array(self.device[-256:], dtype=np.int64)
+        seconds = np.array(self.seconds[-256:], dtype=np.int64)
+        even = (np.diff(seconds)[:-1] == 1) & (np.diff(seconds)[1:] == 1)
+        second = np.diff(device, n=2)[even]
+        if second.size < 8:
+            return LATCH_NOISE_NS
+        return max(1.4826 * float(np.median(np.abs(second))) / math.sqrt(6.0), LATCH_NOISE_NS / math.sqrt(12.0))
+
+
+class _Arrivals:
+    """Least delayed arrivals, one a bin: where a device has no latch."""
+
+    def __init__(self) -> None:
+        self.bins: dict[int, tuple[int, int]] = {}  # bin: (host − device, device ns)
+
+    def add(self, device: Int64Array, host: Int64Array) -> None:
+        """Take arrivals: device times and host stamps (n,)."""
+        late = host - device
+        which = device // BIN_NS
+        starts = np.flatnonzero(np.concatenate(([True], np.diff(which) != 0)))
+        for start, stop in zip(starts, np.append(starts[1:], len(which)), strict=True):
+            best = int(start) + int(np.argmin(late[start:stop]))
+            key, found = int(which[start]), (int(late[best]), int(device[best]))
+            self.bins[key] = min(self.bins.get(key, found), found)
+
+    def trim(self) -> None:
+        """Forget all but the last LIVE_KNOTS bins."""
+        for key in list(self.bins)[:-LIVE_KNOTS]:
+            del self.bins[key]
+
+    def host_at(self, device_ns: Int64Array) -> tuple[Int64Array, float]:
+        """Host times (n,) of device times, and their sigma in ns."""
+        rows = sorted(self.bins.values(), key=lambda row: row[1])
+        late = np.array([row[0] for row in rows], dtype=np.int64)
+        at = np.array([row[1] for row in rows], dtype=np.int64)
+        base, relative = int(late[0]), (late - late[0]).astype(np.float64)
+        x, knots = (device_ns - at[0]).astype(np.float64), (at - at[0]).astype(np.float64)
+        offsets = np.interp(x, knots, relative)
+        if len(rows) > 2:
+            recent = slice(-30, None)
+            slope = float(np.polyfit(knots[recent] - knots[-1], relative[recent], 1)[0])
+            offsets += slope * (np.maximum(x - knots[-1], 0.0) + np.minimum(x, 0.0))
+        bends = np.diff(relative, n=2)
+        scatter = 1.4826 * float(np.median(np.abs(bends))) / math.sqrt(6.0) if bends.size else 0.0
+        return device_ns + base + np.rint(offsets).astype(np.int64), math.hypot(ARRIVAL_LATENCY_NS, scatter)
+
+
+class _Segment:
+    """The device's clock from one power-on to the next."""
+
+    def __init__(self, first_host_ns: int) -> None:
+        self.first_host_ns = first_host_ns
+        self.latch = _Latch()
+        self.arrivals = _Arrivals()
+        self.last_device_ns: int | None = None
+        self.last_count = -1
+        self.last_pps_ns = -1
+
+
+class DeviceClock:
+    """Maps a device's time to GPS time; fed by `DEVICE_CLOCK_DTYPE` rows beside the host's `PpsClock`."""
+
+    def __init__(self, clock: PpsClock, *, past_utc_hour: bool = False, keep_history: bool = False) -> None:
+        """past_utc_hour: device time counts from the UTC hour while `locked` is 1 (Velodyne), else from power-on."""
+        self._clock = clock
+        self._past_utc_hour = past_utc_hour
+        self._keep_history = keep_history
+        self._segments: list[_Segment] = []
+        self._lock_host = array("q")
+        self._lock_state = array("b")
+        self._edges_used = 0
+        self.refused: dict[str, int] = {}
+
+    def add(self, rows: StructArray, host_ns: Int64Array | None = None) -> None:
+        """Rows in order of arrival. host_ns (n,): their host times on the clock's scale; None: the rows' own are."""
+        if not len(rows):
+            return
+        host = np.asarray(rows["host_time_ns"] if host_ns is None else host_ns, dtype=np.int64)
+        device = np.asarray(rows["device_time_ns"], dtype=np.int64)
+        count = np.asarray(rows["pps_count"], dtype=np.int64)
+        self._note_locks(np.asarray(rows["locked"]), host)
+        back = (np.diff(device) < -STEP_BACK_NS) | ((np.diff(count) < 0) & (count[1:] >= 0))
+        starts = [0, *(int(place) + 1 for place in np.flatnonzero(back))]
+        for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+            segment = self._segment_for(int(device[start]), int(count[start]), int(host[start]))
+            pps = np.asarray(rows["pps_time_ns"][start:stop], dtype=np.int64)
+            self._add_latched(segment, pps, count[start:stop], device[start:stop], host[start:stop])
+            segment = self._segments[-1]
+            segment.arrivals.add(device[start:stop], host[start:stop])
+            segment.last_device_ns = int(device[stop - 1])
+            segment.last_count = int(count[stop - 1])
+        self._trim()
+
+    def _note_locks(self, locked: NDArray[np.int8], host: Int64Array) -> None:
+        previous = self._lock_state[-1] if self._lock_state else None
+        changes = np.flatnonzero(np.diff(locked)) + 1
+        for place in ([] if int(locked[0]) == previous else [0]) + changes.tolist():
+            self._lock_host.append(int(host[place]))
+            self._lock_state.append(int(locked[place]))
+
+    def _segment_for(self, device_ns: int, count: int, host_ns: int) -> _Segment:
+        """The segment that goes on, or a new one where device time or edge count went back."""
+        if self._segments:
+            last = self._segments[-1]
+            went_back = last.last_device_ns is not None and device_ns < last.last_device_ns - STEP_BACK_NS
+            if not went_back and not 0 <= count < last.last_count:
+                return last
+        self._segments.append(_Segment(host_ns))
+        return self._segments[-1]
+
+    def _add_latched(
+        self, segment: _Segment, pps: Int64Array, count: Int64Array, device: Int64Array, host: Int64Array
+    ) -> None:
+        """Take each new latch once: the host saw its edge (device time − latch) before the row's stamp."""
+        usable = np.flatnonzero((pps >= 0) & (count != 0))
+        if not usable.size:
+            return
+        values = pps[usable]
+        fresh = usable[np.concatenate(([values[0] != segment.last_pps_ns], np.diff(values) != 0))]
+        segment.last_pps_ns = int(values[-1])
+        for place in fresh.tolist():
+            latch = segment.latch
+            edge, at = int(pps[place]), int(host[place]) - int(device[place] - pps[place])
+            if latch.device and edge - latch.device[-1] > MAX_BRIDGED_S * SECOND_NS:
+                segment = self._follow_up(segment, int(host[place]))
+            reason = segment.latch.add(edge, at)
+            if reason is None:
+                self._edges_used += 1
+                continue
+            self.refused[reason] = self.refused.get(reason, 0) + 1
+            if segment.latch.refused_in_a_row >= REFUSED_IN_A_ROW:
+                segment = self._follow_up(segment, int(host[place]))
+                segment.latch.add(edge, at)
+
+    def _follow_up(self, segment: _Segment, host_ns: int) -> _Segment:
+        """A new segment where the chain of latched edges broke."""
+        following = _Segment(host_ns)
+        following.last_pps_ns = segment.last_pps_ns
+        self._segments.append(following)
+        return following
+
+    def _trim(self) -> None:
+        if self._keep_history:
+            return
+        latch, arrivals = self._segments[-1].latch, self._segments[-1].arrivals
+        if len(latch.device) > 2 * LIVE_KNOTS:
+            latch.trim()
+        if len(arrivals.bins) > 2 * LIVE_KNOTS:
+            arrivals.trim()
+        del self._segments[:-8], self._lock_host[:-64], self._lock_state[:-64]
+
+    def gps_from_device(
+        self, device_time_ns: Int64Array, host_ns: Int64Array | None = None
+    ) -> tuple[Int64Array, NDArray[np.float64]]:
+        """GPS ns (n,) and sigma ns (n,) of device times (n,). host_ns (n,), when they arrived, chooses among restarts.
+
+        Without host_ns the time since the last restart is meant. Where nothing is known the sigma is inf.
+        """
+        device = np.atleast_1d(np.asarray(device_time_ns, dtype=np.int64))
+        gps, sigma = np.zeros_like(device), np.full(device.shape, math.inf)
+        if not self._segments or not device.size:
+            return gps, sigma
+        host = None if host_ns is None else np.atleast_1d(np.asarray(host_ns, dtype=np.int64))
+        starts = np.array([segment.first_host_ns for segment in self._segments], dtype=np.int64)
+        which = np.full(device.shape, len(starts) - 1)
+        if host is not None:
+            which = np.clip(np.searchsorted(starts, host, side="right") - 1, 0, None)
+        for number in np.unique(which).tolist():
+            inside = which == number
+            gps[inside], sigma[inside] = self._in_segment(self._segments[number], device[inside])
+        if self._past_utc_hour and host is not None:
+            self._place_past_hour(device, host, gps, sigma)
+        return gps, sigma
+
+    def _in_segment(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+        latched = self._by_latch(segment.latch, device)
+        if latched is not None:
+            return latched
+        if not segment.arrivals.bins:
+            return np.zeros_like(device), np.full(device.shape, math.inf)
+        host, scatter = segment.arrivals.host_at(device)
+        gps, sigma = self._clock.gps_from_host(host)
+        return gps, np.hypot(sigma, scatter)
+
+    def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]] | None:
+        """Piecewise linear between latched edges, by their last rate beyond; None where their second is not known."""
+        knots = np.array(latch.device, dtype=np.int64)
+        if not knots.size:
+            return None
+        label = self._label(latch, int(np.searchsorted(knots, np.median(device))))
+        if label is None:
+            return None
+        gps = (np.array(latch.seconds, dtype=np.int64) + label) * SECOND_NS
+        left = np.clip(np.searchsorted(knots, device, side="right") - 1, 0, max(len(knots) - 2, 0))
+        right = np.minimum(left + 1, len(knots) - 1)
+        rate = np.ones(device.shape)
+        if len(knots) > 1:
+            rate = (gps[right] - gps[left]) / (knots[right] - knots[left]).astype(np.float64)
+        before, after = device < knots[0], device > knots[-1]
+        anchor = np.where(after, len(knots) - 1, left)
+        rate = np.where(after, latch.slope(len(knots) - 1), np.where(before, latch.slope(0), rate))
+        since = (device - knots[anchor]).astype(np.float64)
+        near = np.minimum(np.abs(device - knots[left]), np.abs(device - knots[right])).astype(np.float64) / SECOND_NS
+        noise = latch.noise_ns()
+        variance = noise**2 * (1.0 + 12.0 / SLOPE_KNOTS**3 * near**2) + WANDER_NS**2 * near**3
+        if len(knots) == 1:
+            variance = variance + (MAX_DRIFT / 2 * SECOND_NS * near) ** 2
+        return gps[anchor] + np.rint(rate * since).astype(np.int64), np.sqrt(variance)
+
+    def _label(self, latch: _Latch, around: int) -> int | None:
+        """GPS second of the first latched edge: what most of the host-labelled edges around a knot say."""
+        low = max(0, min(around - LABEL_KNOTS // 2, len(latch.host) - LABEL_KNOTS))
+        host = np.array(latch.host[low : low + LABEL_KNOTS], dtype=np.int64)
+        gps, sigma = self._clock.gps_from_host(host)
+        second = (gps + SECOND_NS // 2) // SECOND_NS
+        near = (np.abs(gps - second * SECOND_NS) <= MAX_PAIRING_S * SECOND_NS) & (sigma <= LABEL_MAX_SIGMA_NS)
+        if not np.any(near):
+            return None
+        offsets = second[near] - np.array(latch.seconds[low : low + LABEL_KNOTS], dtype=np.int64)[near]
+        values, counts = np.unique(offsets, return_counts=True)
+        best = int(np.argmax(counts))
+        return int(values[best]) if counts[best] >= LABEL_MAJORITY * len(offsets) else None
+
+    def _place_past_hour(
+        self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
+    ) -> None:
+        """Overwrite, in place, what the locked head itself says better: stamps past the UTC hour."""
+        near, near_sigma = self._clock.gps_from_host(host)
+        leap = self._clock.leap_seconds_at(int(near[-1]))
+        place = np.searchsorted(np.array(self._lock_host, dtype=np.int64), host, side="right") - 1
+        locked = (place >= 0) & (np.array(self._lock_state)[np.clip(place, 0, None)] == 1)
+        placed, believed = gps_ns_past_hour(device % HOUR_NS, near, leap)
+        good = locked & believed & (near_sigma <= LABEL_MAX_SIGMA_NS)
+        refused = int(np.count_nonzero(locked & ~believed))
+        if refused:
+            self.refused["past_hour"] = self.refused.get("past_hour", 0) + refused
+        gps[good], sigma[good] = placed[good], HOUR_STAMP_SIGMA_NS
+
+    def status(self) -> DeviceClockStatus:
+        """Counts and drift."""
+        latch = self._segments[-1].latch if self._segments else _Latch()
+        latched = len(latch.device) > 1
+        drift = (1.0 / latch.slope(len(latch.device) - 1) - 1.0) * 1e6 if latched else None
+        return DeviceClockStatus(latched, drift, len(self._segments), self._edges_used, dict(self.refused))
