@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import random
 import socket
 import struct
@@ -34,6 +35,15 @@ def transport(options: str = "", host: str = "127.0.0.1", port: int | None = Non
 
 def port_of(udp: UdpTransport) -> int:
     return udp._spec.port
+
+
+@pytest.fixture(autouse=True)
+def one_processor() -> Iterator[None]:
+    """A sender that moves to another processor can overtake itself: loopback keeps the order of each one only."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    yield
+    os.sched_setaffinity(0, allowed)
 
 
 @pytest.fixture
