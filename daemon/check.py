@@ -149,6 +149,8 @@ def check_pps(source: str, text: str, edge: str, span: Span) -> list[Report]:
         report.problems.append(
             f"no {edge} edge in {span.seconds:g} s; is the PPS wired, and does the receiver put it out?"
         )
+    if session.last_error:
+        report.problems.append(f"went away: {session.last_error}")
     stamps = np.array([item.realtime_ns for item in edges], dtype=np.int64)
     if len(stamps) > 1:
         spacing_s = float(np.median(np.diff(stamps))) * 1e-9
@@ -242,12 +244,13 @@ def _wire_problems(session: Session[Any], spec: TransportSpec, report: Report, s
     if counters.error_frames or counters.bus_off:
         found.append(f"CAN trouble: {counters.error_frames} error frames, {counters.bus_off} times bus-off")
     if spec.kind == "can" and spec.interface == "socketcan":
-        found += _bitrate_problems(spec)
+        found += bitrate_problems(spec, interface_bitrate(spec.channel))
     return found
 
 
-def _bitrate_problems(spec: TransportSpec) -> list[str]:
-    wanted, actual = spec.options.get("bitrate"), interface_bitrate(spec.channel)
+def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
+    """Whether the interface runs at the configured bit rate; None: it has none (vcan) or cannot be asked."""
+    wanted = spec.options.get("bitrate")
     if wanted is None or actual is None or int(wanted) == actual:
         return []
     command = f"ip link set {spec.channel} down && ip link set {spec.channel} up type can bitrate {wanted}"

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from daemon.config import DeviceEntry
-from drivers.core.parser import DriverSettingsError
+from daemon.config import DeviceEntry, GnssConfig, ImuConfig, ScannerConfig
+from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import all_drivers
 from georef.records import ChunkBatch, DeviceClockSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # one frame may be chance
-STAND_IN = {"mirror_factor": 1.0, "installation": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
-WEEK_S = 604_800
+IDENTITY = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
 @dataclass(slots=True)
@@ -78,10 +77,8 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     for protocol, driver in all_drivers(entry.kind).items():
         if protocol == entry.protocol:
             continue
-        stand_in = {key: value for key, value in STAND_IN.items() if entry.settings.config.get(key) is None}
-        settings = replace(entry.settings, config={**entry.settings.config, **stand_in})
         try:
-            parser = driver.make_parser(settings)
+            parser = driver.make_parser(_default_settings(entry, protocol))
         except DriverSettingsError:
             continue
         for batch in kept:
@@ -91,3 +88,16 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
         if found > most:
             best, most = protocol, found
     return best
+
+
+def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
+    """Settings of a device of which only the protocol is known; what frames need no value of ours is stood in for."""
+    transport = entry.transport.text
+    table: GnssConfig | ImuConfig | ScannerConfig
+    if entry.kind == "gnss":
+        table = GnssConfig(transport=transport, protocol=protocol)
+    elif entry.kind == "imu":
+        table = ImuConfig(transport=transport, protocol=protocol)
+    else:
+        table = ScannerConfig(transport=transport, protocol=protocol, mirror_factor=1.0, installation=IDENTITY)
+    return DeviceSettings(entry.source, table.model_dump())

@@ -213,7 +213,8 @@ def same_wire(one: TransportSpec, other: TransportSpec) -> bool:
     path, other_path = _device_path(one), _device_path(other)
     if path is not None or other_path is not None:
         return path == other_path
-    return one.kind == other.kind and one.address == other.address
+    port, other_port = one.options.get("port"), other.options.get("port")  # of a bus over UDP
+    return one.kind == other.kind and (one.address, port) == (other.address, other_port)
 
 
 def _udp_address(spec: TransportSpec) -> str:

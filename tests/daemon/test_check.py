@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import subprocess
@@ -16,10 +17,11 @@ from operator import xor
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 
+import can
 import numpy as np
 import pytest
 
-from daemon.check import Report, _bitrate_problems, check_everything
+from daemon.check import Report, bitrate_problems, check_everything
 from daemon.config import parse_config
 from daemon.identify import describe_tag
 from drivers.scanner.srep import SrepHeader, encode_datagram
@@ -28,6 +30,8 @@ from georef.records import TimeScale, TimeTag
 from tests.daemon.rig import free_udp_port
 
 ROOT = Path(__file__).parents[2]
+CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
+GROUP = "239.74.163.2"
 LISTEN_S = 1.2
 
 
@@ -225,6 +229,45 @@ class TestSomethingElse:
         assert any("messages damaged" in problem for problem in report.problems)
 
 
+class TestCan:
+    """A real CANmod.gps recording on a bus of its own."""
+
+    @pytest.fixture
+    def port(self) -> Iterator[int]:
+        with gzip.open(CANMOD, "rt") as log:
+            frames = [line.split()[2].split("#") for line in log if " can2 " in line]
+        messages = [
+            can.Message(arbitration_id=int(name, 16), data=bytes.fromhex(data), is_extended_id=False)
+            for name, data in frames
+        ]
+        port = free_udp_port()
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
+
+            def send(number: int) -> None:
+                for message in messages[number * 100 % len(messages) :][:100]:
+                    bus.send(message)
+
+            with repeating(send):
+                yield port
+
+    def test_answers(self, port: int, tmp_path: Path) -> None:
+        text = f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "canmod-gps"\n'
+        report = check(text, tmp_path)["imu/main"]
+        assert report.problems == []
+        assert report.records["ImuSamples"] > 100
+        assert report.bytes == 16 * report.units
+
+    def test_answers_as_something_else(self, port: int, tmp_path: Path) -> None:
+        (tmp_path / "imu.dbc").write_bytes((ROOT / "fixtures/config/imu.dbc").read_bytes())
+        text = (
+            f'[imu.main]\ntransport = "can:udp_multicast:{GROUP}?port={port}"\nprotocol = "dbc"\ndbc = "imu.dbc"\n'
+            '[imu.main.signals]\nspecific_force = ["ACC.acc_x", "ACC.acc_y", "ACC.acc_z"]\n'
+            'angular_rate = ["GYR.gyr_x", "GYR.gyr_y", "GYR.gyr_z"]\n'
+        )
+        report = check(text, tmp_path)["imu/main"]
+        assert report.problems == ["answers as canmod-gps, configured as dbc"]
+
+
 class TestTime:
     def test_a_receiver_without_valid_time(self, tmp_path: Path) -> None:
         with pty(lambda number: epoch(number, valid=False)) as path:
@@ -262,8 +305,12 @@ class TestComputer:
         [report] = check_everything(config, 0.1)
         assert "MB free, reserve_mb is 1e+07" in report.problems[0]
 
-    def test_a_can_bus_of_another_bitrate_is_compared_only_where_there_is_one(self) -> None:
-        assert _bitrate_problems(parse_transport("can:socketcan:nonesuch0?bitrate=500000")) == []
+    def test_a_can_interface_of_another_bitrate_is_named_with_the_command_that_mends_it(self) -> None:
+        spec = parse_transport("can:socketcan:can0?bitrate=1000000")
+        command = "ip link set can0 down && ip link set can0 up type can bitrate 1000000"
+        assert bitrate_problems(spec, 250_000) == [f"can0 runs at 250000 bit/s, configured is 1000000; `{command}`"]
+        assert bitrate_problems(spec, 1_000_000) == []
+        assert bitrate_problems(spec, None) == []
 
     def test_a_receive_buffer_that_is_not_granted(self, tmp_path: Path) -> None:
         """In a process without the right to force it, as the service is."""

@@ -168,6 +168,7 @@ class TestBadFiles:
         ("udp:0.0.0.0:2368", "udp:0.0.0.0:2369", False),
         ("can:socketcan:can0", "can:socketcan:can0?bitrate=500000", True),
         ("can:socketcan:can0", "can:socketcan:can1", False),
+        ("can:udp_multicast:239.74.163.2?port=4001", "can:udp_multicast:239.74.163.2?port=4002", False),
         ("can:slcan:/dev/null", "serial:/dev/null?baud=9600", True),
         ("serial:/dev/null", "can:socketcan:can0", False),
     ],
