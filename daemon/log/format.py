@@ -1,0 +1,157 @@
+"""Names and layouts of the log: topics, schemas, session metadata, attachment names. docs/log-format.md in code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+PROFILE = "swath"
+LIBRARY = "swath"
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_BYTES = 1 << 20
+CHUNK_OPEN_NS = 250_000_000
+SESSION_METADATA = "swath.session"
+
+ChunkClass = Literal["scanner", "other"]
+CHUNK_CLASSES: tuple[ChunkClass, ...] = ("scanner", "other")
+
+
+class LogError(Exception):
+    """Something is not a log of ours, or cannot be read as one; one line: what, where."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSpec:
+    """A channel as the log describes it.
+
+    Attributes:
+        topic: ``/gnss/rover/raw`` …
+        message_encoding: ``x-swath-serial``, ``x-swath-can``, ``x-swath-udp`` or ``json``.
+        metadata: of the channel.
+        schema: name in `SCHEMAS`; None for raw channels (schema id 0).
+        chunk_class: channels of one class share chunks.
+    """
+
+    topic: str
+    message_encoding: str
+    metadata: dict[str, str] = field(default_factory=dict)
+    schema: str | None = None
+    chunk_class: ChunkClass = "other"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionInfo:
+    """``swath.session``: what ties the parts together, and host time to the clocks of the computer.
+
+    Attributes:
+        realtime_ns, monotonic_ns: one reading of both clocks; log_time = monotonic + (realtime_ns − monotonic_ns).
+        origin: "import" for a log made from captures; None for a recording.
+    """
+
+    session_id: str
+    software: str
+    host: str
+    boot_id: str
+    realtime_ns: int
+    monotonic_ns: int
+    origin: str | None = None
+
+    def to_metadata(self, part: int) -> dict[str, str]:
+        """As the metadata record of a part."""
+        values = {
+            "session_id": self.session_id,
+            "part": str(part),
+            "software": self.software,
+            "host": self.host,
+            "boot_id": self.boot_id,
+            "realtime_ns": str(self.realtime_ns),
+            "monotonic_ns": str(self.monotonic_ns),
+        }
+        return values | ({"origin": self.origin} if self.origin is not None else {})
+
+    @classmethod
+    def from_metadata(cls, values: dict[str, str]) -> tuple[SessionInfo, int]:
+        """Read a metadata record: the session and the number of the part.
+
+        Raises:
+            LogError: a key is missing or no number.
+        """
+        try:
+            info = cls(
+                session_id=values["session_id"],
+                software=values["software"],
+                host=values["host"],
+                boot_id=values["boot_id"],
+                realtime_ns=int(values["realtime_ns"]),
+                monotonic_ns=int(values["monotonic_ns"]),
+                origin=values.get("origin"),
+            )
+            return info, int(values["part"])
+        except (KeyError, ValueError) as error:
+            raise LogError(f"metadata {SESSION_METADATA}: {error} is missing or wrong") from error
+
+
+def _object(title: str, required: dict[str, str], optional: dict[str, str]) -> bytes:
+    types = {"int": {"type": "integer"}, "str": {"type": "string"}, "num": {"type": ["number", "null"]}}
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": title,
+        "type": "object",
+        "properties": {key: types[kind] for key, kind in (required | optional).items()},
+        "required": list(required),
+    }
+    return json.dumps(schema, separators=(",", ":")).encode()
+
+
+SCHEMAS: dict[str, bytes] = {
+    "swath.Pps": _object(
+        "swath.Pps", {"edge_time_ns": "int", "sequence": "int"}, {"edge": "str", "realtime_ns": "int"}
+    ),
+    "swath.Clock": _object(
+        "swath.Clock",
+        {
+            "realtime_ns": "int",
+            "monotonic_ns": "int",
+            "monotonic_raw_ns": "int",
+            "frequency_ppm": "num",
+            "status": "int",
+        },
+        {},
+    ),
+    "swath.Status": _object(
+        "swath.Status",
+        {
+            "bytes": "int",
+            "units": "int",
+            "written": "int",
+            "lost_kernel": "int",
+            "lost_queue": "int",
+            "lost_write": "int",
+            "last_unit_age_s": "num",
+            "receive_buffer_bytes": "int",
+            "queue_high_water": "int",
+            "write_ms_max": "num",
+            "sync_ms_max": "num",
+            "state": "str",
+        },
+        {"time_state": "str", "time_sigma_ns": "num", "stamp_ambiguous": "int"},
+    ),
+    "swath.Event": _object(
+        "swath.Event", {"time_ns": "int", "severity": "str", "source": "str", "code": "str", "text": "str"}, {}
+    ),
+}
+SCHEMA_IDS: dict[str, int] = {name: number for number, name in enumerate(SCHEMAS, start=1)}
+
+
+def safe_attachment_path(folder: Path, name: str) -> Path:
+    """Where an attachment may be written: below ``folder``.
+
+    Raises:
+        LogError: the name is a path out of the folder.
+    """
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+        raise LogError(f"attachment {name!r}: is no name; nothing is written for it")
+    return folder.joinpath(*parts)
