@@ -65,6 +65,14 @@ class TestHelp:
         for code in [*ExitCode, INTERRUPTED]:
             assert f"{int(code)} " in text.split("Exit codes:")[1]
 
+    def test_the_page_names_every_command_and_exit_code(self) -> None:
+        page = (ROOT / "docs/commands.md").read_text()
+        assert [name for name in (listed.name for listed in COMMANDS) if f"| `swath {name}" not in page] == []
+        codes = [
+            int(line.split()[1]) for line in page.splitlines() if line.startswith("| ") and line.split()[1].isdigit()
+        ]
+        assert codes == [*(int(code) for code in ExitCode), INTERRUPTED, PIPE_CLOSED]
+
     def test_every_command_has_a_help_of_its_own(self) -> None:
         for listed in COMMANDS:
             result = CliRunner().invoke(app, [listed.name, "--help"])
