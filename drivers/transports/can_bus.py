@@ -165,18 +165,18 @@ class PythonCanTransport(DescriptorTransport):
         except can.CanError as error:
             if not isinstance(error.__cause__, _UNREADABLE):
                 raise TransportError(f"{self.name}: the CAN bus failed: {_one_line(error)}") from error
-            self._refuse()
+            self._refuse(undecodable=isinstance(error.__cause__, UnicodeDecodeError))
         except OSError as error:
             raise TransportError(f"{self.name}: the CAN bus failed: {_one_line(error)}") from error
         except _UNREADABLE:
-            self._refuse()
+            self._refuse(undecodable=False)
         return None
 
-    def _refuse(self) -> None:
-        """Count input nobody can read; slcan keeps an undecodable line unless it is told to flush."""
+    def _refuse(self, *, undecodable: bool) -> None:
+        """Count input nobody can read; slcan stumbles over an undecodable line again and again until it flushes."""
         self.counters.refused += 1
         flush = getattr(self._bus, "flush", None)
-        if flush is not None:
+        if undecodable and flush is not None:
             flush()
 
     def _send(self, data: bytes) -> None:

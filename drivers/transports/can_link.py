@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 import struct
+import sys
 from collections.abc import Iterator
 
 _NETLINK_ROUTE = 0
@@ -47,7 +48,7 @@ def bitrate_of_link(message: bytes) -> int | None:
         value = None if value is None else dict(_attributes(value)).get(kind)
     if value is None or len(value) < 4:
         return None
-    return int.from_bytes(value[:4], "little" if struct.pack("=H", 1) == b"\1\0" else "big") or None
+    return int.from_bytes(value[:4], sys.byteorder) or None
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:

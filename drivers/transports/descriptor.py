@@ -65,6 +65,7 @@ class DescriptorTransport(Transport):
         self.name = name
         self._reading = threading.Lock()
         self._sending = threading.Lock()
+        self._counting = threading.Lock()
         self._gate: Gate | None = None
 
     @abstractmethod
@@ -84,7 +85,7 @@ class DescriptorTransport(Transport):
 
     def open(self) -> None:
         """Open the device; the counters start anew."""
-        with self._reading, self._sending:
+        with self._reading, self._sending, self._counting:
             if self._gate is not None:
                 raise TransportError(f"{self.name}: is open already")
             self.counters = TransportCounters()
@@ -107,7 +108,7 @@ class DescriptorTransport(Transport):
         if gate is None:
             return
         gate.wake()
-        with self._reading, self._sending:
+        with self._reading, self._sending, self._counting:
             if self._gate is not gate:
                 return
             self._refresh_counters()
@@ -117,7 +118,7 @@ class DescriptorTransport(Transport):
 
     def poll_counters(self) -> TransportCounters:
         """Counters brought up to date with the kernel's; the last values once closed."""
-        with self._sending:
+        with self._counting:
             if self._gate is not None:
                 self._refresh_counters()
         return self.counters

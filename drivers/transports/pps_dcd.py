@@ -12,6 +12,7 @@ import fcntl
 import os
 import queue
 import struct
+import sys
 import termios
 import threading
 import time
@@ -120,7 +121,7 @@ def edge_at_wake_up(changes_before: int, changes: int, carrier: bool) -> tuple[s
 
 
 def _carrier(fd: int) -> bool:
-    lines = int.from_bytes(fcntl.ioctl(fd, termios.TIOCMGET, bytes(4)), "little")
+    lines = int.from_bytes(fcntl.ioctl(fd, termios.TIOCMGET, bytes(4)), sys.byteorder)
     return bool(lines & termios.TIOCM_CAR)
 
 

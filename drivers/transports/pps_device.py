@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import struct
+import sys
 import threading
 
 from drivers.transports.base import PpsSource, RawEdge, TransportError
@@ -79,7 +80,7 @@ class KernelPps(PpsSource):
 
     def _select_edge(self) -> None:
         wanted = PPS_CAPTUREASSERT if self._edge == "assert" else PPS_CAPTURECLEAR
-        capable = int.from_bytes(fcntl.ioctl(self._fd, PPS_GETCAP, bytes(4)), "little")
+        capable = int.from_bytes(fcntl.ioctl(self._fd, PPS_GETCAP, bytes(4)), sys.byteorder)
         if not capable & wanted:
             raise TransportError(f"{self._path}: its driver does not capture the {self._edge} edge; use the other one")
         parameters = PARAMETERS.unpack(fcntl.ioctl(self._fd, PPS_GETPARAMS, bytes(PARAMETERS.size)))

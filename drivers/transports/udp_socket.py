@@ -2,7 +2,8 @@
 
 Datagrams of other senders than ``source`` are no units: they are let go after the kernel handed them over, and
 counted in `TransportCounters.refused`. (A filter in the kernel would count them among the socket's drops, and a
-connected socket hears no broadcasts, which is what scanners send out of the box.)
+connected socket hears no broadcasts, which is what scanners send out of the box.) Bound to 0.0.0.0 a port hears
+broadcasts too; bound to one address of this machine it does not.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from drivers.transports.uri import TransportSpec
 MAX_DATAGRAM_BYTES = 65535  # total length of an IPv4 packet is 16 bits, RFC 791
 SLOTS = 256
 BATCH_S = 0.004
-MAX_CALLS = 32  # bounds one receive to 8192 datagrams
+MAX_CALLS = 32  # bounds one receive to 8192 datagrams,
+MAX_BYTES = 8 << 20  # and to this and one call more
 DEFAULT_BUFFER_MB = 32
 
 _IP_ADD_SOURCE_MEMBERSHIP = 39  # <linux/in.h>
@@ -127,13 +129,16 @@ class UdpTransport(DescriptorTransport):
         assert self._sock is not None
         assert self._reader is not None
         blocks: list[UnitBlock] = []
+        size = 0
         for _ in range(MAX_CALLS):
             try:
                 count = self._reader.read(self._sock.fileno())
             except OSError as error:
                 raise TransportError(f"{self.name}: reading failed: {error.strerror}") from error
-            blocks += self._reader.blocks(count)
-            if count < self._reader.slots:
+            more = self._reader.blocks(count)
+            blocks += more
+            size += sum(block.units.size for block in more)
+            if count < self._reader.slots or size > MAX_BYTES:
                 break
         return blocks if self._source is None else self._accepted(blocks)
 
