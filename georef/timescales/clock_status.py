@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+MAX_EVENTS = 1000
+
 
 class TimeState(StrEnum):
     """How well the host's clock is known in GPS time."""
@@ -61,3 +63,27 @@ class ClockStatus:
     edges_used: int = 0
     edges_refused: dict[str, int] = field(default_factory=dict)
     messages_refused: dict[str, int] = field(default_factory=dict)
+
+
+class EventLog:
+    """Events until they are fetched; the oldest go when nobody does."""
+
+    def __init__(self) -> None:
+        self._events: list[ClockEvent] = []
+        self._said: set[str] = set()
+
+    def add(self, host_ns: int, severity: Severity, code: str, text: str) -> None:
+        """Keep an event."""
+        self._events.append(ClockEvent(host_ns, severity, code, text))
+        del self._events[:-MAX_EVENTS]
+
+    def add_once(self, host_ns: int, code: str, text: str) -> None:
+        """Keep a warning of a kind that is worth saying once a session."""
+        if code not in self._said:
+            self._said.add(code)
+            self.add(host_ns, Severity.WARNING, code, text)
+
+    def drain(self) -> list[ClockEvent]:
+        """The events since the last call."""
+        events, self._events = self._events, []
+        return events

@@ -85,6 +85,13 @@ class EdgeTrain:
         since = host_ns - self.anchor_ns - knot.index * SECOND_NS - knot.phase_ns
         return knot.index + since / (SECOND_NS + knot.drift_ns_s)
 
+    def gps_ns_at(self, host_ns: int) -> int:
+        """GPS ns at a host time by the last knot's line; the train must have its label."""
+        knot = self.bank.knot
+        since = host_ns - self.anchor_ns - knot.index * SECOND_NS - knot.phase_ns
+        whole = ((self.labeller.label or 0) + knot.index) * SECOND_NS
+        return whole + round(since * SECOND_NS / (SECOND_NS + knot.drift_ns_s))
+
     def sigma_at(self, host_ns: int) -> float:
         """Sigma (ns) of the line at a host time."""
         return math.sqrt(self.bank.knot.variance_at(self.index_at(host_ns)))

@@ -7,7 +7,7 @@ make it name the next edge, so the age of the messages is watched, and voters ar
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -63,6 +63,16 @@ class Verdict:
     key: VoterKey | None = None
     leap: LeapTrust = LeapTrust.SAID
     late: bool = False
+
+    @property
+    def text(self) -> str:
+        """Who says so, for the log."""
+        return self.basis if self.key is None else f"{self.key.source} {self.key.message}".strip()
+
+    def with_leap_said(self, seconds: int) -> Verdict:
+        """The same after the leap count turned out to be so many seconds more."""
+        offset = None if self.offset is None else self.offset + seconds
+        return replace(self, offset=offset, leap=LeapTrust.SAID)
 
 
 class Voter:
@@ -142,6 +152,8 @@ class Labeller:
         if bound and all(v.offset == bound[0].offset for v in bound):
             return self._by(bound[0], "bound")
         doubt = self._doubt(sure, bound, index)
+        if self.label is None and not doubt and sure and self._somebody_else(sure[0], index):
+            return Verdict()
         fresh = [v for v in sure if not v.late]
         if not doubt and fresh:
             gps_scale = any(not v.key.utc for v in fresh)
@@ -154,6 +166,13 @@ class Labeller:
             return Verdict(wall_offset, "", "wall_clock", None, wall_leap)
         late = bool(sure) and all(v.late and v.offset == sure[0].offset for v in sure)
         return Verdict(sure[0].offset if sure else None, doubt, late=late)
+
+    def _somebody_else(self, sure: Voter, index: int) -> bool:
+        """Whether a voter not yet sure last said another second: a first label waits for it."""
+        return any(
+            v.offset is None and v.votes and index - v.last_index <= MIN_VOTES and v.votes[-1].offset != sure.offset
+            for v in self.voters.values()
+        )
 
     @staticmethod
     def _by(voter: Voter, basis: str) -> Verdict:

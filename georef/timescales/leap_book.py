@@ -19,7 +19,7 @@ class LeapSeconds(NamedTuple):
 
     @property
     def trust(self) -> LeapTrust:
-        """How far a label may rest on it."""
+        """How far a label may rest on it. A configured count that the table contradicts is no more than a guess."""
         if self.origin in ("receiver", "second_60"):
             return LeapTrust.SAID
         return LeapTrust.GUESSED if self.origin == "guess" else LeapTrust.ASSUMED
@@ -58,9 +58,10 @@ class LeapBook:
         said = self._said.get(source, next(iter(self._said.values()), None))
         if said is not None:
             return LeapSeconds(said, "receiver")
-        if self.assumed is not None:
-            return LeapSeconds(self.assumed, "configured")
         seconds, known = table_leap_seconds(date)
+        if self.assumed is not None:
+            plausible = self.assumed == seconds if known else self.assumed >= seconds
+            return LeapSeconds(self.assumed, "configured" if plausible else "guess")
         return LeapSeconds(seconds, "table" if known else "guess")
 
     def hear(self, source: str, tag: TimeTag) -> LeapChange | None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
+from georef.timescales.clock_status import ClockEvent, ClockStatus, EventLog, Severity, TimeState
 from georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
 from georef.timescales.edge_train import MAX_REFUSED_IN_A_ROW, NOISY_AFTER_EDGES, EdgeTrain, find_chain
 from georef.timescales.gps_time import (
@@ -27,6 +27,7 @@ from georef.timescales.gps_time import (
     whole_gps_ns,
 )
 from georef.timescales.history import gps_of_trains
+from georef.timescales.label_keeper import BASIS_RANK, LabelKeeper
 from georef.timescales.labelling import LeapTrust, Verdict, Vote, VoterKey
 from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds
 
@@ -40,7 +41,6 @@ MESSAGES_KEPT_NS = 30 * SECOND_NS
 MAX_QUANTISATION_AGE_NS = 1_100_000_000
 SAME_SECOND_NS = SECOND_NS // 2
 PHASE_JUMP_NS = 1_000_000
-BASIS_RANK = {"": 0, "vote": 1, "wall_clock": 2, "bound": 3}
 
 
 class _Said(NamedTuple):
@@ -84,8 +84,8 @@ class PpsClock:
         self._edges_unlocked = 0
         self._messages: deque[_Said] = deque(maxlen=RECENT_MESSAGES)
         self._quantisation: tuple[int, int, float] | None = None  # host ns, second, ns
-        self._events: list[ClockEvent] = []
-        self._warned: set[str] = set()
+        self._events = EventLog()
+        self._labels = LabelKeeper(self.leaps, self._wall, self._events)
         self._edges_used = 0
         self.edges_refused: dict[str, int] = {}
         self.messages_refused: dict[str, int] = {}
@@ -150,10 +150,10 @@ class PpsClock:
         self._tell_recent_messages(train)
         if self._train is None or self._train.labeller.label is None:
             if self._train is not None:
-                self._event(host_ns, Severity.WARNING, "pps_relocked", "another train of edges than before")
+                self._events.add(host_ns, Severity.WARNING, "pps_relocked", "another train of edges than before")
             self._train = train
             self._edges_used += train.used
-            self._decide(train, host_ns)
+            self._labels.decide(train, host_ns)
         else:
             self._candidate = train
             self._replace_if_labelled()
@@ -169,17 +169,19 @@ class PpsClock:
         if old is None or new is None:
             return
         host = new.last_host_ns
-        verdict = self._verdict(new, host)
+        verdict = self._labels.verdict(new, host)
         if verdict.offset is None or verdict.ambiguous or verdict.leap is LeapTrust.GUESSED:
             return
         held = _gps_float(old, host)
         jump_ns = (verdict.offset + new.index_at(host) - held) * SECOND_NS
         rank = BASIS_RANK[verdict.basis] > BASIS_RANK[old.labeller.basis.basis]
         if abs(jump_ns) >= SAME_SECOND_NS and not rank:
-            self._set_conflict(old, host, f"after the edges changed the messages are {jump_ns / SECOND_NS:+.1f} s off")
+            self._labels.set_conflict(
+                old, host, f"since the edges changed messages are {jump_ns / SECOND_NS:+.1f} s off"
+            )
             return
         severity = Severity.WARNING if abs(jump_ns) >= PHASE_JUMP_NS else Severity.INFO
-        self._event(host, severity, "pps_relocked", f"edges moved by {jump_ns / 1e6:+.3f} ms against holdover")
+        self._events.add(host, severity, "pps_relocked", f"edges moved by {jump_ns / 1e6:+.3f} ms against holdover")
         new.labeller.label, new.labeller.basis = verdict.offset, verdict
         self._former.append(old)
         if not self._keep_history:
@@ -216,7 +218,7 @@ class PpsClock:
         self._coarse.add(said.host_ns, (second - names_next) * SECOND_NS)
         for train in (self._train, self._candidate):
             if train is not None and self._vote(train, said) and train is self._train:
-                self._decide(train, said.host_ns)
+                self._labels.decide(train, said.host_ns)
 
     def _refuse_message(self, reason: str) -> None:
         self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
@@ -272,77 +274,10 @@ class PpsClock:
         train.labeller.vote(said.key, index, Vote(said.second - named, place - index, said.leap))
         return True
 
-    # ---- labels
-
-    def _verdict(self, train: EdgeTrain, host_ns: int) -> Verdict:
-        wall = self._wall.utc_offset_ns(host_ns)
-        index = math.floor(train.index_at(host_ns))
-        if wall is None:
-            return train.labeller.decide(index, None, LeapTrust.GUESSED)
-        date, _ = utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)
-        leap = self.leaps.on("", date)
-        offset = gps_ns_from_unix(host_ns + wall, leap.seconds) / SECOND_NS - train.index_at(host_ns)
-        if abs(offset - round(offset)) > 0.3:
-            return train.labeller.decide(index, None, LeapTrust.GUESSED)
-        return train.labeller.decide(index, round(offset), leap.trust)
-
-    def _decide(self, train: EdgeTrain, host_ns: int) -> None:
-        """Label the train, hold its label, or say why its seconds are not certain."""
-        labeller = train.labeller
-        verdict = labeller.verdict = self._verdict(train, host_ns)
-        if verdict.offset is None and not verdict.ambiguous:
-            return
-        if verdict.leap is LeapTrust.GUESSED and not verdict.ambiguous:
-            self._warn_once(host_ns, "leap_unknown", "UTC only; neither receiver nor configuration says leap seconds")
-            return
-        if labeller.label is None:
-            if verdict.ambiguous:
-                self._set_conflict(train, host_ns, verdict.ambiguous)
-            else:
-                self._clear_conflict(train, host_ns)
-                labeller.label, labeller.basis = verdict.offset, verdict
-                self._event(host_ns, Severity.INFO, "second_known", f"by {_basis_text(verdict)}")
-        elif verdict.offset == labeller.label and (not verdict.ambiguous or verdict.late):
-            if verdict.late:
-                self._warn_once(host_ns, "messages_late", verdict.ambiguous)
-            else:
-                self._confirm(train, host_ns, verdict)
-        elif not verdict.ambiguous and BASIS_RANK[verdict.basis] > BASIS_RANK[labeller.basis.basis]:
-            self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, f"by {_basis_text(verdict)}")
-            labeller.basis = verdict
-            self._clear_conflict(train, host_ns)
-        else:
-            difference = 0 if verdict.offset is None else verdict.offset - labeller.label
-            text = verdict.ambiguous or f"{_basis_text(verdict)} is {difference:+d} s against the second held"
-            self._set_conflict(train, host_ns, text)
-
-    def _confirm(self, train: EdgeTrain, host_ns: int, verdict: Verdict) -> None:
-        self._clear_conflict(train, host_ns)
-        basis = train.labeller.basis
-        if (BASIS_RANK[verdict.basis], verdict.leap) > (BASIS_RANK[basis.basis], basis.leap):
-            train.labeller.basis = verdict
-
-    def _set_conflict(self, train: EdgeTrain, host_ns: int, text: str) -> None:
-        if not train.doubtful:
-            self._event(host_ns, Severity.ERROR, "second_ambiguous", text)
-        train.doubtful = True
-        train.labeller.conflict = text
-
-    def _clear_conflict(self, train: EdgeTrain, host_ns: int) -> None:
-        if train.doubtful:
-            self._event(host_ns, Severity.INFO, "second_confirmed", "the contradiction has ended")
-        train.doubtful = False
-        train.labeller.conflict = ""
-
-    def _relabel(self, train: EdgeTrain, host_ns: int, seconds: int, why: str) -> None:
-        train.labeller.label = (train.labeller.label or 0) + seconds
-        text = f"all seconds since these edges began move by {seconds:+d} s, {why}"
-        self._event(host_ns, Severity.ERROR, "relabelled", text)
-
     def _leap_changed(self, host_ns: int, change: LeapChange) -> None:
         """A receiver says another leap count: what rested on the assumed one moves, in one logged step."""
         text = f"{change.source} says GPS − UTC is {change.now} s, in use was {change.before} s"
-        self._event(host_ns, Severity.WARNING, "leap_seconds_changed", text)
+        self._events.add(host_ns, Severity.WARNING, "leap_seconds_changed", text)
         if change.said_before:
             return
         seconds = change.now - change.before
@@ -353,15 +288,8 @@ class PpsClock:
         )
         if not self._coarse_is_gps():
             self._coarse.shift(seconds)
-        for train in (self._train, self._candidate, *self._former):
-            if train is None:
-                continue
-            for key, voter in train.labeller.voters.items():
-                if key.utc:
-                    voter.shift(seconds)
-            if train.labeller.label is not None and train.labeller.basis.leap is not said:
-                self._relabel(train, host_ns, seconds, "for the leap seconds the receiver says")
-                train.labeller.basis = _with_leap_said(train.labeller.basis, seconds)
+        trains = [train for train in (*self._former, self._train, self._candidate) if train is not None]
+        self._labels.leap_said(trains, host_ns, change)
 
     def _coarse_is_gps(self) -> bool:
         return any(not said.key.utc for said in self._messages)
@@ -385,7 +313,7 @@ class PpsClock:
             offset_ns=offset,
             drift_ppm=train.bank.knot.drift_ns_s / 1e3 if train is not None else None,
             noise_ns=train.bank.noise_ns if train is not None else None,
-            source=_basis_text(verdict),
+            source=verdict.text,
             ambiguous=train.labeller.conflict if train is not None else "",
             leap_seconds=self._leap.seconds if self._leap is not None else None,
             leap_origin=self._leap.origin if self._leap is not None else "",
@@ -398,8 +326,8 @@ class PpsClock:
         """State, GPS − host and sigma at a host time."""
         train = self._train
         if train is not None and train.labeller.label is not None and not train.doubtful:
-            gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
-            offset, sigma_ns = int(gps[0]) - host_ns, float(sigma[0])
+            gps_ns, sigma_ns = self._gps_at(train, host_ns)
+            offset = gps_ns - host_ns
             if host_ns - train.last_host_ns <= HOLDOVER_AFTER_NS:
                 return TimeState.LOCKED, offset, sigma_ns
             if sigma_ns <= self._lost_sigma_ns:
@@ -444,37 +372,21 @@ class PpsClock:
     def _trains(self) -> list[EdgeTrain]:
         return [*self._former, self._train] if self._train is not None else []
 
+    def _gps_at(self, train: EdgeTrain, host_ns: int) -> tuple[int, float]:
+        """GPS ns and sigma at one host time; quick from the last knot on, where live use asks."""
+        if host_ns >= train.last_knot_ns and not train.doubtful:
+            return train.gps_ns_at(host_ns), train.sigma_at(host_ns)
+        gps, sigma = self._by_trains(np.array([host_ns], dtype=np.int64))
+        return int(gps[0]), float(sigma[0])
+
     def _by_trains(self, host: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
         return gps_of_trains([train for train in self._trains() if train.labeller.label is not None], host)
 
-    # ---- events
-
     def drain_events(self) -> list[ClockEvent]:
         """What happened since the last call."""
-        events, self._events = self._events, []
-        return events
-
-    def _event(self, host_ns: int, severity: Severity, code: str, text: str) -> None:
-        self._events.append(ClockEvent(host_ns, severity, code, text))
-        del self._events[:-1000]
-
-    def _warn_once(self, host_ns: int, code: str, text: str) -> None:
-        if code not in self._warned:
-            self._warned.add(code)
-            self._event(host_ns, Severity.WARNING, code, text)
+        return self._events.drain()
 
 
 def _gps_float(train: EdgeTrain, host_ns: int) -> float:
     """GPS seconds of a labelled train at a host time, to 0.3 µs."""
     return (train.labeller.label or 0) + train.index_at(host_ns)
-
-
-def _basis_text(verdict: Verdict) -> str:
-    if verdict.key is None:
-        return verdict.basis
-    return f"{verdict.key.source} {verdict.key.message}".strip()
-
-
-def _with_leap_said(verdict: Verdict, seconds: int) -> Verdict:
-    offset = None if verdict.offset is None else verdict.offset + seconds
-    return Verdict(offset, verdict.ambiguous, verdict.basis, verdict.key, LeapTrust.SAID, verdict.late)

@@ -1,0 +1,107 @@
+"""Labels of edge trains: given once, held, doubted aloud, and moved only in a logged step."""
+
+from __future__ import annotations
+
+import math
+
+from georef.timescales.clock_status import EventLog, Severity
+from georef.timescales.coarse import WallClock
+from georef.timescales.edge_train import EdgeTrain
+from georef.timescales.gps_time import SECOND_NS, gps_ns_from_unix, utc_from_gps
+from georef.timescales.labelling import LeapTrust, Verdict
+from georef.timescales.leap_book import LeapBook, LeapChange
+
+BASIS_RANK = {"": 0, "vote": 1, "wall_clock": 2, "bound": 3}
+WALL_FRACTION_S = 0.3  # a wall clock this far off the edges' whole second decides nothing
+
+
+class LabelKeeper:
+    """Applies what the voters and the wall clock say to the labels of trains."""
+
+    def __init__(self, leaps: LeapBook, wall: WallClock, events: EventLog) -> None:
+        self._leaps = leaps
+        self._wall = wall
+        self._events = events
+
+    def verdict(self, train: EdgeTrain, host_ns: int) -> Verdict:
+        """What is known of a train's seconds at a host time."""
+        wall = self._wall.utc_offset_ns(host_ns)
+        index = math.floor(train.index_at(host_ns))
+        if wall is None:
+            return train.labeller.decide(index, None, LeapTrust.GUESSED)
+        date, _ = utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)
+        leap = self._leaps.on("", date)
+        offset = gps_ns_from_unix(host_ns + wall, leap.seconds) / SECOND_NS - train.index_at(host_ns)
+        if abs(offset - round(offset)) > WALL_FRACTION_S:
+            return train.labeller.decide(index, None, LeapTrust.GUESSED)
+        return train.labeller.decide(index, round(offset), leap.trust)
+
+    def decide(self, train: EdgeTrain, host_ns: int) -> None:
+        """Label the train, hold its label, or say why its seconds are not certain."""
+        labeller = train.labeller
+        verdict = labeller.verdict = self.verdict(train, host_ns)
+        if verdict.offset is None and not verdict.ambiguous:
+            return
+        if verdict.leap is LeapTrust.GUESSED and not verdict.ambiguous:
+            self._events.add_once(
+                host_ns,
+                "leap_unknown",
+                "UTC only, and nothing to be believed says the leap seconds",
+            )
+            return
+        if labeller.label is None:
+            if verdict.ambiguous:
+                self.set_conflict(train, host_ns, verdict.ambiguous)
+            else:
+                self._clear_conflict(train, host_ns)
+                labeller.label, labeller.basis = verdict.offset, verdict
+                self._events.add(host_ns, Severity.INFO, "second_known", f"by {verdict.text}")
+        elif verdict.offset == labeller.label and (not verdict.ambiguous or verdict.late):
+            if verdict.late:
+                self._events.add_once(host_ns, "messages_late", verdict.ambiguous)
+            else:
+                self._confirm(train, host_ns, verdict)
+        elif not verdict.ambiguous and BASIS_RANK[verdict.basis] > BASIS_RANK[labeller.basis.basis]:
+            self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, f"by {verdict.text}")
+            labeller.basis = verdict
+            self._clear_conflict(train, host_ns)
+        else:
+            difference = 0 if verdict.offset is None else verdict.offset - labeller.label
+            text = verdict.ambiguous or f"{verdict.text} is {difference:+d} s against the second held"
+            self.set_conflict(train, host_ns, text)
+
+    def _confirm(self, train: EdgeTrain, host_ns: int, verdict: Verdict) -> None:
+        self._clear_conflict(train, host_ns)
+        basis = train.labeller.basis
+        if (BASIS_RANK[verdict.basis], verdict.leap) > (BASIS_RANK[basis.basis], basis.leap):
+            train.labeller.basis = verdict
+
+    def set_conflict(self, train: EdgeTrain, host_ns: int, text: str) -> None:
+        """The train's seconds are not certain from here on."""
+        if not train.doubtful:
+            self._events.add(host_ns, Severity.ERROR, "second_ambiguous", text)
+        train.doubtful = True
+        train.labeller.conflict = text
+
+    def _clear_conflict(self, train: EdgeTrain, host_ns: int) -> None:
+        if train.doubtful:
+            self._events.add(host_ns, Severity.INFO, "second_confirmed", "the contradiction has ended")
+        train.doubtful = False
+        train.labeller.conflict = ""
+
+    def _relabel(self, train: EdgeTrain, host_ns: int, seconds: int, why: str) -> None:
+        train.labeller.label = (train.labeller.label or 0) + seconds
+        text = f"all seconds since these edges began move by {seconds:+d} s, {why}"
+        self._events.add(host_ns, Severity.ERROR, "relabelled", text)
+
+    def leap_said(self, trains: list[EdgeTrain], host_ns: int, change: LeapChange) -> None:
+        """A receiver says the leap count that was assumed so far: votes and labels that rest on it move together."""
+        seconds = change.now - change.before
+        for train in trains:
+            for key, voter in train.labeller.voters.items():
+                if key.utc:
+                    voter.shift(seconds)
+            basis = train.labeller.basis
+            if train.labeller.label is not None and basis.leap is not LeapTrust.SAID:
+                self._relabel(train, host_ns, seconds, "for the leap seconds the receiver says")
+                train.labeller.basis = basis.with_leap_said(seconds)
