@@ -45,12 +45,15 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
     from rich.text import Text
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("kind", "protocol", "by", "needs", "what, and what it yields"):
-        table.add_column(title, no_wrap=title in ("kind", "protocol"))
+    for title in ("kind", "protocol", "by", ""):
+        table.add_column(title, no_wrap=title != "")
     kind = ""
     for row in listed:
         first = row["kind"] if row["kind"] != kind else ""
         kind = row["kind"]
-        what = Text(row["summary"]) + Text("\n" + ", ".join(row["yields"]), style="dim")
-        table.add_row(first, row["protocol"], ", ".join(row["transports"]), ", ".join(row["needs"]), what)
+        what = Text(row["summary"])
+        what.append("\nyields " + ", ".join(row["yields"]), style="dim")
+        if row["needs"]:
+            what.append("\nneeds " + ", ".join(row["needs"]), style="yellow")
+        table.add_row(first, row["protocol"], ", ".join(row["transports"]), what)
     Console().print(table)

@@ -67,7 +67,10 @@ def _print_version(wanted: bool) -> None:
 
 def _callback(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Say the version and leave.")
+        bool,
+        typer.Option(
+            "--version", metavar="", callback=_print_version, is_eager=True, help="Say the version and leave."
+        ),
     ] = False,
 ) -> None:
     """Options of `swath` itself."""
@@ -75,9 +78,7 @@ def _callback(
 
 def make_app() -> typer.Typer:
     """The application with every command whose file there is; a command's file imports what is heavy when it runs."""
-    made = typer.Typer(
-        name="swath", help=HELP, epilog=EPILOG, no_args_is_help=True, add_completion=False, rich_markup_mode="markdown"
-    )
+    made = typer.Typer(name="swath", help=HELP, epilog=EPILOG, add_completion=False, rich_markup_mode="markdown")
     made.callback(help=HELP, epilog=EPILOG)(_callback)
     for listed in COMMANDS:
         if importlib.util.find_spec(listed.module) is not None:
@@ -96,6 +97,9 @@ def main() -> None:
 
 def run_app(arguments: list[str]) -> int:
     """Run a command; every way it can end becomes an exit code and at most a line an error."""
+    if not arguments:
+        app(args=["--help"], prog_name="swath", standalone_mode=False)
+        return int(ExitCode.USAGE)
     try:
         result = app(args=arguments, prog_name="swath", standalone_mode=False)
         sys.stdout.flush()
@@ -121,9 +125,8 @@ def _end_unforeseen(error: Exception) -> int:
     format_message = getattr(error, "format_message", None)  # its class moved between versions of typer
     if callable(format_message):
         message = " ".join(str(format_message()).split())
-        if message and type(error).__name__ != "NoArgsIsHelpError":
-            context = getattr(error, "ctx", None)
-            _say(f"{message.rstrip('.')}; see `{context.command_path if context else 'swath'} --help`")
+        context = getattr(error, "ctx", None)
+        _say(f"{message.rstrip('.')}; see `{context.command_path if context else 'swath'} --help`")
         return int(ExitCode.USAGE)
     if isinstance(error, typer.Abort):
         return INTERRUPTED
