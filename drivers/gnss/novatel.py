@@ -1,0 +1,190 @@
+"""NovAtel OEM7 (and OEM4 to OEM6) binary logs, long and short headers, with or without SPAN.
+
+Framing and checksum are `drivers.core.framing`'s; layouts and tables `drivers.gnss.novatel_layouts`'. Prompts
+(``[COM1]``), ASCII logs, NMEA and RTCM3 between the logs are framed or skipped, and counted.
+
+What each log gives:
+
+- TIME: the second of the previous edge, and leap seconds when its UTC status is VALID. BESTPOS and INSPVAX on the whole
+  second name it too. All only while the receiver vouches for its time (FINE, FINESTEERING, FINEBACKUPSTEERING).
+- BESTPOS, PPPPOS, BESTVEL: `GnssFix`. INSPVA(S), INSPVAX, INSATT(S), INSATTX: `InsSolution`, with the receiver's INS
+  status: before alignment it sends rows too, see `novatel_tables.INS_NAVIGATING`.
+- RAWIMU(S), RAWIMUX(S): `ImuSamples` in the axes marked on the IMU. Counts mean nothing without the IMU's type, which
+  RAWIMUX and INSCONFIG say, or the setting ``imu_type``; without it they are counted as ``imu_scale_unknown``.
+- CORRIMU…: motion of the vehicle with gravity and earth rotation taken out, so no `ImuSamples` but `DeviceStatus`.
+- HEADING2: `GnssHeading`. MARKxTIME: `EventMark`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drivers.core.frame_kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
+from drivers.core.framing import Frame, Framer
+from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
+from drivers.gnss import novatel_layouts as nov
+from drivers.gnss import novatel_tables as tables
+from drivers.gnss.novatel_records import DECODERS, Header, Row, State
+from georef.records import (
+    IMU_DTYPE,
+    INS_DTYPE,
+    Chunk,
+    DeviceStatus,
+    EventMark,
+    GnssFix,
+    GnssHeading,
+    ImuSamples,
+    InsSolution,
+    NamesEdge,
+    Record,
+    TimeMessage,
+)
+
+TIME_NAMING = frozenset(("BESTPOS", "INSPVAX"))  # besides TIME: computed at the epoch in their header
+
+
+def message_name(frame: bytes) -> str:
+    """``BESTPOS``; ``NOVATEL-1234`` without a name here; answers to commands end in ``-response``."""
+    number = int.from_bytes(frame[4:6], "little")
+    layout = nov.LAYOUTS.get(number)
+    name = layout.name if layout else nov.OTHER_NAMES.get(number, f"NOVATEL-{number}")
+    is_long = frame[:3] == nov.SYNC_LONG
+    return f"{name}-response" if is_long and frame[6] & nov.RESPONSE_BIT else name
+
+
+FRAME_KINDS = (
+    replace(NOVATEL, message_name=message_name),
+    replace(NOVATEL_SHORT, message_name=message_name),
+    NMEA,
+    RTCM3,
+)
+
+
+class NovatelParser(StreamParser):
+    """Decodes the logs listed above; everything else is framed and counted."""
+
+    def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
+        """Args: the device's table (``imu_type`` is read), and the record types to give; None: all.
+
+        Raises:
+            DriverSettingsError: an IMU type that is not in the table.
+        """
+        super().__init__()
+        self._framer = Framer(FRAME_KINDS, self.counters)
+        self._wanted = wanted
+        self._state = State(self.counters, configured_scale=imu_scale(settings))
+        self._last_named: tuple[int, int] = (-1, -1)
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one read."""
+        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def close(self) -> list[Record]:
+        """Release what was held back."""
+        return self._decode_all(self._framer.close())
+
+    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+        """Records in order; rows of neighbouring messages are one array."""
+        records: list[Record] = []
+        run: list[Row] = []
+        for frame in frames:
+            if not frame.kind.startswith("novatel"):
+                continue
+            for item in self._decode(frame):
+                if run and not (isinstance(item, Row) and item.record is run[0].record):
+                    records.append(_array(run))
+                    run = []
+                if isinstance(item, Row):
+                    run.append(item)
+                else:
+                    records.append(item)
+        return [*records, _array(run)] if run else records
+
+    def _decode(self, frame: Frame) -> list[Record | Row]:
+        """One frame; a short body is counted."""
+        header, body = _split(frame)
+        if header is None:
+            return []
+        layout = nov.LAYOUTS[int.from_bytes(frame.data[4:6], "little")]
+        if len(body) < layout.wire.size:
+            self.counters.bad_messages += 1
+            self.counters.errors["bad_length"] += 1
+            return []
+        message = layout.body._make(layout.wire.unpack_from(body))
+        items = [*self._named_second(header), *DECODERS[layout.body](self._state, header, message)]
+        if self._wanted is None:
+            return items
+        return [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
+
+    def _named_second(self, header: Header) -> list[TimeMessage]:
+        """The whole second a synchronous solution names, once for all logs of an epoch."""
+        epoch = (header.week, header.milliseconds)
+        if header.name not in TIME_NAMING or header.milliseconds % 1000 or epoch == self._last_named:
+            return []
+        if not header.time_valid or header.time_status is None:
+            return []
+        self._last_named = epoch
+        return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
+
+
+def _array(run: list[Row]) -> Record:
+    """Rows of one kind as one record."""
+    values: list[Any] = [row.values for row in run]
+    if run[0].record is ImuSamples:
+        return ImuSamples(np.array(values, dtype=IMU_DTYPE))
+    return InsSolution(np.array(values, dtype=INS_DTYPE))
+
+
+def _split(frame: Frame) -> tuple[Header | None, bytes]:
+    """Header and body of a frame of a known log; None for others, and for answers to commands."""
+    data = frame.data
+    layout = nov.LAYOUTS.get(int.from_bytes(data[4:6], "little"))
+    if layout is None:
+        return None, b""
+    if data[:3] == nov.SYNC_SHORT:
+        short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
+        header = Header(layout.name, frame.host_time_ns, short.week, short.milliseconds, None, 0)
+        return header, data[nov.SHORT_HEADER.size : -nov.CRC_BYTES]
+    long = nov.LongHeader._make(nov.LONG_HEADER.unpack_from(data))
+    if long.message_type & (nov.RESPONSE_BIT | nov.FORMAT_BITS):
+        return None, b""
+    source = long.message_type & nov.SOURCE_BITS
+    header = Header(layout.name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source)
+    return header, data[long.header_bytes : -nov.CRC_BYTES]
+
+
+def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
+    """The scale of the configured ``imu_type``, a name of INSCONFIG's table or its number; None without it.
+
+    Raises:
+        DriverSettingsError: naming the types there are.
+    """
+    wanted = settings.config.get("imu_type")
+    if wanted in (None, ""):
+        return None
+    number = tables.IMU_TYPES.get(str(wanted).upper().replace("-", "_"), wanted)
+    if number not in tables.IMU_SCALES:
+        raise DriverSettingsError(f"imu_type: got {wanted!r}, want one of: {', '.join(sorted(tables.IMU_TYPES))}")
+    return tables.IMU_SCALES[number]
+
+
+def make_time_parser(settings: DeviceSettings) -> NovatelParser:
+    """The recorder's parser: time messages only."""
+    return NovatelParser(settings, wanted=(TimeMessage,))
+
+
+DRIVERS = (
+    Driver(
+        protocol="novatel",
+        kind="gnss",
+        transports=("serial", "udp"),
+        yields=(TimeMessage, GnssFix, InsSolution, ImuSamples, GnssHeading, EventMark, DeviceStatus),
+        summary="NovAtel OEM7 binary logs, long and short headers, with SPAN",
+        make_parser=NovatelParser,
+        make_time_parser=make_time_parser,
+        names_edge=NamesEdge.PREVIOUS,
+    ),
+)

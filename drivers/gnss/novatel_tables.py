@@ -1,0 +1,120 @@
+"""NovAtel OEM7: status values and IMU scale factors, as the manual's tables have them (docs.novatel.com/OEM7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import radians
+
+from georef.records import FixType
+
+FOOT_M = 0.3048
+STANDARD_GRAVITY = 9.80665
+FULL_SCALE_16 = 2.0**16
+
+# GPS reference time status (table of that name). The receiver vouches for its time, and steers its PPS to it, in these:
+TIME_STATUS_FINE = 160
+TIME_STATUS_FINEBACKUPSTEERING = 170
+TIME_STATUS_FINESTEERING = 180
+TIME_VALID = frozenset((TIME_STATUS_FINE, TIME_STATUS_FINEBACKUPSTEERING, TIME_STATUS_FINESTEERING))
+TIME_STATUS_UNKNOWN = 20
+TIME_STATUS_SATTIME = 200  # time of satellite data, not of the receiver
+
+CLOCK_VALID = 0  # clock model status
+UTC_VALID = 1  # UTC status; 2 is WARNING: leap seconds guessed
+SOL_COMPUTED = 0  # solution status
+POSITION_NONE = 0
+
+# Position or velocity type -> the coarse class; what is not here is NONE.
+FIX_TYPES: dict[int, FixType] = {
+    1: FixType.MANUAL,  # FIXEDPOS
+    2: FixType.SINGLE,  # FIXEDHEIGHT
+    8: FixType.SINGLE,  # DOPPLER_VELOCITY
+    16: FixType.SINGLE,
+    17: FixType.DIFFERENTIAL,  # PSRDIFF
+    18: FixType.DIFFERENTIAL,  # WAAS (SBAS)
+    19: FixType.DEAD_RECKONING,  # PROPAGATED
+    20: FixType.DIFFERENTIAL,  # OMNISTAR
+    32: FixType.RTK_FLOAT,  # L1_FLOAT
+    33: FixType.RTK_FLOAT,  # IONOFREE_FLOAT
+    34: FixType.RTK_FLOAT,  # NARROW_FLOAT
+    48: FixType.RTK_FIXED,  # L1_INT
+    49: FixType.RTK_FIXED,  # WIDE_INT
+    50: FixType.RTK_FIXED,  # NARROW_INT
+    51: FixType.RTK_FIXED,  # RTK_DIRECT_INS
+    52: FixType.DIFFERENTIAL,  # INS_SBAS
+    53: FixType.SINGLE,  # INS_PSRSP
+    54: FixType.DIFFERENTIAL,  # INS_PSRDIFF
+    55: FixType.RTK_FLOAT,  # INS_RTKFLOAT
+    56: FixType.RTK_FIXED,  # INS_RTKFIXED
+    64: FixType.PPP,  # OMNISTAR_HP
+    65: FixType.PPP,  # OMNISTAR_XP
+    66: FixType.DIFFERENTIAL,  # CDGPS
+    68: FixType.PPP,  # PPP_CONVERGING
+    69: FixType.PPP,
+    70: FixType.SINGLE,  # OPERATIONAL, WARNING, OUT_OF_BOUNDS: the type behind a user accuracy limit is not told
+    71: FixType.SINGLE,
+    72: FixType.SINGLE,
+    73: FixType.PPP,  # INS_PPP_CONVERGING
+    74: FixType.PPP,  # INS_PPP
+    77: FixType.PPP,  # PPP_BASIC_CONVERGING
+    78: FixType.PPP,  # PPP_BASIC
+    79: FixType.PPP,  # INS_PPP_BASIC_CONVERGING
+    80: FixType.PPP,  # INS_PPP_BASIC
+}
+
+# Inertial solution status: of these a row is a navigation solution (HIGH_VARIANCE, GOOD, FREE, ALIGNMENT_COMPLETE).
+INS_NAVIGATING = frozenset((2, 3, 6, 7))
+
+
+@dataclass(frozen=True, slots=True)
+class ImuScale:
+    """What one count of RAWIMU means, and how many samples a second there are.
+
+    Attributes:
+        name: the manual's name of the IMU type.
+        rad_per_count: angle increment.
+        mps_per_count: velocity increment.
+        rate_hz: samples a second; the increments are over its inverse.
+    """
+
+    name: str
+    rad_per_count: float
+    mps_per_count: float
+    rate_hz: float
+
+
+def _rate_output(name: str, deg_per_s: float, milli_g: float, rate_hz: float) -> ImuScale:
+    """An IMU whose counts are rates in 1/65536 of a unit (Epson), as increments over one sample."""
+    rad = radians(deg_per_s) / FULL_SCALE_16 / rate_hz
+    return ImuScale(name, rad, milli_g / FULL_SCALE_16 * STANDARD_GRAVITY / 1000.0 / rate_hz, rate_hz)
+
+
+_HG_RAD, _HG_MPS = 2.0**-33, 2.0**-27 * FOOT_M
+_KVH_RAD, _FSAS_MPS = 0.1 / (3600.0 * 256.0), 0.05 / 2.0**15
+
+# IMU type (INSCONFIG, RAWIMUX) -> scale: RAWIMUSX, "Raw IMU Scale Factors" and the output rates above that table.
+IMU_SCALES: dict[int, ImuScale] = {
+    1: ImuScale("HG1700_AG11", _HG_RAD, _HG_MPS, 100.0),
+    4: ImuScale("HG1700_AG17", _HG_RAD, 2.0 * _HG_MPS, 100.0),
+    5: ImuScale("HG1900_CA29", _HG_RAD, _HG_MPS, 100.0),
+    8: ImuScale("LN200", 2.0**-19, 2.0**-14, 200.0),
+    11: ImuScale("HG1700_AG58", _HG_RAD, _HG_MPS, 100.0),
+    12: ImuScale("HG1700_AG62", _HG_RAD, 2.0 * _HG_MPS, 100.0),
+    13: ImuScale("IMAR_FSAS", radians(0.1 / 256.0 / 3600.0), _FSAS_MPS, 200.0),
+    20: ImuScale("HG1930_AA99", _HG_RAD, _HG_MPS, 100.0),
+    26: ImuScale("ISA100C", 1.0e-9, 2.0e-8, 200.0),
+    27: ImuScale("HG1900_CA50", _HG_RAD, _HG_MPS, 100.0),
+    28: ImuScale("HG1930_CA50", _HG_RAD, _HG_MPS, 100.0),
+    31: ImuScale("ADIS16488", radians(720.0 / 2.0**31), 200.0 / 2.0**31, 200.0),
+    32: ImuScale("STIM300", radians(2.0**-21), 2.0**-22, 125.0),
+    33: ImuScale("KVH_1750", _KVH_RAD, _FSAS_MPS, 200.0),
+    41: _rate_output("EPSON_G320", 0.008, 0.2, 125.0),
+    52: ImuScale("LITEF_MICROIMU", 1.0e-9, 2.0e-8, 200.0),
+    56: ImuScale("STIM300D", radians(2.0**-21), 2.0**-22, 125.0),
+    58: ImuScale("HG4930_AN01", _HG_RAD, 2.0**-29, 100.0),
+    61: _rate_output("EPSON_G370", 0.0151515, 0.4, 200.0),
+    62: _rate_output("EPSON_G320_200HZ", 0.008, 0.2, 200.0),
+    68: ImuScale("HG4930_AN04", _HG_RAD, 2.0**-29, 100.0),
+    69: ImuScale("HG4930_AN04_400HZ", _HG_RAD, 2.0**-29, 400.0),
+}
+IMU_TYPES = {scale.name: number for number, scale in IMU_SCALES.items()}

@@ -1,0 +1,24 @@
+"""The IMU of a NovAtel SPAN system, inside the receiver's own stream (``transport = "gnss:NAME"``)."""
+
+from __future__ import annotations
+
+from drivers.core.parser import DeviceSettings, Driver
+from drivers.gnss.novatel import NovatelParser
+from georef.records import ImuSamples, InsSolution
+
+
+def make_imu_parser(settings: DeviceSettings) -> NovatelParser:
+    """A parser of the receiver's stream that gives what is inertial."""
+    return NovatelParser(settings, wanted=(ImuSamples, InsSolution))
+
+
+DRIVERS = (
+    Driver(
+        protocol="novatel",
+        kind="imu",
+        transports=("gnss",),
+        yields=(ImuSamples, InsSolution),
+        summary="IMU and INS of a NovAtel SPAN receiver, inside its GNSS stream",
+        make_parser=make_imu_parser,
+    ),
+)
