@@ -13,6 +13,7 @@ import platform
 import resource
 import signal
 import time
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,9 +43,15 @@ STEP_TOLD_NS = 1_000_000
 _ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp"}
 
 
+def read_boot_id() -> str:
+    """This boot of the computer; the unit says it in ``SWATH_BOOT_ID``, because its /proc holds processes only."""
+    said = os.environ.get("SWATH_BOOT_ID", "")
+    return str(uuid.UUID(said)) if said else Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
 def make_session_info(name: str, clock: HostClock) -> SessionInfo:
     """Name a session by its start and this boot of the computer."""
-    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    boot_id = read_boot_id()
     start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(clock.realtime_ns // 1_000_000_000))
     return SessionInfo(
         session_id=f"{name}-{start}-{boot_id[:4]}",
