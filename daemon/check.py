@@ -21,16 +21,16 @@ import numpy as np
 
 from daemon.config import Config, DeviceEntry
 from daemon.identify import Heard, describe_time, identify
-from drivers.core.parser import Parser
 from drivers.core.registry import find_driver
 from drivers.session import Session
-from drivers.transports.base import RawEdge, UnitBlock
+from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from drivers.transports.can_link import interface_bitrate
 from drivers.transports.uri import TransportSpec, open_transport, parse_pps
 from georef.records import ChunkBatch
 
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
+DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
 EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
 
 
@@ -73,6 +73,11 @@ class Report:
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def add(self, batch: ChunkBatch) -> None:
+        """Count units."""
+        self.units += len(batch.units)
+        self.bytes += int(batch.units.size)
+
     def plain(self) -> dict[str, Any]:
         """As plain values, the form of ``--json``."""
         return {
@@ -89,31 +94,112 @@ class Report:
         }
 
 
+class Reading:
+    """One device's parser, what it made of the bytes, and what they were. Two ports of a head feed the same parser."""
+
+    def __init__(self, entry: DeviceEntry) -> None:
+        self.entry = entry
+        self.report = Report(entry.source, entry.protocol)
+        self.heard = Heard()
+        self.parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
+        self.kept: list[ChunkBatch] = []
+        self._kept_bytes = 0
+        self._lock = threading.Lock()
+
+    def feed(self, batch: ChunkBatch, *, main: bool) -> None:
+        """Take units of the device's own port, or of its second one."""
+        with self._lock:
+            self.heard.add(self.parser.feed_batch(batch))
+            if main:
+                self.report.add(batch)
+                if self._kept_bytes < KEPT_BYTES:
+                    self._kept_bytes += batch.units.size
+                    self.kept.append(ChunkBatch(batch.source, batch.host_time_ns, batch.units.copy()))
+
+    def finish(self) -> None:
+        """After the last byte: what it says, and what is wrong with it."""
+        self.heard.add(self.parser.close())
+        self.report.records = self.heard.counts
+        if self.report.bytes:
+            self.report.time = describe_time(self.entry, self.heard)
+            self.report.problems += _answer_problems(self)
+
+
+class Wire:
+    """One port, socket or bus, and who reads of it."""
+
+    def __init__(self, report: Report, spec: TransportSpec, readings: list[Reading], *, main: bool) -> None:
+        self.report = report
+        self._spec = spec
+        self._readings = readings
+        self._main = main
+
+    def listen(self, span: Span) -> None:
+        """Feed the readings until the time is up; then say what is wrong with the wire."""
+        session = Session(lambda: open_transport(self._spec))
+        for blocks in span.listen(session):
+            for block in blocks:
+                batch = _batch(self.report.source, block)
+                for reading in self._readings:
+                    reading.feed(batch, main=self._main)
+                if not self._main:
+                    self.report.add(batch)
+        self._say(session, span.seconds)
+        session.close()
+
+    def _say(self, session: Session[Any], seconds: float) -> None:
+        counters = session.poll_counters()
+        for report in [reading.report for reading in self._readings] if self._main else [self.report]:
+            report.opens = session.openings > 0
+            report.problems += _wire_problems(session, counters, report, seconds)
+            if self._spec.kind == "can" and self._spec.interface == "socketcan":
+                report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
+            if counters.refused:
+                report.notes.append(f"{counters.refused} datagrams of other senders than the configured source")
+
+
 def check_everything(config: Config, seconds: float) -> list[Report]:
     """Listen to all sources of a configuration at once for ``seconds``."""
     span = Span(seconds)
-    jobs = list(_jobs(config, span))
+    readings = {entry.source: Reading(entry) for entry in config.devices()}
+    reports = [Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()]
+    jobs: list[Callable[[], None]] = [
+        partial(check_pps, report, pps.edge, span) for report, pps in zip(reports, config.pps.values(), strict=True)
+    ]
+    for reading in readings.values():
+        reports.append(reading.report)
+        for wire in _wires(reading, readings):
+            jobs.append(partial(wire.listen, span))
+            if wire.report is not reading.report:
+                reports.append(wire.report)
+    _run(jobs, span)
+    for reading in readings.values():
+        reading.finish()
+    return [*reports, check_directory(Path(config.session.directory), config.session.reserve_mb)]
+
+
+def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
+    """The wires of a device; devices inside its stream read along, and have none of their own."""
+    entry = reading.entry
+    if entry.transport.kind == "gnss":
+        return
+    inside = [other for other in readings.values() if _is_inside(other.entry, entry)]
+    yield Wire(reading.report, entry.transport, [reading, *inside], main=True)
+    if entry.auxiliary is not None:
+        yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading], main=False)
+
+
+def _is_inside(inner: DeviceEntry, outer: DeviceEntry) -> bool:
+    return inner.transport.kind == "gnss" and f"gnss/{inner.transport.address}" == outer.source
+
+
+def _run(jobs: list[Callable[[], None]], span: Span) -> None:
     with ThreadPoolExecutor(max_workers=max(1, len(jobs)), thread_name_prefix="check") as pool:
         try:
-            futures = [pool.submit(job) for job in jobs]
-            found = [report for future in futures for report in future.result()]
+            for future in [pool.submit(job) for job in jobs]:
+                future.result()
         finally:
             span.stop.set()  # an interrupt does not wait for the rest of the time
-    return [*found, check_directory(Path(config.session.directory), config.session.reserve_mb)]
-
-
-def _jobs(config: Config, span: Span) -> Iterable[Callable[[], list[Report]]]:
-    """One job a wire."""
-    devices = list(config.devices())
-    for name, pps in config.pps.items():
-        yield partial(check_pps, f"pps/{name}", pps.source, pps.edge, span)
-    for device in devices:
-        if device.transport.kind == "gnss":
-            continue
-        inside = [d for d in devices if d.transport.kind == "gnss" and f"gnss/{d.transport.address}" == device.source]
-        yield partial(check_wire, device, inside, span)
-        if device.auxiliary is not None:
-            yield partial(check_auxiliary, device, device.auxiliary, span)
 
 
 def check_directory(directory: Path, reserve_mb: float) -> Report:
@@ -132,25 +218,21 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
     return report
 
 
-def check_pps(source: str, text: str, edge: str, span: Span) -> list[Report]:
-    """Count the edges of a PPS source."""
-    report = Report(source, protocol=text)
-    session: Session[RawEdge] = Session(lambda: parse_pps(text, edge=edge))
+def check_pps(report: Report, edge: str, span: Span) -> None:
+    """Count the edges of the PPS source that the report's protocol names."""
+    session: Session[RawEdge] = Session(lambda: parse_pps(report.protocol, edge=edge))
     edges: list[RawEdge] = []
     for got in span.listen(session):
         edges += got
     session.close()
     report.opens, report.units = session.openings > 0, len(edges)
     report.records["edges"] = len(edges)
-    if not report.opens:
-        report.problems.append(session.last_error)
-        return [report]
-    if not edges:
+    if session.last_error:
+        report.problems.append(f"went away: {session.last_error}" if report.opens else session.last_error)
+    elif not edges:
         report.problems.append(
             f"no {edge} edge in {span.seconds:g} s; is the PPS wired, and does the receiver put it out?"
         )
-    if session.last_error:
-        report.problems.append(f"went away: {session.last_error}")
     stamps = np.array([item.realtime_ns for item in edges], dtype=np.int64)
     if len(stamps) > 1:
         spacing_s = float(np.median(np.diff(stamps))) * 1e-9
@@ -159,48 +241,6 @@ def check_pps(source: str, text: str, edge: str, span: Span) -> list[Report]:
             report.problems.append(f"edges are {spacing_s:.4f} s apart, want 1 s: noise, or another pulse")
     if any(not item.kernel_stamp for item in edges):
         report.notes.append("stamped after a wake-up, not by the kernel: tens of microseconds")
-    return [report]
-
-
-def check_wire(device: DeviceEntry, inside: list[DeviceEntry], span: Span) -> list[Report]:
-    """Listen to a device; also of the devices inside its stream."""
-    parsers = [
-        (entry, find_driver(entry.kind, entry.protocol).make_parser(entry.settings)) for entry in (device, *inside)
-    ]
-    reports = [Report(entry.source, entry.protocol) for entry, _ in parsers]
-    heard = [Heard() for _ in parsers]
-    session = Session(lambda: open_transport(device.transport))
-    kept: list[ChunkBatch] = []
-    for blocks in span.listen(session):
-        for block in blocks:
-            batch = _batch(device.source, block)
-            _keep(kept, batch)
-            for (_, parser), report, records in zip(parsers, reports, heard, strict=True):
-                _count_units(report, block)
-                records.add(parser.feed_batch(batch))
-    for (_, parser), records in zip(parsers, heard, strict=True):
-        records.add(parser.close())
-    for (entry, parser), report, records in zip(parsers, reports, heard, strict=True):
-        report.opens = session.openings > 0
-        report.records, report.time = records.counts, describe_time(entry, records)
-        report.problems += _wire_problems(session, device.transport, report, span.seconds)
-        if report.bytes:
-            report.problems += _answer_problems(entry, parser, records, kept)
-    session.close()
-    return reports
-
-
-def check_auxiliary(device: DeviceEntry, auxiliary: TransportSpec, span: Span) -> list[Report]:
-    """Listen to a head's second port; what it carries is read with the first."""
-    report = Report(f"{device.source}/aux", device.protocol)
-    session = Session(lambda: open_transport(auxiliary))
-    for blocks in span.listen(session):
-        for block in blocks:
-            _count_units(report, block)
-    report.opens = session.openings > 0
-    report.problems += _wire_problems(session, auxiliary, report, span.seconds)
-    session.close()
-    return [report]
 
 
 def _batch(source: str, block: UnitBlock) -> ChunkBatch:
@@ -211,41 +251,25 @@ def _batch(source: str, block: UnitBlock) -> ChunkBatch:
     return ChunkBatch(source, stamps, block.units)
 
 
-def _keep(kept: list[ChunkBatch], batch: ChunkBatch) -> None:
-    if sum(item.units.size for item in kept) < KEPT_BYTES:
-        kept.append(ChunkBatch(batch.source, batch.host_time_ns.copy(), batch.units.copy()))
-
-
-def _count_units(report: Report, block: UnitBlock) -> None:
-    report.units += len(block.units)
-    report.bytes += int(block.units.size)
-
-
-def _wire_problems(session: Session[Any], spec: TransportSpec, report: Report, seconds: float) -> list[str]:
+def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:
     """What is wrong with the wire itself."""
     if not report.opens:
-        return [session.last_error]
-    found: list[str] = []
+        yield session.last_error or "not opened in the time; listen longer"
+        return
     if session.last_error:
-        found.append(f"went away: {session.last_error}")
+        yield f"went away: {session.last_error}"
     if not report.bytes:
-        found.append(f"silent: opened, but no byte in {seconds:g} s; is it powered, wired and sending here?")
-    counters = session.poll_counters()
+        yield f"silent: opened, but no byte in {seconds:g} s; is it powered, wired and sending here?"
     granted, asked = counters.receive_buffer_bytes, counters.receive_buffer_asked_bytes
     if 0 < granted < asked:
-        found.append(
+        yield (
             f"receive buffer: asked for {asked} bytes, got {granted}; "
             f"`sysctl -w net.core.rmem_max={asked}`, for good in /etc/sysctl.d"
         )
     if counters.lost_kernel:
-        found.append(f"the kernel dropped {counters.lost_kernel} units")
-    if counters.refused:
-        report.notes.append(f"{counters.refused} datagrams of other senders than the configured source")
+        yield f"the kernel dropped {counters.lost_kernel} units"
     if counters.error_frames or counters.bus_off:
-        found.append(f"CAN trouble: {counters.error_frames} error frames, {counters.bus_off} times bus-off")
-    if spec.kind == "can" and spec.interface == "socketcan":
-        found += bitrate_problems(spec, interface_bitrate(spec.channel))
-    return found
+        yield f"CAN trouble: {counters.error_frames} error frames, {counters.bus_off} times bus-off"
 
 
 def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
@@ -257,12 +281,12 @@ def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
     return [f"{spec.channel} runs at {actual} bit/s, configured is {wanted}; `{command}`"]
 
 
-def _answer_problems(entry: DeviceEntry, parser: Parser, heard: Heard, kept: list[ChunkBatch]) -> list[str]:
+def _answer_problems(reading: Reading) -> list[str]:
     """What is wrong with what came."""
-    counters = parser.counters
+    entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
     if not good or not heard.counts:
-        other = identify(entry, kept, than=good)
+        other = identify(entry, reading.kept, than=good)
         if other is not None:
             return [f"answers as {other}, configured as {entry.protocol}"]
     if not good:
@@ -273,17 +297,17 @@ def _answer_problems(entry: DeviceEntry, parser: Parser, heard: Heard, kept: lis
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
         found.append(f"speaks {entry.protocol}, but sends nothing that is decoded ({names})")
     bad = counters.bad_checksums + counters.bad_messages
-    if bad > 0.01 * good:
+    if bad > DAMAGED_SHARE * good:
         found.append(f"{bad} of {bad + good} messages damaged")
     return found + _time_problems(entry, heard)
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """A GNSS must say a valid time; a device on a PPS must see it."""
+    """A GNSS must say a valid time; a device on a PPS that says whether it sees it must see it."""
     if entry.kind == "gnss":
         if heard.time_messages == 0:
             return ["no time message: the clock cannot be set by it; switch one on"]
         return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
-    if entry.pps is not None and heard.clock_rows and not heard.clock_sees_pps:
+    if entry.pps is not None and heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]
     return []

@@ -24,14 +24,13 @@ class Heard:
         counts: by type; rows, where they come in batches.
         time_messages: how many said a time.
         valid_time: the last one that the device vouches for.
-        clock_rows: rows of the device's clock; clock_sees_pps: it has a PPS latched or says it is locked.
+        sees_pps: whether the device says, last, that it has a PPS latched or is locked to it; None: it does not say.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
     time_messages: int = 0
     valid_time: TimeMessage | None = None
-    clock_rows: int = 0
-    clock_sees_pps: bool = False
+    sees_pps: bool | None = None
 
     def add(self, records: list[Record]) -> None:
         """Count records."""
@@ -42,9 +41,15 @@ class Heard:
                 self.time_messages += 1
                 self.valid_time = record if record.valid else self.valid_time
             elif isinstance(record, DeviceClockSamples):
-                self.clock_rows += len(record.rows)
-                latched = (record.rows["pps_time_ns"] >= 0) & (record.rows["locked"] != 0)
-                self.clock_sees_pps |= bool(np.any(latched | (record.rows["locked"] == 1)))
+                self._add_clock(record)
+
+    def _add_clock(self, record: DeviceClockSamples) -> None:
+        rows = record.rows
+        latched, locked = rows["pps_time_ns"] >= 0, rows["locked"]
+        says = latched | (locked >= 0) | (rows["pps_count"] >= 0)
+        if np.any(says):
+            last = np.flatnonzero(says)[-1]
+            self.sees_pps = bool(locked[last] == 1 or (locked[last] < 0 and latched[last]))
 
 
 def describe_time(entry: DeviceEntry, heard: Heard) -> str:
@@ -53,8 +58,8 @@ def describe_time(entry: DeviceEntry, heard: Heard) -> str:
         return f"{describe_tag(heard.valid_time.time)} ({heard.valid_time.message})"
     if heard.time_messages:
         return "not valid"
-    if heard.clock_rows:
-        return "PPS seen" if heard.clock_sees_pps else "no PPS"
+    if heard.sees_pps is not None:
+        return "PPS seen" if heard.sees_pps else "no PPS"
     return "none" if entry.kind == "gnss" else ""
 
 
@@ -69,11 +74,13 @@ def describe_tag(tag: TimeTag) -> str:
 
 
 def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | None:
-    """The protocol of the same kind whose parser finds most messages in the bytes, if more than ``than``.
+    """The protocol of the same kind that makes most of bytes of which the configured one makes no record.
 
-    A driver that cannot work without settings that only the right configuration has is left out.
+    A parser that decodes records is before one that only finds messages (receivers mix protocols on a port, and
+    their parsers frame each other's); the latter must find more than ``than``, what the configured one found. A
+    driver that cannot work without settings that only the right configuration has is left out.
     """
-    best, most = None, max(than, LEAST_MESSAGES - 1)
+    best, most = None, (0, max(than, LEAST_MESSAGES - 1))
     for protocol, driver in all_drivers(entry.kind).items():
         if protocol == entry.protocol:
             continue
@@ -81,10 +88,11 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
             parser = driver.make_parser(_default_settings(entry, protocol))
         except DriverSettingsError:
             continue
+        heard = Heard()
         for batch in kept:
-            parser.feed_batch(batch)
-        parser.close()
-        found = parser.counters.messages.total()
+            heard.add(parser.feed_batch(batch))
+        heard.add(parser.close())
+        found = (heard.counts.total(), parser.counters.messages.total())
         if found > most:
             best, most = protocol, found
     return best
