@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from georef.records import RETURN_DTYPE, StructArray
 
-_WORDS = np.dtype(np.uint64)
-
-BLOCK_SLOTS = 16384  # slots worked on at once, so that the temporaries stay in the processor's second-level cache
+BLOCK_SLOTS = 32768  # slots worked on at once, so that the temporaries stay in the processor's second-level cache
 
 
 @dataclass(slots=True)
@@ -24,35 +22,39 @@ class ReturnSlots:
         range_unit_m: metres of one raw unit.
         intensity: (pulses, slots).
         per_pulse: fields of `RETURN_DTYPE` that are the pulse's, each (pulses,) or one number for all.
-        per_slot: further fields of the return itself, each (pulses, slots), and the unit to multiply by.
+        per_slot: further fields of the return itself, each (pulses, slots).
     """
 
     range_raw: NDArray[Any]
     range_unit_m: float
     intensity: NDArray[Any]
     per_pulse: dict[str, NDArray[Any] | int]
-    per_slot: dict[str, tuple[NDArray[Any], float]]
+    per_slot: dict[str, NDArray[Any]]
 
-    def rows(self) -> StructArray:
-        """The returns there are, `RETURN_DTYPE`, ordered by pulse, then by slot."""
+    def fill(self, table: StructArray) -> int:
+        """Write the returns there are, ordered by pulse, then by slot, to the head of ``table``; returns their number.
+
+        Args:
+            table: `RETURN_DTYPE`, at least as many rows as there are slots.
+        """
         pulses, slots = self.range_raw.shape
         raw = self.range_raw.reshape(-1)
         index = np.flatnonzero(raw)
         all_there = len(index) == len(raw)
-        rows = np.empty(len(index), dtype=RETURN_DTYPE)
+        rows = table[: len(index)]
         rows["range_m"] = (raw if all_there else raw[index]) * self.range_unit_m
         intensity = self.intensity.reshape(-1)
         rows["intensity"] = intensity if all_there else intensity[index]
-        for name, (values, unit) in self.per_slot.items():
+        for name, values in self.per_slot.items():
             flat = values.reshape(-1)
-            rows[name] = (flat if all_there else flat[index]) * np.float32(unit)
+            rows[name] = flat if all_there else flat[index]
         pulse = index if slots == 1 else index // slots
         whole = all_there and slots == 1
         for name, per_pulse in self.per_pulse.items():
             scalar = isinstance(per_pulse, int) or whole
             rows[name] = per_pulse if scalar else per_pulse[pulse]  # type: ignore[index]
         self._number(rows, index, pulse, pulses, slots)
-        return rows
+        return len(index)
 
     def _number(
         self, rows: StructArray, index: NDArray[np.intp], pulse: NDArray[np.intp], pulses: int, slots: int
@@ -71,9 +73,6 @@ class ReturnSlots:
         rows["number_of_returns"] = count[pulse]
 
 
-def join_rows(blocks: list[StructArray]) -> StructArray:
-    """One `RETURN_DTYPE` array of several, joined as words: NumPy copies structures field by field, tenfold slower."""
-    if len(blocks) == 1:
-        return blocks[0]
-    words = [np.empty(0, dtype=_WORDS), *(block.view(_WORDS) for block in blocks)]
-    return np.concatenate(words).view(RETURN_DTYPE)
+def returns_table(slots: int) -> StructArray:
+    """A `RETURN_DTYPE` table for at most so many returns; what is not written to takes no memory."""
+    return np.empty(slots, dtype=RETURN_DTYPE)

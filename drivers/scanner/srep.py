@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, join_rows
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
-    RETURN_DTYPE,
     RETURN_FLAG_PPS_LOCKED,
     ByteRows,
     DeviceClockSamples,
@@ -267,19 +266,21 @@ class SrepParser(PacketParser):
         self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
     ) -> StructArray:
         """Returns of all datagrams, in order, decoded in blocks of one layout."""
-        blocks = []
+        slots = header["pulses"].astype(np.int64) * header["return_slots"]
+        table = returns_table(int(slots.sum()))
+        filled = 0
         for start, stop in _same_layout(header):
             part = slice(start, stop)
-            blocks.append(self._block(host_time_ns[part], header[part], units[part], unwrapped[part]))
-        return join_rows(blocks)
+            if header["pulses"][start]:
+                block = self._block(host_time_ns[part], header[part], units[part], unwrapped[part])
+                filled += block.fill(table[filled:])
+        return table[:filled]
 
     def _block(
         self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
-    ) -> StructArray:
-        """Returns of datagrams that have N, R and tick_hz in common."""
+    ) -> ReturnSlots:
+        """The slots of datagrams that have N, R and tick_hz in common."""
         n, pulses, slots = len(units), int(header["pulses"][0]), int(header["return_slots"][0])
-        if not pulses:
-            return np.empty(0, dtype=RETURN_DTYPE)
         body = units[:, HEADER_BYTES : -CRC.size].view(pulse_dtype(slots))
         angle, facet = self._scan_angle.angles(body["encoder"], header["encoder_counts"][:, np.newaxis])
         number = np.arange(pulses, dtype=np.uint64)
@@ -294,7 +295,7 @@ class SrepParser(PacketParser):
             range_raw=slot["range"].reshape(-1, slots),
             range_unit_m=RANGE_UNIT_M,
             intensity=slot["intensity"].reshape(-1, slots),
-            per_slot={"pulse_width_ns": (slot["pulse_width"], PULSE_WIDTH_UNIT_NS)},
+            per_slot={"pulse_width_ns": slot["pulse_width"] * np.float32(PULSE_WIDTH_UNIT_NS)},
             per_pulse={
                 "host_time_ns": every_pulse(host_time_ns),
                 "device_time_ns": _pulse_times(header, body["ticks"]).reshape(-1),
@@ -304,7 +305,7 @@ class SrepParser(PacketParser):
                 "mta_zone": every_pulse(header["mta_zone"]),
                 "flags": every_pulse(locked),
             },
-        ).rows()
+        )
 
 
 def _headers(units: ByteRows) -> StructArray:
