@@ -300,5 +300,6 @@ DRIVERS = (
         summary="Velodyne VLP-16: single and dual return, position packets with NMEA and PPS status",
         make_parser=VelodyneParser,
         make_time_parser=_clock_parser,
+        needs=("installation",),
     ),
 )
