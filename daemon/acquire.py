@@ -17,7 +17,7 @@ from daemon.block_queue import BlockQueue, QueueItem, SourceCount
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.events import Events, Severity
 from daemon.host_clock import HostClock, StampConverter, read_clock_pair
-from daemon.log.format import ChannelSpec
+from daemon.log.format import ChannelSpec, ChunkClass
 from daemon.log.writer import encode_block
 from daemon.threads import name_thread
 from drivers.session import Session, SessionState
@@ -46,7 +46,7 @@ class Wire:
     source: str
     topic: str
     encoding: str
-    chunk_class: str
+    chunk_class: ChunkClass
     metadata: dict[str, str]
 
 

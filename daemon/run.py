@@ -154,7 +154,7 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
         _add_gnss_time(assembly, device)
         units_seen = assembly.timekeeper.units_seen(device.source)
     main = _wire(device, device.transport, "")
-    session = Session(lambda: open_transport(device.transport))  # type: ignore[arg-type]
+    session = Session(lambda: open_transport(device.transport))
     assembly.receivers.append(UnitReceiver(main, session, assembly.shared, units_seen))
     if device.auxiliary is not None:
         auxiliary = device.auxiliary

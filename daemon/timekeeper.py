@@ -80,11 +80,12 @@ class TimeKeeper:
         if not messages:
             return
         with self._lock:
-            host_ns = np.array([message.host_time_ns for message in messages], dtype=np.int64)
-            raw_ns = self._timeline.raw_from_host(host_ns)
-            for message, raw in zip(messages, raw_ns.tolist(), strict=True):
+            for message in messages:
                 names = time_source.names_edge or message.names_edge
-                time_source.clock.add_message(time_source.source, replace(message, host_time_ns=raw, names_edge=names))
+                raw_ns = self._timeline.raw_at(message.host_time_ns)
+                time_source.clock.add_message(
+                    time_source.source, replace(message, host_time_ns=raw_ns, names_edge=names)
+                )
             self._drain(time_source.source, time_source.clock)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:

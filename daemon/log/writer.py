@@ -107,6 +107,13 @@ def encode_block(
     return EncodedBlock(channel_id, count, log_time_ns, offsets, rows.view(np.uint8).data)
 
 
+def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:
+    """Whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
+    count, stride = rows.shape
+    offsets = np.arange(count, dtype=np.int64) * stride
+    return EncodedBlock(channel_id, count, log_time_ns, offsets, np.ascontiguousarray(rows).reshape(-1).data)
+
+
 def encode_json(channel_id: int, sequence: int, log_time_ns: int, value: Mapping[str, Any]) -> EncodedBlock:
     """One JSON message."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()

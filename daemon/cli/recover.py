@@ -1,0 +1,94 @@
+"""``swath recover``: repair logs."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError
+
+if TYPE_CHECKING:
+    from daemon.log.recover import RecoveryReport
+
+_IOPRIO_WHO_PROCESS = 1
+_IOPRIO_IDLE = 3 << 13  # class idle, linux/ioprio.h
+_SYS_IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the repaired copies; beside the log without it.")
+    ] = None,
+    keep_free_mb: Annotated[float, typer.Option(help="Repair only while so much stays free.", min=0)] = 0.0,
+    background: Annotated[bool, typer.Option("--background", help="At idle CPU and I/O priority.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Check every CRC, save what is whole into LOG.recovered.mcap, say exactly what was lost.
+
+    The log itself is never touched. Exit code 4 when damage was found.
+    """
+    from daemon.log.format import LogError
+    from daemon.log.reader import RECOVERED
+    from daemon.log.recover import recover
+
+    if background:
+        _at_idle_priority()
+    reports = []
+    for path in _files(logs, RECOVERED):
+        try:
+            reports.append(recover(path, output, keep_free_bytes=round(keep_free_mb * 1e6)))
+        except LogError as error:
+            raise UserError(str(error), ExitCode.IO) from error
+        except OSError as error:
+            raise UserError(f"{path}: {error.strerror or error}", ExitCode.IO) from error
+    if as_json:
+        print(json.dumps({"logs": [report.plain() for report in reports]}, indent=2))
+    else:
+        for report in reports:
+            _print_report(report)
+    if not all(report.whole for report in reports):
+        raise typer.Exit(int(ExitCode.DAMAGE))
+
+
+def _files(paths: list[Path], recovered: str) -> list[Path]:
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(file for file in path.glob("*.mcap") if not file.name.endswith(recovered))
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise UserError(f"{path}: no such file or directory", ExitCode.IO)
+    if not files:
+        raise UserError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there", ExitCode.IO)
+    return files
+
+
+def _print_report(report: RecoveryReport) -> None:
+    count = sum(report.messages.values())
+    if report.whole:
+        print(f"{report.path}: whole, {report.chunks} chunks, {count} messages; nothing to do")
+        return
+    print(f"{report.path}: {report.chunks} good chunks, {count} messages saved in {report.recovered}")
+    for item in report.damage:
+        messages = "" if item.messages is None else f", {item.messages} messages lost"
+        print(f"  at byte {item.offset}: {item.length} bytes, {item.what}{messages}")
+
+
+def _at_idle_priority() -> None:
+    """Give way to everything else on this computer; where it is not permitted, go on as it is."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.nice(19)
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except OSError:
+        pass
+    number = _SYS_IOPRIO_SET.get(os.uname().machine)
+    if number is not None:
+        ctypes.CDLL(None, use_errno=True).syscall(number, _IOPRIO_WHO_PROCESS, 0, _IOPRIO_IDLE)

@@ -1,0 +1,315 @@
+"""Reads logs: finished, cut off by a crash, or recovered; one file, several, or a directory of them.
+
+`open_logs` gives sessions in the order of time, their parts in the order of their number. A chunk is used only after
+its CRC has been checked; what cannot be read is skipped and stands in `Session.damage`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import io
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from mcap import records
+from mcap.data_stream import ReadDataStream
+
+from daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, ChunkClass, LogError, SessionInfo
+from daemon.log.scan import (
+    OP_ATTACHMENT,
+    OP_CHANNEL,
+    OP_CHUNK,
+    OP_HEADER,
+    OP_MESSAGE,
+    OP_METADATA,
+    OP_SCHEMA,
+    Damage,
+    Record,
+    scan,
+)
+from georef.records import ByteRows, Int64Array
+
+TopicFilter = Callable[[str], bool]
+RECOVERED = ".recovered.mcap"
+_MESSAGE_HEAD = 31
+_HEAD = struct.Struct("<BQ")
+LOOK_AHEAD_NS = 1_000_000_000  # a chunk is open for 250 ms and waits for the writer a little longer
+
+
+@dataclass(frozen=True, slots=True)
+class LogBatch:
+    """Consecutive messages of equal length of one channel, as they stand in a chunk.
+
+    Attributes:
+        log_time_ns: (n,) host time.
+        rows: (n, 31 + length) uint8, the whole message records, a view into the chunk.
+    """
+
+    channel: ChannelSpec
+    channel_id: int
+    log_time_ns: Int64Array
+    rows: ByteRows
+
+    @property
+    def units(self) -> ByteRows:
+        """(n, length) uint8, the messages' data, a view into the chunk."""
+        return self.rows[:, _MESSAGE_HEAD:]
+
+
+@dataclass(frozen=True, slots=True)
+class PartDamage:
+    """What could not be read of a part."""
+
+    path: Path
+    damage: Damage
+
+
+@dataclass(slots=True)
+class Part:
+    """One file of a session."""
+
+    path: Path
+    info: SessionInfo
+    number: int
+
+
+@dataclass(slots=True)
+class Session:
+    """One recording: its parts, and what was found wrong while reading them."""
+
+    info: SessionInfo
+    parts: list[Part]
+    damage: list[PartDamage] = field(default_factory=list)
+
+    @property
+    def session_id(self) -> str:
+        """Name of the session."""
+        return self.info.session_id
+
+    @property
+    def missing_parts(self) -> list[int]:
+        """Numbers below the highest that are not there."""
+        there = {part.number for part in self.parts}
+        return [number for number in range(max(there) + 1) if number not in there]
+
+    def batches(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
+        """All messages in the order in which they stand in the files."""
+        for chunk in self._chunks(topics):
+            yield from chunk
+
+    def batches_by_time(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
+        """All messages merged by log time: batches are split where another's messages come between.
+
+        A second of messages is held, longer than a chunk stays open.
+        """
+        held: list[LogBatch] = []
+        for chunk in self._chunks(topics):
+            chunk = [batch for batch in chunk if len(batch.log_time_ns)]
+            held += chunk
+            newest_ns = min((int(batch.log_time_ns.min()) for batch in chunk), default=None)
+            if newest_ns is not None:
+                ready, held = _older_than(held, newest_ns - LOOK_AHEAD_NS)
+                yield from _merge(ready)
+        yield from _merge(held)
+
+    def attachments(self) -> dict[str, bytes]:
+        """Attachments by name, of the first part that has each."""
+        found: dict[str, bytes] = {}
+        for part in self.parts:
+            for record in self._records(part):
+                if record.opcode == OP_ATTACHMENT:
+                    attachment = records.Attachment.read(ReadDataStream(io.BytesIO(record.body)))
+                    found.setdefault(attachment.name, attachment.data)
+        return found
+
+    def _chunks(self, topics: TopicFilter | None) -> Iterator[list[LogBatch]]:
+        for part in self.parts:
+            channels: dict[int, ChannelSpec] = {}
+            schemas: dict[int, str] = {}
+            for record in self._records(part):
+                if record.opcode == OP_CHUNK:
+                    yield list(chunk_batches(record.body, channels, schemas, topics))
+                elif record.opcode == OP_CHANNEL:
+                    _take_channel(record.body, channels, schemas)
+                elif record.opcode == OP_SCHEMA:
+                    _take_schema(record.body, schemas)
+
+    def _records(self, part: Part) -> Iterator[Record]:
+        with part.path.open("rb") as file:
+            size = part.path.stat().st_size
+            for found in scan(file, size):
+                if isinstance(found, Record):
+                    yield found
+                else:
+                    entry = PartDamage(part.path, found)
+                    if entry not in self.damage:
+                        self.damage.append(entry)
+
+
+def open_logs(paths: Sequence[Path | str]) -> list[Session]:
+    """Sessions of logs and of directories of them, in order of time.
+
+    Raises:
+        LogError: a file is no log, or there is none.
+    """
+    by_session: dict[str, list[Part]] = {}
+    for path in _files([Path(path) for path in paths]):
+        part = read_part_head(path)
+        by_session.setdefault(part.info.session_id, []).append(part)
+    if not by_session:
+        raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there")
+    sessions = [_session(parts) for parts in by_session.values()]
+    return sorted(sessions, key=lambda session: session.info.realtime_ns)
+
+
+def _session(parts: list[Part]) -> Session:
+    parts.sort(key=lambda part: part.number)
+    for one, other in pairwise(parts):
+        if one.number == other.number:
+            raise LogError(f"{other.path}: is part {other.number} of its session, and so is {one.path}")
+    return Session(parts[0].info, parts)
+
+
+def _files(paths: list[Path]) -> list[Path]:
+    """The files named, and those in the directories named; a recovered copy among them stands for its original."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(path.glob("*.mcap"))
+        elif path.exists():
+            files.append(path)
+        else:
+            raise LogError(f"{path}: no such file or directory")
+    recovered = {str(file).removesuffix(RECOVERED) for file in files if file.name.endswith(RECOVERED)}
+    return [file for file in dict.fromkeys(files) if str(file).removesuffix(".mcap") not in recovered]
+
+
+def read_part_head(path: Path) -> Part:
+    """Session and number of a part, from its first records.
+
+    Raises:
+        LogError: it is no log of this program.
+    """
+    try:
+        with path.open("rb") as file:
+            for found in scan(file, path.stat().st_size):
+                if isinstance(found, Damage):
+                    break
+                if found.opcode == OP_HEADER:
+                    profile = records.Header.read(ReadDataStream(io.BytesIO(found.body))).profile
+                    if profile != PROFILE:
+                        raise LogError(f"{path}: is an MCAP file of profile {profile!r}, not {PROFILE!r}")
+                elif found.opcode == OP_METADATA:
+                    metadata = records.Metadata.read(ReadDataStream(io.BytesIO(found.body)))
+                    if metadata.name == SESSION_METADATA:
+                        info, number = SessionInfo.from_metadata(metadata.metadata)
+                        return Part(path, info, number)
+                elif found.opcode == OP_CHUNK:
+                    break
+    except LogError as error:
+        text = str(error)
+        raise LogError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+    except (OSError, struct.error, UnicodeDecodeError) as error:
+        raise LogError(f"{path}: cannot be read: {error}") from error
+    raise LogError(f"{path}: no {SESSION_METADATA} at its beginning; not a log of swath, or cut off before it began")
+
+
+# ---------------------------------------------------------------------- inside a chunk
+
+
+def chunk_batches(
+    data: bytes, channels: dict[int, ChannelSpec], schemas: dict[int, str], topics: TopicFilter | None = None
+) -> Iterator[LogBatch]:
+    """Messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way."""
+    at, size = 0, len(data)
+    array = np.frombuffer(data, np.uint8)
+    while at + _HEAD.size <= size:
+        opcode, length = _HEAD.unpack_from(data, at)
+        end = at + _HEAD.size + length
+        if end > size:
+            return
+        if opcode == OP_MESSAGE and length >= _MESSAGE_HEAD - _HEAD.size:
+            stride = end - at
+            count = _run_length(array, at, stride)
+            channel_id = int.from_bytes(data[at + 9 : at + 11], "little")
+            spec = channels.get(channel_id)
+            if spec is not None and (topics is None or topics(spec.topic)):
+                yield _batch(spec, channel_id, array[at : at + count * stride].reshape(count, stride))
+            end = at + count * stride
+        elif opcode == OP_CHANNEL:
+            _take_channel(data[at + _HEAD.size : end], channels, schemas)
+        elif opcode == OP_SCHEMA:
+            _take_schema(data[at + _HEAD.size : end], schemas)
+        at = end
+
+
+def _run_length(array: ByteRows, at: int, stride: int) -> int:
+    """Messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
+    possible = (len(array) - at) // stride
+    if possible <= 1:
+        return possible
+    # most runs in a chunk of several channels are short: look one ahead before looking at all
+    if not np.array_equal(array[at : at + 11], array[at + stride : at + stride + 11]):
+        return 1
+    heads = array[at : at + possible * stride].reshape(possible, stride)[:, :11]
+    differs = np.flatnonzero((heads != heads[0]).any(axis=1))
+    return int(differs[0]) if len(differs) else possible
+
+
+def _batch(spec: ChannelSpec, channel_id: int, rows: ByteRows) -> LogBatch:
+    times: Int64Array = rows[:, 15:23].copy().view("<i8")[:, 0]
+    return LogBatch(spec, channel_id, times, rows)
+
+
+def _take_channel(body: bytes, channels: dict[int, ChannelSpec], schemas: dict[int, str]) -> None:
+    channel = records.Channel.read(ReadDataStream(io.BytesIO(body)))
+    chunk_class: ChunkClass = "scanner" if channel.topic.startswith("/scanner/") else "other"
+    channels[channel.id] = ChannelSpec(
+        channel.topic, channel.message_encoding, channel.metadata, schemas.get(channel.schema_id), chunk_class
+    )
+
+
+def _take_schema(body: bytes, schemas: dict[int, str]) -> None:
+    schema = records.Schema.read(ReadDataStream(io.BytesIO(body)))
+    schemas[schema.id] = schema.name
+
+
+# ---------------------------------------------------------------------- merging by time
+
+
+def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], list[LogBatch]]:
+    """Batches split at a time: those before it, those after."""
+    ready: list[LogBatch] = []
+    rest: list[LogBatch] = []
+    for batch in held:
+        split = int(np.searchsorted(batch.log_time_ns, limit_ns))
+        if split:
+            ready.append(_slice(batch, 0, split))
+        if split < len(batch.log_time_ns):
+            rest.append(_slice(batch, split, len(batch.log_time_ns)))
+    return ready, rest
+
+
+def _slice(batch: LogBatch, first: int, last: int) -> LogBatch:
+    return LogBatch(batch.channel, batch.channel_id, batch.log_time_ns[first:last], batch.rows[first:last])
+
+
+def _merge(batches: list[LogBatch]) -> Iterator[LogBatch]:
+    """Batches split at each other's times; equal times keep the order of the file."""
+    heap = [(int(batch.log_time_ns[0]), number, 0) for number, batch in enumerate(batches)]
+    heapq.heapify(heap)
+    while heap:
+        _, number, first = heapq.heappop(heap)
+        batch = batches[number]
+        times = batch.log_time_ns
+        last = len(times)
+        if heap:
+            next_ns = heap[0][0] + (number < heap[0][1])  # of equal times the one first in the file goes first
+            last = max(first + 1, first + int(np.searchsorted(times[first:], next_ns)))
+        yield _slice(batch, first, last)
+        if last < len(times):
+            heapq.heappush(heap, (int(times[last]), number, last))

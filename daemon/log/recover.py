@@ -1,0 +1,176 @@
+"""Makes a damaged or unfinished log whole: what can be read is copied beside it, the original is never touched.
+
+Whole chunks are written again with their messages in the same order and with the same stamps; bad ones are dropped
+and told. The copy has index and footer, so that every MCAP reader opens it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap import records
+from mcap.data_stream import ReadDataStream
+
+from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
+from daemon.log.reader import RECOVERED, chunk_batches, read_part_head
+from daemon.log.scan import OP_ATTACHMENT, OP_CHANNEL, OP_CHUNK, OP_METADATA, OP_SCHEMA, Damage, Record, scan
+from daemon.log.writer import PartWriter, encode_raw
+
+
+@dataclass(slots=True)
+class RecoveryReport:
+    """What was found in a log and what was done about it.
+
+    Attributes:
+        path: the original.
+        recovered: the copy; None where the log was whole and nothing was written.
+        chunks: good ones. messages: in them, by topic.
+        damage: every stretch that could not be read.
+        duplicate_of: the copy was there already.
+    """
+
+    path: Path
+    recovered: Path | None = None
+    chunks: int = 0
+    messages: Counter[str] = field(default_factory=Counter)
+    damage: list[Damage] = field(default_factory=list)
+
+    @property
+    def whole(self) -> bool:
+        """Nothing is wrong with the original."""
+        return not self.damage
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes of the original that could not be read."""
+        return sum(damage.length for damage in self.damage)
+
+    def plain(self) -> dict[str, object]:
+        """For ``--json``."""
+        return {
+            "path": str(self.path),
+            "whole": self.whole,
+            "recovered": None if self.recovered is None else str(self.recovered),
+            "chunks": self.chunks,
+            "messages": dict(self.messages),
+            "lost_bytes": self.lost_bytes,
+            "damage": [
+                {"offset": item.offset, "length": item.length, "what": item.what, "messages": item.messages}
+                for item in self.damage
+            ],
+        }
+
+
+def examine(path: Path) -> RecoveryReport:
+    """Read a log through and check every CRC; writes nothing.
+
+    Raises:
+        LogError: it is no log.
+    """
+    return _pass(path, None)
+
+
+def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int = 0) -> RecoveryReport:
+    """Repair a log into ``<stem>.recovered.mcap`` beside it, or in the folder ``destination``.
+
+    Args:
+        path: the log; it is only read.
+        destination: folder of the copy.
+        keep_free_bytes: the copy is given up when less would stay free.
+
+    Raises:
+        LogError: it is no log, the copy is there already, or there is no room for it.
+        OSError: the copy cannot be written.
+    """
+    folder = path.parent if destination is None else destination
+    target = folder / (path.name.removesuffix(".mcap") + RECOVERED)
+    report = examine(path)
+    if report.whole:
+        return report
+    if target.exists():
+        raise LogError(f"{target}: is there already; remove it to recover {path.name} again")
+    free = shutil.disk_usage(folder).free
+    needed = path.stat().st_size + keep_free_bytes
+    if free < needed:
+        raise LogError(f"{folder}: {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB needed to recover {path.name}")
+    temporary = target.with_name(target.name + ".part")
+    temporary.unlink(missing_ok=True)
+    try:
+        report = _pass(path, temporary)
+        temporary.rename(target)
+        _sync_folder(folder)
+    finally:
+        temporary.unlink(missing_ok=True)
+    report.recovered = target
+    return report
+
+
+def _pass(path: Path, copy: Path | None) -> RecoveryReport:
+    """Read all; write what is good to ``copy`` if there is one."""
+    head = read_part_head(path)
+    report = RecoveryReport(path)
+    writer = None if copy is None else PartWriter(copy, head.info, head.number, compression="auto")
+    channels: dict[int, ChannelSpec] = {}
+    schemas: dict[int, str] = {}
+    try:
+        with path.open("rb") as file:
+            for found in scan(file, path.stat().st_size):
+                if isinstance(found, Damage):
+                    report.damage.append(found)
+                elif found.opcode == OP_CHUNK:
+                    _copy_chunk(found, writer, channels, schemas, report)
+                elif found.opcode in (OP_CHANNEL, OP_SCHEMA):
+                    list(chunk_batches(_as_chunk(found), channels, schemas))
+                elif writer is not None:
+                    _copy_outside(found, writer)
+        if writer is not None:
+            writer.finish()
+    finally:
+        if writer is not None:
+            writer.close()
+    return report
+
+
+def _copy_chunk(
+    found: Record,
+    writer: PartWriter | None,
+    channels: dict[int, ChannelSpec],
+    schemas: dict[int, str],
+    report: RecoveryReport,
+) -> None:
+    report.chunks += 1
+    for batch in chunk_batches(found.body, channels, schemas):
+        report.messages[batch.channel.topic] += len(batch.units)
+        if writer is not None:
+            writer.add_channel(batch.channel_id, batch.channel)
+            writer.add(encode_raw(batch.channel_id, batch.log_time_ns, batch.rows))
+    if writer is not None:
+        writer.flush()
+
+
+def _copy_outside(found: Record, writer: PartWriter) -> None:
+    if found.opcode == OP_ATTACHMENT:
+        attachment = records.Attachment.read(ReadDataStream(io.BytesIO(found.body)))
+        writer.add_attachment(attachment.name, attachment.media_type, attachment.data, attachment.log_time)
+    elif found.opcode == OP_METADATA:
+        metadata = records.Metadata.read(ReadDataStream(io.BytesIO(found.body)))
+        if metadata.name != SESSION_METADATA:
+            writer.add_metadata(metadata.name, metadata.metadata)
+
+
+def _as_chunk(found: Record) -> bytes:
+    """A record outside chunks as if it stood in one."""
+    return bytes([found.opcode]) + len(found.body).to_bytes(8, "little") + found.body
+
+
+def _sync_folder(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,1 @@
+"""The demonstration: real recordings played into a real recorder."""
