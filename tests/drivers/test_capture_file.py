@@ -1,0 +1,264 @@
+"""Capture files: real recordings of each kind, and files that are cut, damaged or something else."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from collections import Counter
+from pathlib import Path
+
+import can
+import dpkt
+import numpy as np
+import pytest
+
+from drivers.core.can_frames import decode_can_frames
+from drivers.transports.base import TransportError
+from drivers.transports.capture_file import CapturedUnit, read_candump, read_pcap, read_serial
+
+FIXTURES = Path(__file__).parents[2] / "fixtures"
+VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"
+CANDUMP = FIXTURES / "canmod-gps" / "2F6913DB_00000004_00000001_candump.log.gz"
+SPAN = FIXTURES / "novatel" / "propak6-basic-fix.gps.gz"
+
+# --- pcap -----------------------------------------------------------------------------------------------------------
+
+
+def test_real_pcap_gives_every_datagram() -> None:
+    units = list(read_pcap(VELODYNE))
+    ports = Counter((unit.destination[1] if unit.destination else 0, len(unit.data)) for unit in units)
+    assert ports == {(2368, 1206): 293, (8308, 512): 57}
+    assert units[0].source == ("10.0.0.100", 2368)
+    assert [unit.time_ns for unit in units] == sorted(unit.time_ns for unit in units)
+    assert len(list(read_pcap(VELODYNE, port=8308))) == 57
+
+
+def test_payloads_and_times_are_those_dpkt_reads() -> None:
+    units = list(read_pcap(VELODYNE))
+    with gzip.open(VELODYNE) as stream:
+        theirs = [
+            (round(seconds * 1e6) * 1000, bytes(dpkt.ethernet.Ethernet(frame).data.data.data))
+            for seconds, frame in dpkt.pcap.Reader(stream)
+        ]
+    assert [(unit.time_ns, unit.data) for unit in units] == theirs
+
+
+def udp_packet(payload: bytes, to_port: int = 2368) -> bytes:
+    udp = dpkt.udp.UDP(sport=4000, dport=to_port, data=payload, ulen=8 + len(payload))
+    ip = dpkt.ip.IP(src=b"\x0a\0\0\1", dst=b"\x0a\0\0\2", p=dpkt.ip.IP_PROTO_UDP, id=77, data=bytes(udp))
+    ip.len = 28 + len(payload)
+    return bytes(ip)
+
+
+def fragments(packet: bytes, size: int) -> list[bytes]:
+    """An IPv4 packet in pieces of ``size`` bytes, as RFC 791 cuts it."""
+    header, data = packet[:20], packet[20:]
+    pieces = []
+    for at in range(0, len(data), size):
+        part = data[at : at + size]
+        flags = at // 8 | (0x2000 if at + size < len(data) else 0)
+        pieces.append(
+            header[:2] + struct.pack(">H", 20 + len(part)) + header[4:6] + struct.pack(">H", flags) + header[8:] + part
+        )
+    return pieces
+
+
+def write_pcap(path: Path, frames: list[bytes], link: int = 1, order: str = "<", nano: bool = False) -> Path:
+    magic = 0xA1B23C4D if nano else 0xA1B2C3D4
+    data = struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 262144, link)
+    for at, frame in enumerate(frames):
+        data += struct.pack(f"{order}IIII", 1_700_000_000 + at, 123_456, len(frame), len(frame)) + frame
+    path.write_bytes(data)
+    return path
+
+
+ETHERNET = bytes(12) + b"\x08\x00"
+VLAN = bytes(12) + b"\x81\x00\x00\x05\x08\x00"
+SLL = bytes(14) + b"\x08\x00"
+SLL2 = b"\x08\x00" + bytes(18)
+
+
+@pytest.mark.parametrize(("link", "head"), [(1, ETHERNET), (1, VLAN), (101, b""), (113, SLL), (276, SLL2)], ids=str)
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_link_layers_and_byte_orders(tmp_path: Path, link: int, head: bytes, order: str) -> None:
+    frame = head + udp_packet(b"scan") + b"padding"
+    [unit] = read_pcap(write_pcap(tmp_path / "one.pcap", [frame], link, order))
+    assert unit == CapturedUnit(1_700_000_000_123_456_000, b"scan", "udp", ("10.0.0.1", 4000), ("10.0.0.2", 2368))
+
+
+def test_nanosecond_times_are_exact(tmp_path: Path) -> None:
+    [unit] = read_pcap(write_pcap(tmp_path / "one.pcap", [ETHERNET + udp_packet(b"")], nano=True))
+    assert unit.time_ns == 1_700_000_000_000_123_456
+
+
+def test_ipv6_datagrams(tmp_path: Path) -> None:
+    segment = struct.pack(">HHHH", 1, 2368, 12, 0) + b"scan"
+    packet = struct.pack(">IHBB", 6 << 28, len(segment), 17, 64) + bytes(15) + b"\1" + bytes(15) + b"\2" + segment
+    [unit] = read_pcap(write_pcap(tmp_path / "six.pcap", [bytes(12) + b"\x86\xdd" + packet]))
+    assert (unit.source, unit.destination, unit.data) == (("::1", 1), ("::2", 2368), b"scan")
+
+
+def test_fragments_are_put_together_in_any_order(tmp_path: Path) -> None:
+    payload = np.random.default_rng(1).bytes(8448)
+    pieces = fragments(udp_packet(payload), 1480)
+    assert len(pieces) == 6
+    shuffled = [pieces[i] for i in (3, 0, 5, 5, 1, 4, 2)]
+    frames = [ETHERNET + piece for piece in [*shuffled, udp_packet(b"next")]]
+    units = list(read_pcap(write_pcap(tmp_path / "cut.pcap", frames)))
+    assert [unit.data for unit in units] == [payload, b"next"]
+    assert units[0].time_ns // 10**9 == 1_700_000_006  # whole with the last of its fragments
+    lost = [ETHERNET + piece for piece in pieces[1:]]
+    assert list(read_pcap(write_pcap(tmp_path / "lost.pcap", lost))) == []
+
+
+def test_other_packets_are_passed_over(tmp_path: Path) -> None:
+    arp = bytes(12) + b"\x08\x06" + bytes(28)
+    tcp = bytearray(udp_packet(b"no"))
+    tcp[9] = 6
+    frames = [arp, ETHERNET + bytes(tcp), b"", b"\1\2", ETHERNET, ETHERNET + udp_packet(b"yes")]
+    assert [unit.data for unit in read_pcap(write_pcap(tmp_path / "mixed.pcap", frames))] == [b"yes"]
+
+
+def test_pcapng(tmp_path: Path) -> None:
+    path = tmp_path / "one.pcapng"
+    with path.open("wb") as stream:
+        writer = dpkt.pcapng.Writer(stream)
+        writer.writepkt(ETHERNET + udp_packet(b"scan"), ts=1_700_000_000.25)
+    [unit] = read_pcap(path)
+    assert (unit.time_ns, unit.data) == (1_700_000_000_250_000_000, b"scan")
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(TransportError, match=r"one.pcapng: damaged pcapng"):
+        list(read_pcap(path))
+
+
+def test_bad_pcaps_are_one_line(tmp_path: Path) -> None:
+    good = write_pcap(tmp_path / "good.pcap", [ETHERNET + udp_packet(b"scan")] * 2)
+    data = good.read_bytes()
+    cases = {
+        "empty": (b"", "neither pcap nor pcapng"),
+        "text": (b"$GPGGA,1,2,3", "neither pcap nor pcapng"),
+        "head": (data[:20], "ends in its header"),
+        "record": (data[:30], "ends in a record header at byte 24"),
+        "packet": (data[:-3], "at byte 86"),
+        "length": (data[:32] + b"\xff\xff\xff\xff" + data[36:], "is damaged, at byte 24"),
+        "link": (data[:20] + b"\x93\0\0\0" + data[24:], "link type 147"),
+        "gzip": (gzip.compress(data)[:-12], "cannot be read on"),
+    }
+    for name, (content, text) in cases.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(TransportError, match=text) as error:
+            list(read_pcap(path))
+        assert name in str(error.value)
+        assert "\n" not in str(error.value)
+    short = write_pcap(tmp_path / "snap.pcap", [(ETHERNET + udp_packet(b"scan"))[:-2]])
+    with pytest.raises(TransportError, match="snap length"):
+        list(read_pcap(short))
+    with pytest.raises(TransportError, match="No such file"):
+        list(read_pcap(tmp_path / "absent.pcap"))
+    reader = read_pcap(tmp_path / "packet")
+    assert next(reader).data == b"scan"  # what came before the bad place is given
+
+
+# --- candump --------------------------------------------------------------------------------------------------------
+
+
+def test_real_candump_is_what_python_can_reads(tmp_path: Path) -> None:
+    units = list(read_candump(CANDUMP))
+    assert len(units) == 5588
+    text = tmp_path / "frames.log"
+    text.write_bytes(gzip.decompress(CANDUMP.read_bytes()))
+    with can.CanutilsLogReader(str(text)) as reader:
+        theirs = list(reader)
+    frames = decode_can_frames(np.frombuffer(b"".join(unit.data for unit in units), dtype=np.uint8).reshape(-1, 16))
+    assert frames is not None
+    assert [m.arbitration_id | (m.is_extended_id << 31) for m in theirs] == frames["can_id"].tolist()
+    assert [bytes(m.data) for m in theirs] == [row["data"][: row["length"]].tobytes() for row in frames]
+    assert [m.channel for m in theirs] == [unit.channel for unit in units]
+    assert max(abs(m.timestamp - unit.time_ns / 1e9) for m, unit in zip(theirs, units, strict=True)) < 1e-6
+    assert len(list(read_candump(CANDUMP, channel="can1"))) == 221
+
+
+@pytest.mark.parametrize(
+    ("text", "frame"),
+    [
+        ("123#", "23010000" "00000000" + 16 * "0"),
+        ("7FF#DEADBEEF", "ff070000" "04000000" "deadbeef00000000"),
+        ("00000123#01", "23010080" "01000000" "0100000000000000"),
+        ("1FFFFFFF#11.22.33", "ffffff9f" "03000000" "1122330000000000"),
+        ("123#R", "23010040" "00000000" + 16 * "0"),
+        ("123#R8", "23010040" "08000000" + 16 * "0"),
+        ("20000004#0001000000000000", "04000020" "08000000" "0001000000000000"),
+        ("123#1122334455667788_F", "23010000" "0800000f" "1122334455667788"),
+        ("123##1AABB", "23010000" "02050000" "aabb" + 124 * "0"),
+        ("123##0" + 64 * "5A", "23010000" "40040000" + 64 * "5a"),
+    ],
+)  # fmt: skip
+def test_kinds_of_frames(tmp_path: Path, text: str, frame: str) -> None:
+    path = tmp_path / "one.log"
+    path.write_text(f"\n(1469439874.299591) vcan0 {text}\n(1469439874.299592) vcan0 {text} R\r\n")
+    units = list(read_candump(path))
+    assert [unit.data.hex() for unit in units] == [frame, frame]
+    assert [unit.time_ns for unit in units] == [1469439874299591000, 1469439874299592000]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "vcan0 123#00",
+        "(1.0) vcan0 12#00",
+        "(1.0) vcan0 123#0",
+        "(1.0) vcan0 123#zz",
+        "(1.0) vcan0 123#001122334455667788",
+        "(1.0) vcan0 123#R9",
+        "(1.0) vcan0 123##",
+        "(1.0) vcan0 123##0" + "00" * 9,
+        " vcan0  123   [2]  00 11",
+    ],
+)
+def test_lines_that_are_no_frame_are_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "bad.log"
+    path.write_text(f"(1.0) vcan0 123#00\n{line}\n")
+    reader = read_candump(path)
+    assert next(reader).channel == "vcan0"
+    with pytest.raises(TransportError, match=r"bad.log: line 2 is no frame"):
+        next(reader)
+
+
+# --- serial ---------------------------------------------------------------------------------------------------------
+
+
+def test_real_serial_recording_is_given_whole() -> None:
+    units = list(read_serial(SPAN))
+    assert len(units) == 10051
+    assert b"".join(unit.data for unit in units) == gzip.decompress(SPAN.read_bytes())
+    assert units[0].time_ns == 1414089843747695000
+    assert units[-1].time_ns - units[0].time_ns == pytest.approx(198.7e9, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ("arrival_unix_s,offset,length\n1.5,0,6\n", "bytes 0.6 are not in port.bin"),
+        ("arrival_unix_s,offset,length\n1.5,-1,2\n", "are not in port.bin"),
+        ("arrival_unix_s,offset,length\n1.5,3,-2\n", "are not in port.bin"),
+        ("arrival_unix_s,offset,length\nx,0,1\n", "line 2: want arrival_unix_s"),
+        ("arrival_unix_s,offset,length\n1.5,0\n", "line 2: want arrival_unix_s"),
+        ("time,offset,length\n1.5,0,1\n", "line 2: want arrival_unix_s"),
+    ],
+)
+def test_bad_tables_are_one_line(tmp_path: Path, table: str, text: str) -> None:
+    (tmp_path / "port.bin").write_bytes(b"bytes")
+    (tmp_path / "port.chunks.csv").write_text(table)
+    with pytest.raises(TransportError, match=text):
+        list(read_serial(tmp_path / "port.bin"))
+
+
+def test_a_missing_table_is_named(tmp_path: Path) -> None:
+    (tmp_path / "port.bin").write_bytes(b"bytes")
+    with pytest.raises(TransportError, match=r"port\.chunks\.csv\[\.gz\] beside it"):
+        list(read_serial(tmp_path / "port.bin"))
+    other = tmp_path / "times.csv"
+    other.write_text("arrival_unix_s,offset,length\n1.25,0,2\n1.5,2,3\n")
+    units = list(read_serial(tmp_path / "port.bin", other))
+    assert [(unit.time_ns, unit.data) for unit in units] == [(1_250_000_000, b"by"), (1_500_000_000, b"tes")]
