@@ -1,0 +1,65 @@
+# make demo and make test set everything up themselves: a virtual environment in .venv, from python3 (PYTHON=… for another).
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+JOBS ?= 2
+PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
+
+DESTDIR ?=
+PREFIX ?= /opt/swath
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_ROOT_USER_ACTION := ignore
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-long lint bench install uninstall clean
+
+help: ## say what there is to make
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
+
+demo: $(VENV)/.runs ## play real recordings through real wires into a recorder, about 30 s
+	@$(BIN)/python -m demo
+
+test: lint $(VENV)/.tools ## install and run everything: style, types, import rules, tests
+	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone"
+	$(PYTEST) -n 0 -m "alone and not long"
+
+test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
+	$(PYTEST) -n 0 -m long
+
+lint: $(VENV)/.tests ## style, import rules and types only
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/mypy
+
+bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit
+	$(BIN)/python -m benchmarks
+
+install: ## install the service (root; DESTDIR= and PREFIX= are honoured)
+	@DESTDIR="$(DESTDIR)" PREFIX="$(PREFIX)" sh systemd/install.sh install
+
+uninstall: ## remove what install put there; configuration and logs stay
+	@DESTDIR="$(DESTDIR)" PREFIX="$(PREFIX)" sh systemd/install.sh uninstall
+
+clean: ## remove the virtual environment and everything built
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# ---- set-up, each step once; a change of pyproject.toml repeats it
+
+$(VENV)/bin/python:
+	@sh systemd/setup.sh venv "$(PYTHON)" "$(VENV)"
+
+$(VENV)/.runs: pyproject.toml | $(VENV)/bin/python
+	@sh systemd/setup.sh pip "$(VENV)" .
+	@touch $@
+
+$(VENV)/.tests: pyproject.toml | $(VENV)/bin/python
+	@sh systemd/setup.sh pip "$(VENV)" '.[test]'
+	@touch $@ $(VENV)/.runs
+
+# the units and rules are tested with systemd's own tools
+$(VENV)/.tools: | $(VENV)/bin/python
+	@sh systemd/setup.sh tools
+	@touch $@

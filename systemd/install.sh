@@ -1,0 +1,126 @@
+#!/bin/sh
+# Installs the recorder on an aircraft's computer, or removes it.   install.sh install|uninstall
+#   PREFIX   where the program goes, /opt/swath by default; the unit's paths follow
+#   DESTDIR  a root to install into, for packagers: nothing is then started, created or loaded
+#   PYTHON   the system's Python 3.11 or newer; not one in a home directory, which the service cannot see
+set -eu
+
+DESTDIR=${DESTDIR-}
+PREFIX=${PREFIX:-/opt/swath}
+PYTHON=${PYTHON:-/usr/bin/python3}
+source=$(cd "$(dirname "$0")/.." && pwd)
+
+fail() { echo "swath: $*" >&2; exit 1; }
+
+# file in this folder -> place on the computer; uninstall removes exactly these
+placed() {
+    cat <<LIST
+swathd.service /usr/lib/systemd/system/swathd.service
+sysctl/90-swath.conf /usr/lib/sysctl.d/90-swath.conf
+network/80-swath-can.network /usr/lib/systemd/network/80-swath-can.network
+udev/90-swath.rules /usr/lib/udev/rules.d/90-swath.rules
+tmpfiles/swath.conf /usr/lib/tmpfiles.d/swath.conf
+sysusers/swath.conf /usr/lib/sysusers.d/swath.conf
+chrony/swath.conf /etc/chrony/conf.d/swath.conf
+LIST
+}
+
+on_this_computer() { [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; }
+
+check_python() {
+    [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make install needs root: sudo make install"
+    "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' 2>/dev/null ||
+        fail "$PYTHON is not Python 3.11 to 3.14; say PYTHON=…"
+    "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || fail "$PYTHON lacks its venv module: apt-get install python3-venv"
+    case $(readlink -f "$(command -v "$PYTHON")") in
+        /root/* | /home/*) fail "$PYTHON lies in a home directory, which the service cannot see; say PYTHON=/usr/bin/python3" ;;
+    esac
+}
+
+# The project is copied before it is built, so that nothing is left in the source tree.
+install_program() {
+    echo "installing the program into $DESTDIR$PREFIX"
+    work=$(mktemp -d)
+    trap 'rm -rf "$work"' EXIT
+    mkdir "$work/swath"
+    for item in pyproject.toml README.md LICENSE calib daemon drivers georef sim; do
+        cp -R "$source/$item" "$work/swath/"
+    done
+    if [ -d "$DESTDIR$PREFIX" ] && [ ! -e "$DESTDIR$PREFIX/pyvenv.cfg" ] && [ -n "$(ls -A "$DESTDIR$PREFIX")" ]; then
+        fail "$DESTDIR$PREFIX holds something else; give PREFIX a folder of its own, as /opt/swath"
+    fi
+    rm -rf "$DESTDIR$PREFIX"
+    mkdir -p "$DESTDIR$PREFIX"
+    chmod 0755 "$DESTDIR$PREFIX"
+    {
+        "$PYTHON" -m venv "$DESTDIR$PREFIX" &&
+            PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore \
+                "$DESTDIR$PREFIX/bin/python" -m pip install -q "$work/swath"
+    } >"$work/log" 2>&1 </dev/null || { cat "$work/log" >&2; fail "the program could not be installed; pip's words are above"; }
+    if [ -n "$DESTDIR" ]; then # its scripts must name the place where they will be
+        grep -rlIF "$DESTDIR$PREFIX" "$DESTDIR$PREFIX/bin" "$DESTDIR$PREFIX/pyvenv.cfg" | while read -r file; do
+            [ -L "$file" ] || sed -i "s#$DESTDIR$PREFIX#$PREFIX#g" "$file"
+        done
+    fi
+    documents="$DESTDIR$PREFIX/share/doc/swath"
+    mkdir -p "$documents"
+    cp -R "$source/README.md" "$source/LICENSE" "$source/docs" "$documents/"
+}
+
+install_files() {
+    placed | while read -r from to; do
+        mkdir -p "$DESTDIR$(dirname "$to")"
+        sed "s#/opt/swath#$PREFIX#g" "$source/systemd/$from" >"$DESTDIR$to"
+        chmod 0644 "$DESTDIR$to"
+    done
+    mkdir -p "$DESTDIR/etc/swath" "$DESTDIR/usr/local/bin"
+    ln -sfn "$PREFIX/bin/swath" "$DESTDIR/usr/local/bin/swath"
+    if [ -e "$DESTDIR/etc/swath/swath.toml" ]; then
+        echo "kept $DESTDIR/etc/swath/swath.toml"
+    else
+        install -m 0644 "$source/systemd/swath.toml" "$DESTDIR/etc/swath/swath.toml"
+        echo "example configuration: $DESTDIR/etc/swath/swath.toml"
+    fi
+}
+
+activate() {
+    systemd-sysusers
+    systemd-tmpfiles --create "$1"
+    sysctl -q -p "$2"
+    systemctl daemon-reload
+    ! command -v udevadm >/dev/null || udevadm control --reload || echo "udev is not running; its rules hold from the next start"
+    echo "edit /etc/swath/swath.toml, then: swath check /etc/swath/swath.toml && systemctl enable --now swathd"
+}
+
+install_all() {
+    check_python
+    install_program
+    install_files
+    if on_this_computer; then
+        activate /usr/lib/tmpfiles.d/swath.conf /usr/lib/sysctl.d/90-swath.conf
+    else
+        echo "installed; users, directories and kernel settings come with the next start of systemd"
+    fi
+}
+
+uninstall_all() {
+    [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make uninstall needs root: sudo make uninstall"
+    if on_this_computer; then
+        systemctl disable --now swathd.service 2>/dev/null || true
+    fi
+    placed | while read -r _ to; do
+        rm -f "$DESTDIR$to"
+    done
+    [ "$(readlink "$DESTDIR/usr/local/bin/swath" || true)" != "$PREFIX/bin/swath" ] || rm -f "$DESTDIR/usr/local/bin/swath"
+    [ ! -e "$DESTDIR$PREFIX/pyvenv.cfg" ] || rm -rf "$DESTDIR$PREFIX"
+    if on_this_computer; then
+        systemctl daemon-reload
+    fi
+    echo "removed; kept: $DESTDIR/etc/swath (configuration), $DESTDIR/var/lib/swath (logs), the user swath"
+}
+
+case "${1-}" in
+    install) install_all ;;
+    uninstall) uninstall_all ;;
+    *) fail "use: install.sh install|uninstall" ;;
+esac
