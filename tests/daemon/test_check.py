@@ -25,6 +25,7 @@ from daemon.check import Report, bitrate_problems, check_everything
 from daemon.config import parse_config
 from daemon.identify import describe_tag
 from drivers.scanner.srep import SrepHeader, encode_datagram
+from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
 from georef.records import TimeScale, TimeTag
 from tests.daemon.rig import free_udp_port
@@ -161,6 +162,26 @@ class TestAllWell:
         assert reports["scanner/left"].records["ScannerReturns"] == 10 * reports["scanner/left"].units
         assert reports["scanner/left"].time == "PPS seen"
 
+    def test_both_ports_of_a_real_head_are_one_device(self, tmp_path: Path) -> None:
+        """A VLP-16 locked to its PPS, which only the position packets say, on a port of their own."""
+        data, position = free_udp_port(), free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        streams = [[unit.data for unit in recorded if len(unit.data) == length] for length in (1206, 512)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\npps = "main"\n'
+            'installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[pps.main]\nsource = "/dev/pps0"\n'
+        )
+        with (
+            udp_sender(data, lambda n: streams[0][n % len(streams[0])]),
+            udp_sender(position, lambda n: streams[1][n % len(streams[1])]),
+        ):
+            reports = check(text, tmp_path, 0.5)
+        assert reports["scanner/roof"].records["ScannerReturns"] > 0
+        assert reports["scanner/roof"].time in {"PPS seen", "2016-01-21 08:18:02 UTC (position RMC)"}
+        assert reports["scanner/roof"].problems == []
+        assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
+
     def test_the_auxiliary_port_has_its_own_line(self, tmp_path: Path) -> None:
         port, auxiliary = free_udp_port(), free_udp_port()
         with udp_sender(port, srep_datagram), udp_sender(auxiliary, lambda _: bytes(512)):
@@ -215,6 +236,21 @@ class TestSomethingElse:
             identity = "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
             report = check(text + identity, tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["answers as srep, configured as velodyne-vlp16"]
+
+    def test_a_real_recording_of_another_receiver_is_named(self, tmp_path: Path) -> None:
+        """NovAtel, where NMEA is configured."""
+        data = gzip.decompress((ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz").read_bytes())
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert report.problems == ["answers as novatel, configured as nmea"]
+
+    def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
+        """A VLP-16, where a line scanner is configured."""
+        port = free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]
+        with udp_sender(port, lambda number: recorded[number % len(recorded)]):
+            report = check(srep(port), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as velodyne-vlp16, configured as srep"]
 
     def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
