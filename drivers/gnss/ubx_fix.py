@@ -50,9 +50,7 @@ def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> Gn
         velocity_cov_l=_velocity_cov(pvt, cov),
         fix_type=_fix_type(pvt),
         satellites=pvt.satellites if pvt is not None else None,
-        valid=position is not None
-        and fix_type is not FixType.NONE
-        and (pvt is None or bool(pvt.flags & ubx.PVT_FIX_OK)),
+        valid=position is not None and (pvt is None or pvt.flags & ubx.PVT_FIX_OK != 0),
         message="NAV-PVT" if pvt is not None else "NAV-HPPOSLLH",
     )
 
