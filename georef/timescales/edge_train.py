@@ -21,10 +21,13 @@ NOISY_TOLERANCE_NS = 2_000_000
 NOISY_AFTER_EDGES = 24
 MAX_CHAIN_GAP_S = 4
 GATE_FLOOR_NS = 50_000.0
+FIRST_GATE_FLOOR_NS = 1_000_000.0  # while the stamps' noise is only guessed
+FIRST_EDGES = 16
 GATE_SIGMAS = 5.0
 GATE_MISSED_MAX = 5.0
 MAX_REFUSED_IN_A_ROW = 8
 LIVE_KNOTS = 900
+FIRST_NOISE_FACTOR = 1.5  # five edges tell little: rather too much at first
 FIRST_NOISE_NS = 2_000.0  # prior of the stamps' noise, worth two edges beside the first lock's residuals
 
 
@@ -50,19 +53,28 @@ def find_chain(edges: Sequence[int], *, noisy: bool) -> list[tuple[int, int]] | 
     return [(index - first, host) for index, host in reversed(chain)]
 
 
-def _chain_noise_ns(chain: Sequence[tuple[int, int]]) -> float:
-    """First guess of the stamps' noise: residuals of a line through the chain, beside the prior."""
+def _chain_noise_ns(chain: Sequence[tuple[int, int]], edges: Sequence[int]) -> float:
+    """First guess of the stamps' noise: residuals of a line through the chain, beside the prior.
+
+    The chain was chosen for being even; the other edges seen near the line (1.48 MAD) tell whether the stamps are.
+    """
     seconds = np.array([index for index, _ in chain], dtype=np.float64)
     phase = np.array([host - chain[0][1] - index * SECOND_NS for index, host in chain], dtype=np.float64)
-    residual = phase - np.polyval(np.polyfit(seconds, phase, 1), seconds)
-    return math.sqrt((float(residual @ residual) + 2 * FIRST_NOISE_NS**2) / len(chain))
+    line = np.polyfit(seconds, phase, 1)
+    residual = phase - np.polyval(line, seconds)
+    chosen = math.sqrt((float(residual @ residual) + 2 * FIRST_NOISE_NS**2) / len(chain))
+    since = np.array(edges, dtype=np.int64) - chain[0][1]
+    whole = np.rint(since / SECOND_NS)
+    off = np.abs(since - whole * SECOND_NS - np.polyval(line, whole))
+    near = off[off < NOISY_TOLERANCE_NS]
+    return FIRST_NOISE_FACTOR * max(chosen, 1.4826 * float(np.median(near)))
 
 
 class EdgeTrain:
     """A locked 1 Hz train with its line, its label and its history."""
 
-    def __init__(self, chain: Sequence[tuple[int, int]], *, keep_history: bool) -> None:
-        """chain: (index, host ns) of its first edges, as `find_chain` gives them."""
+    def __init__(self, chain: Sequence[tuple[int, int]], edges: Sequence[int], *, keep_history: bool) -> None:
+        """chain: (index, host ns) of its first edges, as `find_chain` gives them; edges: all seen of late."""
         self.anchor_ns = chain[0][1]
         self.labeller = Labeller()
         self.refused_in_a_row = 0
@@ -74,7 +86,7 @@ class EdgeTrain:
         self._index = array("q")
         self._doubt = array("b")
         self._numbers = array("d")  # KNOT_NUMBERS a knot
-        self.bank = LineBank(0, 0.0, _chain_noise_ns(chain))
+        self.bank = LineBank(0, 0.0, _chain_noise_ns(chain, edges))
         self._remember()
         for index, host in chain[1:]:
             self._take(index, host)
@@ -104,7 +116,8 @@ class EdgeTrain:
             return "duplicate" if index == knot.index else "backwards"
         phase = float(host_ns - self.anchor_ns - index * SECOND_NS)
         sigma = math.sqrt(knot.variance_at(index) + self.bank.noise_ns**2)
-        gate = max(GATE_FLOOR_NS, GATE_SIGMAS * sigma) * min(float(index - knot.index), GATE_MISSED_MAX)
+        floor = FIRST_GATE_FLOOR_NS if self.used < FIRST_EDGES else GATE_FLOOR_NS
+        gate = max(floor, GATE_SIGMAS * sigma) * min(float(index - knot.index), GATE_MISSED_MAX)
         if abs(phase - knot.phase_at(index)) > gate:
             self.refused_in_a_row += 1
             return "off_prediction"

@@ -15,6 +15,11 @@ BASIS_RANK = {"": 0, "vote": 1, "wall_clock": 2, "bound": 3}
 WALL_FRACTION_S = 0.3  # a wall clock this far off the edges' whole second decides nothing
 
 
+def outranks(verdict: Verdict, basis: Verdict) -> bool:
+    """Whether a verdict may move a label that rests on another: only what is bound to its edge may."""
+    return verdict.basis == "bound" and basis.basis != "bound"
+
+
 class LabelKeeper:
     """Applies what the voters and the wall clock say to the labels of trains."""
 
@@ -61,7 +66,7 @@ class LabelKeeper:
                 self._events.add_once(host_ns, "messages_late", verdict.ambiguous)
             else:
                 self._confirm(train, host_ns, verdict)
-        elif not verdict.ambiguous and BASIS_RANK[verdict.basis] > BASIS_RANK[labeller.basis.basis]:
+        elif not verdict.ambiguous and outranks(verdict, labeller.basis):
             self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, f"by {verdict.text}")
             labeller.basis = verdict
             self._clear_conflict(train, host_ns)
@@ -98,9 +103,7 @@ class LabelKeeper:
         """A receiver says the leap count that was assumed so far: votes and labels that rest on it move together."""
         seconds = change.now - change.before
         for train in trains:
-            for key, voter in train.labeller.voters.items():
-                if key.utc:
-                    voter.shift(seconds)
+            train.labeller.shift(seconds)
             basis = train.labeller.basis
             if train.labeller.label is not None and basis.leap is not LeapTrust.SAID:
                 self._relabel(train, host_ns, seconds, "for the leap seconds the receiver says")

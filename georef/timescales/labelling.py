@@ -15,6 +15,10 @@ VOTES = 15
 MIN_VOTES = 5
 MAJORITY = 0.8
 SURE_AGE_S = 0.5  # up to this age five votes of one mind are enough
+YOUNG_AGE_S = 0.12  # below this (just after an edge, or a whole second late) only if they are …
+YOUNG_SPREAD_S = 0.02  # … that even, and …
+LEAST_AGE_S = 0.004  # … not impossibly quick
+STRADDLE_MEMORY_S = 600  # a message just before an edge makes those just after it suspect for so many edges
 LATE_AGE_S = 0.7  # a steady delay above this may be one second and a bit less or more
 VOTER_FORGOTTEN_S = 60  # a voter silent for so many edges has no say
 
@@ -82,7 +86,6 @@ class Voter:
         self.key = key
         self.votes: deque[Vote] = deque(maxlen=VOTES)
         self.last_index = -(1 << 62)
-        self.late_offset: int | None = None
         self.offset: int | None = None
         self.late = False
         self.undecided = 0
@@ -103,8 +106,6 @@ class Voter:
         said = LeapTrust.SAID
         moved = [v if v.leap is said else Vote(v.offset + seconds, v.age_s, said) for v in self.votes]
         self.votes = deque(moved, maxlen=VOTES)
-        if self.late_offset is not None:
-            self.late_offset += seconds
         self._count()
 
     def _count(self) -> None:
@@ -120,12 +121,17 @@ class Voter:
         if len(votes) < MIN_VOTES or agreeing < MAJORITY * len(votes):
             return
         ages = sorted(vote.age_s for vote in votes if vote.offset == best)
-        if len(votes) < VOTES and not self.key.bound and (agreeing < len(votes) or ages[-1] > SURE_AGE_S):
+        if len(votes) < VOTES and not self.key.bound and (agreeing < len(votes) or not _surely_aged(ages)):
             return
         self.offset = best
         self.late = not self.key.bound and ages[len(ages) // 2] > LATE_AGE_S
-        if self.late:
-            self.late_offset = best
+
+
+def _surely_aged(ages: list[float]) -> bool:
+    """Whether sorted ages leave no doubt which edge was before, with few votes."""
+    if ages[0] >= YOUNG_AGE_S:
+        return ages[-1] <= SURE_AGE_S
+    return ages[0] >= LEAST_AGE_S and ages[-1] - ages[0] <= YOUNG_SPREAD_S
 
 
 class Labeller:
@@ -137,6 +143,7 @@ class Labeller:
         self.verdict = Verdict()
         self.basis = Verdict()  # the verdict that gave the label
         self.conflict = ""
+        self._late_votes: dict[int, int] = {}  # offset: the last edge a message named just before the next one
 
     def vote(self, key: VoterKey, index: int, vote: Vote) -> None:
         """Take one vote for edge `index`."""
@@ -144,6 +151,18 @@ class Labeller:
         if voter is None:
             voter = self.voters[key] = Voter(key)
         voter.add(index, vote)
+        if vote.age_s > LATE_AGE_S and not key.bound:
+            self._late_votes[vote.offset] = index
+            if len(self._late_votes) > VOTES:
+                del self._late_votes[min(self._late_votes, key=self._late_votes.__getitem__)]
+
+    def shift(self, seconds: int) -> None:
+        """Move all votes that rest on a leap count no receiver had said: now one has."""
+        for key, voter in self.voters.items():
+            if key.utc:
+                voter.shift(seconds)
+        if self.voters and all(key.utc for key in self.voters):
+            self._late_votes = {offset + seconds: index for offset, index in self._late_votes.items()}
 
     def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:
         """The verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
@@ -151,21 +170,32 @@ class Labeller:
         bound = [v for v in sure if v.key.bound]
         if bound and all(v.offset == bound[0].offset for v in bound):
             return self._by(bound[0], "bound")
+        wall = wall_offset if wall_offset in self._wall_may_say() else None
         doubt = self._doubt(sure, bound, index)
         if self.label is None and not doubt and sure and self._somebody_else(sure[0], index):
             return Verdict()
         fresh = [v for v in sure if not v.late]
         if not doubt and fresh:
             gps_scale = any(not v.key.utc for v in fresh)
-            if wall_offset is None or wall_offset == fresh[0].offset or (gps_scale and wall_leap is not LeapTrust.SAID):
+            if (
+                wall is None
+                or wall == fresh[0].offset
+                or self.label == fresh[0].offset
+                or (gps_scale and wall_leap is not LeapTrust.SAID)
+            ):
                 return self._by(fresh[0], "vote")
-            doubt = f"messages and the disciplined wall clock differ by {wall_offset - (fresh[0].offset or 0)} s"
+            doubt = f"messages and the disciplined wall clock differ by {wall - (fresh[0].offset or 0)} s"
         if not doubt:
             return Verdict()
-        if wall_offset is not None and any(v.offset is not None or v.undecided for v in self.voters.values()):
-            return Verdict(wall_offset, "", "wall_clock", None, wall_leap)
+        if wall is not None:
+            return Verdict(wall, "", "wall_clock", None, wall_leap)
         late = bool(sure) and all(v.late and v.offset == sure[0].offset for v in sure)
         return Verdict(sure[0].offset if sure else None, doubt, late=late)
+
+    def _wall_may_say(self) -> set[int]:
+        """Offsets a wall clock may decide for: what some message said, or what it meant if it came a second late."""
+        said = {vote.offset for voter in self.voters.values() for vote in voter.votes}
+        return said | {offset + 1 for offset in said}
 
     def _somebody_else(self, sure: Voter, index: int) -> bool:
         """Whether a voter not yet sure last said another second: a first label waits for it."""
@@ -189,8 +219,9 @@ class Labeller:
             if other.offset != first.offset:
                 difference = (other.offset or 0) - (first.offset or 0)
                 return f"{_name(other)} is {difference:+d} s against {_name(first)}"
-            if not other.late and other.late_offset is not None and other.late_offset != other.offset:
-                return f"{_name(other)} changed its second after coming late"
+        straddled = self._late_votes.get((first.offset or 0) + 1)
+        if self.label is None and not bound and straddled is not None and index - straddled <= STRADDLE_MEMORY_S:
+            return f"{_name(first)} comes just after an edge, others came just before it"
         if not bound and all(v.late for v in sure):
             return f"{_name(first)} comes steadily more than {LATE_AGE_S} s after its edge"
         return ""

@@ -27,7 +27,7 @@ from georef.timescales.gps_time import (
     whole_gps_ns,
 )
 from georef.timescales.history import gps_of_trains
-from georef.timescales.label_keeper import BASIS_RANK, LabelKeeper
+from georef.timescales.label_keeper import LabelKeeper, outranks
 from georef.timescales.labelling import LeapTrust, Verdict, Vote, VoterKey
 from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds
 
@@ -146,7 +146,7 @@ class PpsClock:
                 self._refuse_edge("no_train_yet")
             return
         self._edges_unlocked = 0
-        train = EdgeTrain(chain, keep_history=self._keep_history)
+        train = EdgeTrain(chain, self._edges, keep_history=self._keep_history)
         self._tell_recent_messages(train)
         if self._train is None or self._train.labeller.label is None:
             if self._train is not None:
@@ -174,8 +174,7 @@ class PpsClock:
             return
         held = _gps_float(old, host)
         jump_ns = (verdict.offset + new.index_at(host) - held) * SECOND_NS
-        rank = BASIS_RANK[verdict.basis] > BASIS_RANK[old.labeller.basis.basis]
-        if abs(jump_ns) >= SAME_SECOND_NS and not rank:
+        if abs(jump_ns) >= SAME_SECOND_NS and not outranks(verdict, old.labeller.basis):
             self._labels.set_conflict(
                 old, host, f"since the edges changed messages are {jump_ns / SECOND_NS:+.1f} s off"
             )
