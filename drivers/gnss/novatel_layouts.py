@@ -40,7 +40,7 @@ class ShortHeader(NamedTuple):
 
 SYNC_LONG = b"\xaa\x44\x12"
 SYNC_SHORT = b"\xaa\x44\x13"
-LONG_HEADER = struct.Struct("<3xBHbBHHBBHIIHH")
+LONG_HEADER = struct.Struct("<3xBHBBHHBBHIIHH")
 SHORT_HEADER = struct.Struct("<3xBHHI")
 CRC_BYTES = 4
 RESPONSE_BIT = 0x80  # of message_type: the answer to a command, no log

@@ -30,7 +30,7 @@ from georef.records import (
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 WEEK_NS = 604_800 * NS_PER_S
-GREATEST_WEEK = 0xFFFF  # a header's field has 16 bits; more in a body is no week
+GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_PPS_ERROR_S = 1e-3  # a clock offset beyond this is not the offset of a steered PPS
 GREATEST_LEAP_S = 255  # 8 bits in the navigation message
 IMU_ERROR_BIT = 1  # of RAWIMUX's IMU info
@@ -49,7 +49,7 @@ class Header(NamedTuple):
     @property
     def time_valid(self) -> bool:
         """Whether the receiver vouches for the time; a short header says nothing against it but a missing week."""
-        return self.week > 0 and (self.time_status is None or self.time_status in tables.TIME_VALID)
+        return 0 < self.week <= GREATEST_WEEK and (self.time_status is None or self.time_status in tables.TIME_VALID)
 
     def tag(self, earlier_ns: int = 0) -> TimeTag:
         """The header's GPS time less ``earlier_ns``."""
@@ -87,7 +87,7 @@ class State:
 
 def time_message(state: State, header: Header, time: nov.Time) -> list[Record | Row]:
     """TIME names the edge its own header says; the PPS is early by what the receiver's clock is ahead."""
-    if header.week == 0:
+    if not state.has_week(header.week):
         return []
     says_leap = time.utc_status == tables.UTC_VALID and abs(time.utc_offset_s) < GREATEST_LEAP_S
     leap = round(-time.utc_offset_s) if says_leap else None
@@ -285,7 +285,7 @@ def ins_config(state: State, header: Header, config: nov.InsConfig) -> list[Reco
 def gps_tag(week: int, time_ns: int) -> TimeTag:
     """GPS time of week, carried over the week's end; no week where the receiver has none."""
     weeks, time_ns = divmod(time_ns, WEEK_NS)
-    return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if week > 0 else None)
+    return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if 0 < week <= GREATEST_WEEK else None)
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -1,0 +1,61 @@
+"""NovAtel's own decoder's output (novatel-edie, ASCII logs), read for comparison; and the recordings beside it."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+from dataclasses import dataclass
+from pathlib import Path
+
+FIXTURES = Path(__file__).parents[2] / "fixtures/novatel"
+NS_PER_S = 1_000_000_000
+WEEK_NS = 604_800 * NS_PER_S
+
+
+def recording(name: str) -> bytes:
+    """A recording's bytes, whether it is stored gzipped or not."""
+    plain, packed = FIXTURES / name, FIXTURES / f"{name}.gz"
+    return plain.read_bytes() if plain.exists() else gzip.decompress(packed.read_bytes())
+
+
+@dataclass(frozen=True)
+class AsciiLog:
+    """One ASCII log.
+
+    Attributes:
+        name: without the format letter: ``BESTPOS``.
+        status: GPS reference time status; empty in a short header.
+        week, seconds: of the header.
+        fields: everything after the semicolon, as text.
+    """
+
+    name: str
+    status: str
+    week: int
+    seconds: float
+    fields: tuple[str, ...]
+
+    @property
+    def time_ns(self) -> int:
+        """Nanoseconds of the week in the header."""
+        return round(self.seconds * 1000) * 1_000_000
+
+    def numbers(self, *places: int) -> list[float]:
+        """Fields as numbers, places counted from 0."""
+        return [float(self.fields[place]) for place in places]
+
+
+def ascii_logs(name: str, *wanted: str) -> list[AsciiLog]:
+    """The logs of an expectation file, those named only."""
+    text = gzip.decompress((FIXTURES / f"{name}.edie.ascii.gz").read_bytes()).decode("ascii", "replace")
+    logs: list[AsciiLog] = []
+    for line in text.splitlines():
+        head, _, rest = line.partition(";")
+        header = head.split(",")
+        log = header[0][1:].removesuffix("_2").removesuffix("A")
+        if log not in wanted or head[0] not in "#%":
+            continue
+        status, week, seconds = ("", header[1], header[2]) if head[0] == "%" else (header[4], header[5], header[6])
+        fields = next(csv.reader([rest.rpartition("*")[0]]))
+        logs.append(AsciiLog(log, status, int(week), float(seconds), tuple(fields)))
+    return logs
