@@ -1,0 +1,140 @@
+"""The unit and what is installed beside it, put before systemd's own checkers."""
+
+from __future__ import annotations
+
+import configparser
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SYSTEMD = Path(__file__).resolve().parent.parent / "systemd"
+UNIT = SYSTEMD / "swathd.service"
+
+
+def run_tool(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run one of systemd's tools; its absence is a failure that says what to install."""
+    if shutil.which(str(command[0])) is None:
+        pytest.fail(f"{command[0]} is missing: apt-get install systemd")
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=60, check=False)
+
+
+def unit_values(key: str) -> list[str]:
+    """All values of a key of the unit, in order."""
+    return re.findall(rf"^{key}=(.*)$", UNIT.read_text(), flags=re.MULTILINE)
+
+
+@pytest.fixture
+def unit_with_program(tmp_path: Path) -> Path:
+    """The unit with a program that exists, because the checker looks for it."""
+    program = tmp_path / "opt/swath/bin/swath"
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    unit = tmp_path / "swathd.service"
+    unit.write_text(UNIT.read_text().replace("/opt/swath", str(tmp_path / "opt/swath")))
+    return unit
+
+
+def test_unit_is_without_fault(unit_with_program: Path) -> None:
+    found = run_tool("systemd-analyze", "verify", "--man=no", unit_with_program)
+    assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
+
+
+def test_the_checker_notices_an_unknown_key(unit_with_program: Path) -> None:
+    unit_with_program.write_text(unit_with_program.read_text().replace("WatchdogSec=", "WatchdogSecs="))
+    assert "WatchdogSecs" in run_tool("systemd-analyze", "verify", "--man=no", unit_with_program).stderr
+
+
+def test_exposure_is_at_most_two() -> None:
+    found = run_tool("systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", UNIT)
+    level = re.search(r"Overall exposure level for swathd\.service: ([0-9.]+)", found.stdout)
+    assert level is not None, found.stderr
+    assert float(level.group(1)) <= 2.0
+    assert found.returncode == 0
+
+
+def test_no_capability_and_no_root() -> None:
+    assert unit_values("CapabilityBoundingSet") == [""]
+    assert unit_values("AmbientCapabilities") == [""]
+    assert unit_values("NoNewPrivileges") == ["yes"]
+    assert unit_values("User") == ["swath"]
+
+
+def test_a_wrong_configuration_is_not_retried_and_everything_else_is() -> None:
+    assert unit_values("RestartPreventExitStatus") == ["2"]
+    assert unit_values("Restart") == ["always"]
+    assert unit_values("StartLimitIntervalSec") == ["0"]
+
+
+def test_the_repairing_child_may_become_idle_and_the_clock_may_be_read() -> None:
+    """What the recorder calls beyond the ordinary is let through by name; the last filter line wins."""
+    last = unit_values("SystemCallFilter")[-1].split()
+    assert set(last) >= {"adjtimex", "ioprio_set", "setpriority", "sched_setscheduler"}
+
+
+def test_users_are_created(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    found = run_tool("systemd-sysusers", f"--root={tmp_path}", SYSTEMD / "sysusers/swath.conf")
+    assert found.returncode == 0, found.stderr
+    assert re.search(
+        r"^swath:[^:]*:\d+:\d+:Swath recorder:/var/lib/swath:", (tmp_path / "etc/passwd").read_text(), re.M
+    )
+    assert re.search(r"^dialout:[^:]*:\d+:swath$", (tmp_path / "etc/group").read_text(), re.M)
+
+
+def test_directories_are_created(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    run_tool("systemd-sysusers", f"--root={tmp_path}", SYSTEMD / "sysusers/swath.conf")
+    found = run_tool("systemd-tmpfiles", "--create", f"--root={tmp_path}", SYSTEMD / "tmpfiles/swath.conf")
+    assert (found.returncode, found.stderr) == (0, "")
+    assert (tmp_path / "var/lib/swath").stat().st_mode & 0o777 == 0o750
+    assert (tmp_path / "etc/swath").is_dir()
+
+
+def test_can_interfaces_come_up_at_the_configured_rate() -> None:
+    network = configparser.ConfigParser()
+    network.optionxform = str  # type: ignore[assignment,method-assign]
+    network.read(SYSTEMD / "network/80-swath-can.network")
+    assert network["Match"]["Type"] == "can"
+    assert network["CAN"] == {"BitRate": "1000000", "RestartSec": "100ms"}
+
+
+def test_receive_buffers_may_be_as_large_as_scanners_need() -> None:
+    text = (SYSTEMD / "sysctl/90-swath.conf").read_text()
+    assert re.search(r"^net\.core\.rmem_max = 67108864$", text, re.M)
+
+
+def test_the_wall_clock_is_stepped_at_start_only() -> None:
+    lines = (SYSTEMD / "chrony/swath.conf").read_text().splitlines()
+    assert [line for line in lines if not line.startswith("#")] == ["makestep 1 3", "maxslewrate 100"]
+
+
+# man udev: KEY op "value", the operators each key takes
+_UDEV_TERM = re.compile(
+    r'(?P<key>(?:SUBSYSTEM|KERNEL|DRIVER|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|TAG|RUN))(?P<op>==|!=|\+=|=)"[^"]*"'
+)
+
+
+def _udev_rules() -> list[str]:
+    lines = (SYSTEMD / "udev/90-swath.rules").read_text().splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("rule", _udev_rules())
+def test_udev_rule_matches_and_assigns(rule: str) -> None:
+    terms = rule.split(", ")
+    matches = [_UDEV_TERM.fullmatch(term) for term in terms]
+    assert all(matches), rule
+    operators = [match.group("op") for match in matches if match]
+    assert operators == sorted(operators, key=lambda op: op not in ("==", "!=")), "matches stand before assignments"
+    assert any(op in ("=", "+=") for op in operators), "a rule that does nothing"
+
+
+def test_example_rules_are_as_good_as_working_ones() -> None:
+    lines = (SYSTEMD / "udev/90-swath.rules").read_text().splitlines()
+    examples = [line[1:] for line in lines if line.startswith("#SUBSYSTEM")]
+    assert len(examples) == 2
+    assert all(_UDEV_TERM.fullmatch(term) for line in examples for term in line.split(", "))
