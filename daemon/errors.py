@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from enum import IntEnum
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 
 
 class ExitCode(IntEnum):
@@ -28,5 +31,10 @@ class ConfigError(UserError):
     """The configuration is wrong; one line an error: file, key, what was got, what would be right."""
 
     def __init__(self, lines: str | list[str]) -> None:
-        self.lines = [lines] if isinstance(lines, str) else list(lines)
+        self.lines = [one_line(line) for line in ([lines] if isinstance(lines, str) else lines)]
         super().__init__("\n".join(self.lines), ExitCode.USAGE)
+
+
+def one_line(text: str) -> str:
+    """A text that may come from anywhere as one line without control characters."""
+    return _CONTROL.sub(" ", text)

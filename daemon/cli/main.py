@@ -20,7 +20,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
@@ -152,7 +152,7 @@ def _write_traceback(error: Exception) -> Path | None:
 
 def _say(*lines: str) -> None:
     for line in lines:
-        print(f"swath: {line}", file=sys.stderr)
+        print(f"swath: {one_line(line)}", file=sys.stderr)
 
 
 if __name__ == "__main__":

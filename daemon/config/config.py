@@ -172,7 +172,7 @@ class Config:
         found = [("config.toml", "application/toml", self.text.encode())]
         for _, name, table in self.device_tables():
             for key, path in self.files_of(table).items():
-                attachment = _attachment_name(key, name, path)
+                attachment = attachment_name(key, name, path)
                 if all(attachment != other for other, _, _ in found):
                     found.append((attachment, _media_type(path), path.read_bytes()))
         return found
@@ -183,7 +183,7 @@ def plain_table(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[str, Any]
     return table.model_dump()
 
 
-def _attachment_name(key: FileKey, device: str, path: Path) -> str:
+def attachment_name(key: FileKey, device: str, path: Path) -> str:
     if key == "dbc":
         return f"dbc/{path.name}"
     suffix = path.suffix if key == "geometry" else ".toml"

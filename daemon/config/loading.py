@@ -68,7 +68,18 @@ def parse_config(text: str, path: Path) -> Config:
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not TOML: {str(error).splitlines()[0]}") from error
+        raise ConfigError(f"{path}: not TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: not a configuration: nested too deeply") from error
+    return validate(table, path, text)
+
+
+def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
+    """Validate a parsed configuration; ``text`` is what it was parsed from.
+
+    Raises:
+        ConfigError: all that is wrong with it, one line each.
+    """
     try:
         tables = Tables.model_validate(table)
     except ValidationError as error:

@@ -105,8 +105,8 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
     if len(head) < _HEAD.size:
         return True
     opcode, length = _HEAD.unpack(head)
-    fits: bool = offset + _HEAD.size + length <= size
-    return opcode in _OPCODES and length <= MAX_RECORD_BYTES and not fits
+    beyond: bool = offset + _HEAD.size + length > size
+    return opcode in _OPCODES and length <= MAX_RECORD_BYTES and beyond
 
 
 def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
@@ -135,7 +135,7 @@ def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
 
 
 def _plausible_chunk(body: bytes) -> bool:
-    _, _, _, _, name_length = _CHUNK_HEAD.unpack_from(body)
+    name_length: int = _CHUNK_HEAD.unpack_from(body)[4]
     at = _CHUNK_HEAD.size + name_length
     if name_length > 32 or len(body) < at + 8:
         return False

@@ -1,0 +1,119 @@
+"""``swath info``: what logs hold."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, UserError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Count units only; decode nothing.")] = False,
+) -> None:
+    """Show duration, counts, rates, gaps, losses, time status, events and damage.
+
+    Exit code 1 when units are not accounted for or a part is missing, 4 when data is damaged.
+    """
+    from rich.console import Console
+
+    from daemon.log.format import LogError
+    from daemon.log.reader import open_logs
+    from daemon.statistics import session_statistics
+
+    try:
+        sessions = open_logs(logs)
+        with Console(stderr=True).status("reading"):
+            found = [session_statistics(session, decode=not quick) for session in sessions]
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    if as_json:
+        print(json.dumps({"sessions": found}, indent=2))
+    else:
+        console = Console()
+        for numbers in found:
+            _print_session(console, numbers)
+    if any(numbers["damage"] for numbers in found):
+        raise typer.Exit(int(ExitCode.DAMAGE))
+    if any(numbers["missing_parts"] or _unaccounted(numbers) for numbers in found):
+        raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _unaccounted(numbers: dict[str, Any]) -> int:
+    return sum(int(source["account_errors"]) for source in numbers["sources"].values())
+
+
+def _print_session(console: Console, numbers: dict[str, Any]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
+    console.print(f"[bold]{numbers['session_id']}[/]  {start:%Y-%m-%d %H:%M:%S} UTC, {numbers['duration_s']:.1f} s")
+    parts = f"{len(numbers['parts'])} part{'s' if len(numbers['parts']) != 1 else ''}, {numbers['bytes'] / 1e6:.1f} MB"
+    console.print(f"{parts}, {numbers['software']} on {numbers['host']} ({numbers['origin']})")
+    for number in numbers["missing_parts"]:
+        console.print(f"[red]part {number} is missing[/]")
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for column in ("source", "units", "bytes", "rate/s", "gaps", "longest s", "lost k/q/w", "time", "decoded"):
+        table.add_column(column, justify="left" if column in ("source", "time", "decoded") else "right")
+    for source, values in numbers["sources"].items():
+        table.add_row(*_row(source, values))
+    console.print(table)
+    unaccounted = _unaccounted(numbers)
+    if unaccounted:
+        console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
+    else:
+        console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
+    for event in numbers["last_events"]:
+        console.print(f"  {event['severity']}: {event['source']} {event['code']}: {event['text']}", highlight=False)
+    for damage in numbers["damage"]:
+        messages = "" if damage["messages"] is None else f", {damage['messages']} messages"
+        text = f"{damage['file']} at byte {damage['offset']}: {damage['length']} bytes, {damage['what']}{messages}"
+        console.print(f"[red]damage: {text}[/]", highlight=False)
+    for note in numbers["notes"]:
+        console.print(f"note: {note}", highlight=False)
+
+
+def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
+    lost = values["lost"]
+    losses = f"{lost['lost_kernel']}/{lost['lost_queue']}/{lost['lost_write']}"
+    rate = "" if values["rate_hz"] is None else f"{values['rate_hz']:,.1f}"
+    return (
+        source,
+        f"{values['units']:,}",
+        f"{values['bytes']:,}",
+        rate,
+        str(values["gaps"]),
+        f"{values['longest_gap_s']:.3f}",
+        losses if losses == "0/0/0" else f"[red]{losses}[/]",
+        _time(values),
+        _decoded(values),
+    )
+
+
+def _time(values: dict[str, Any]) -> str:
+    state = values.get("time_state")
+    if state is None:
+        return ""
+    sigma = values["time_sigma_ns"]
+    return f"{state} ±{sigma / 1e3:.1f} µs" if sigma is not None and sigma < 1e6 else str(state)
+
+
+def _decoded(values: dict[str, Any]) -> str:
+    decoded = values.get("decoded")
+    if decoded is None:
+        return ""
+    told = [f"{count:,} {name}" for name, count in sorted(decoded["records"].items(), key=lambda item: -item[1])[:3]]
+    if decoded["bad_checksums"]:
+        told.append(f"{decoded['bad_checksums']} bad checksums")
+    told += [f"{count} {code}" for code, count in decoded["errors"].items()]
+    return ", ".join(told)

@@ -1,0 +1,49 @@
+"""The parsers of a log's sources, made from the configuration and files that are stored in the log itself."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from daemon.config.config import Config, attachment_name, plain_table
+from daemon.config.tables import Tables
+from daemon.log.format import LogError
+from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
+from drivers.core.registry import UnknownProtocolError, find_driver
+
+
+def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
+    """The configuration as it was used; None where the log has none.
+
+    Raises:
+        LogError: it is none of this version's.
+    """
+    stored = attachments.get("config.toml")
+    if stored is None:
+        return None
+    try:
+        text = stored.decode()
+        return Config(Tables.model_validate(tomllib.loads(text)), Path("config.toml"), text)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
+        raise LogError(f"config.toml in the log: {str(error).splitlines()[0]}") from error
+
+
+def stored_parsers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Parser], list[str]]:
+    """A parser a source (``kind/name``), and a line for every source that has none."""
+    config = stored_config(attachments)
+    parsers: dict[str, Parser] = {}
+    troubles: list[str] = []
+    if config is None:
+        return parsers, ["the log holds no configuration: units are counted, not decoded"]
+    for kind, name, table in config.device_tables():
+        files = {key: attachments.get(attachment_name(key, name, path)) for key, path in config.files_of(table).items()}
+        contents: dict[str, bytes] = {key: data for key, data in files.items() if data is not None}
+        settings = DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
+        try:
+            parsers[settings.source] = find_driver(kind, table.protocol).make_parser(settings)
+        except (UnknownProtocolError, DriverSettingsError) as error:
+            troubles.append(f"{settings.source}: {error}")
+    return parsers, troubles
