@@ -112,6 +112,9 @@ class ImuConfig(Section):
     transport: Text = Field(description="can:<interface>:<channel>?…, serial:… or gnss:<name> (inside that stream)")
     protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
     dbc: Text | None = Field(None, description="the DBC file, relative to this file")
+    imu_type: Text | None = Field(
+        None, description="novatel: the IMU as INSCONFIG names it (HG1900_CA50), where its stream does not say it"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
     rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
     tick_hz: float = Field(
