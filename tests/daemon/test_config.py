@@ -8,13 +8,16 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from daemon.config import Config, Tables, load_config, parse_config
 from daemon.config.checks import rotation_problem, same_wire
-from daemon.config.loading import MAX_CONFIG_BYTES, _model_in
+from daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
 from daemon.errors import ConfigError, ExitCode, UserError
 from drivers.core.registry import all_drivers
 from drivers.transports.uri import parse_transport
@@ -186,6 +189,43 @@ def test_rotations_of_seven_digits_pass_and_others_do_not() -> None:
     assert "length 0" in str(rotation_problem([[0, 0, 0], [0, 1, 0], [0, 0, 1]]))
 
 
+TOML_VALUES = st.recursive(
+    st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=20)
+    | st.datetimes()
+    | st.sampled_from(
+        ["serial:/dev/ttyS0", "udp:0.0.0.0:1", "can:socketcan:can0", "gnss:rover", "fixed:x", "novatel", 10**400]
+    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+class TestAnything:
+    """Whatever stands in a file, it is valid or said in lines."""
+
+    @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @given(data=st.data())
+    def test_any_value_anywhere_is_valid_or_one_line_each(self, data: st.DataObject) -> None:
+        table = tomllib.loads(AIRCRAFT.read_text())
+        for _ in range(data.draw(st.integers(1, 3))):
+            place: dict[str, Any] = table
+            while True:
+                key = data.draw(st.sampled_from(sorted(place)) if place else st.text(max_size=5))
+                if not isinstance(place.get(key), dict) or (data.draw(st.booleans()) and key != "session"):
+                    break
+                place = place[key]
+            place[data.draw(st.just(key) | st.text(max_size=8))] = data.draw(TOML_VALUES)
+        lines = _findings(table)
+        assert all(line.startswith(f"{AIRCRAFT}: ") and len(line.splitlines()) == 1 for line in lines)
+
+    def test_a_bottomless_file_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"a\.toml: not"):
+            parse_config("a = " + "[" * 100_000, tmp_path / "a.toml")
+
+
 class TestDevices:
     @pytest.fixture
     def config(self) -> Config:
@@ -255,6 +295,16 @@ class TestPage:
                     for attribute in ("ge", "gt", "le", "lt"):
                         bound = getattr(item, attribute, None)
                         assert bound is None or f"{bound:.10g}" in row, f"[{section}] {key}: {bound}"
+
+
+def _findings(table: dict[str, Any]) -> list[str]:
+    """What is wrong with a table; where nothing is, its devices must be usable."""
+    try:
+        config = validate(table, AIRCRAFT, "")
+    except ConfigError as error:
+        return error.lines or ["an error without a line"]
+    assert len(list(config.devices())) == len(config.gnss) + len(config.imu) + len(config.scanner)
+    return []
 
 
 def _sections(model: type[BaseModel], prefix: str) -> dict[str, type[BaseModel]]:
