@@ -96,7 +96,9 @@ def free_ports(count: int) -> list[int]:
 
 def all_units(seconds: float) -> Iterator[TimedUnit]:
     """Everything, in order of time."""
-    streams = [until(stream, seconds) for stream in (gnss_units(), can_units(), scanner_units(seconds), pps_units(seconds))]
+    streams = [
+        until(stream, seconds) for stream in (gnss_units(), can_units(), scanner_units(seconds), pps_units(seconds))
+    ]
     return heapq.merge(*streams, key=lambda unit: unit.time_ns)
 
 

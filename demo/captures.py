@@ -26,12 +26,12 @@ FASTEST_MESSAGE_NS = 50_000_000  # the edge is placed so long before the least d
 
 def gnss_units() -> Iterator[TimedUnit]:
     """NovAtel ProPak6, the chunks as they arrived."""
-    return _from_zero(read_serial(GNSS, GNSS_CHUNKS), lambda unit: "gnss/rover")
+    return _from_zero(read_serial(GNSS, GNSS_CHUNKS), "gnss/rover")
 
 
 def can_units() -> Iterator[TimedUnit]:
     """CANmod.gps between the other traffic of its bus."""
-    return _from_zero(read_candump(CAN), lambda unit: "imu/main")
+    return _from_zero(read_candump(CAN), "imu/main")
 
 
 def scanner_units(seconds: float) -> Iterator[TimedUnit]:
@@ -39,10 +39,10 @@ def scanner_units(seconds: float) -> Iterator[TimedUnit]:
     once = list(read_pcap(SCANNER))
     period_ns = once[-1].time_ns - once[0].time_ns + 1_327_000  # one packet's time behind the last, VLP-16 manual 9.3
     sources = {SCANNER_DATA_PORT: "scanner/top", SCANNER_POSITION_PORT: "scanner/top/aux"}
+    ports = [sources[unit.destination[1]] for unit in once if unit.destination is not None]
     for turn in range(round(seconds * SECOND_NS / period_ns) + 1):
-        for unit in once:
-            time_ns = unit.time_ns - once[0].time_ns + turn * period_ns
-            yield TimedUnit(time_ns, sources[unit.destination_port], unit.data)
+        for unit, source in zip(once, ports, strict=True):
+            yield TimedUnit(unit.time_ns - once[0].time_ns + turn * period_ns, source, unit.data)
 
 
 def pps_units(seconds: float) -> Iterator[TimedUnit]:
@@ -69,8 +69,8 @@ def until(units: Iterable[TimedUnit], seconds: float) -> Iterator[TimedUnit]:
     return takewhile(lambda unit: unit.time_ns < seconds * SECOND_NS, units)
 
 
-def _from_zero(units: Iterable[CapturedUnit], source_of) -> Iterator[TimedUnit]:  # type: ignore[no-untyped-def]
+def _from_zero(units: Iterable[CapturedUnit], source: str) -> Iterator[TimedUnit]:
     first_ns = None
     for unit in units:
         first_ns = unit.time_ns if first_ns is None else first_ns
-        yield TimedUnit(unit.time_ns - first_ns, source_of(unit), unit.data)
+        yield TimedUnit(unit.time_ns - first_ns, source, unit.data)
