@@ -1,0 +1,6 @@
+"""All benchmarks, one after the other: ``python -m benchmarks``; each has options of its own, see its ``--help``."""
+
+from benchmarks import acquire, decode
+
+decode.main()
+acquire.main()

@@ -1,0 +1,291 @@
+"""What decoding costs on one core, beside the machine's own limit measured in the same run.
+
+python -m benchmarks.decode [--repeats 15] [--json FILE]
+
+Figures are medians over the repeats, items a second of this process's own CPU time. The limit beside each figure is
+the least that any program must do with the same bytes: check them where the protocol has a CRC (zlib's), touch them
+once, and copy rows of the output's size once. No decoder can be faster; the share says how far ours is from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+import re
+import statistics
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from drivers.core.frame_kinds import GNSS_KINDS
+from drivers.core.framing import Frame, Framer
+from drivers.core.parser import DeviceSettings, Parser, ParserCounters
+from drivers.imu.canmod_gps import CanmodGpsParser
+from drivers.imu.dbc import DbcParser
+from drivers.scanner.srep import SrepHeader, SrepParser, encode_datagram
+from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
+from drivers.transports.capture_file import read_candump, read_pcap
+from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+BATCH_BYTES = 1 << 20  # a chunk of the log
+NO_RECORDING = re.compile(r"\.(md|json|chk|csv|txt)(\.gz)?$")  # what lies beside the recordings
+READ_BYTES = 4096  # one read of a serial port
+
+
+@dataclass
+class Figure:
+    """One line of the table; rates are items a second of CPU."""
+
+    name: str
+    item: str
+    rate: float
+    target: float | None
+    limit: float
+    limit_is: str
+
+
+def rate(work: Callable[[], object], items: float, repeats: int) -> float:
+    """Median of items a second of CPU time; the work is repeated within a measurement until it takes 30 ms."""
+    work()
+    start = time.process_time()
+    work()
+    rounds = max(1, int(0.03 / max(time.process_time() - start, 1e-6)))
+    spent = []
+    for _ in range(repeats):
+        start = time.process_time()
+        for _ in range(rounds):
+            work()
+        spent.append((time.process_time() - start) / rounds)
+    return items / statistics.median(spent)
+
+
+def batches_of(units: ByteRows) -> list[ChunkBatch]:
+    """Rows as the log hands them over: 1 MiB a batch, 31 bytes of message header before each row."""
+    n, length = units.shape
+    table = np.zeros((n, length + 31), dtype=np.uint8)
+    table[:, 31:] = units
+    step = max(1, BATCH_BYTES // (length + 31))
+    host = np.arange(n, dtype=np.int64) * 1_000_000
+    return [ChunkBatch("bench", host[at : at + step], table[at : at + step, 31:]) for at in range(0, n, step)]
+
+
+def copy_rows(dtype: np.dtype[np.void], count: int) -> Callable[[], object]:
+    """Work that copies so many rows of the output once, from and to memory that is already there."""
+    source, target = np.zeros(count * dtype.itemsize, np.uint8), np.zeros(count * dtype.itemsize, np.uint8)
+    return lambda: np.copyto(target, source)
+
+
+def count_rows(records: list[Record]) -> int:
+    return sum(len(record.rows) for record in records if isinstance(record, ScannerReturns | ImuSamples))
+
+
+def decode_all(make: Callable[[], Parser], batches: list[ChunkBatch]) -> int:
+    """Rows a fresh parser gives for all batches, each batch's let go before the next."""
+    parser = make()
+    return sum(count_rows(parser.feed_batch(batch)) for batch in batches)
+
+
+# --- scanners -------------------------------------------------------------------------------------------------------
+
+
+def srep_units(pulses: int, slots: int, second_share: float) -> ByteRows:
+    """About 4 MB of datagrams: 200 kHz, every pulse with a first return, a share of them with further ones."""
+    random = np.random.default_rng(1)
+    header = SrepHeader(flags=5, pps_count=1, pps_ticks=1, prf_mhz=200_000_000)
+    length = len(encode_datagram(header, np.zeros(pulses), np.zeros(pulses), np.ones((pulses, slots))))
+    units = np.empty((4_000_000 // length, length), dtype=np.uint8)
+    number = np.arange(pulses)
+    for at in range(len(units)):
+        ranges = random.integers(5_000_000, 15_000_000, (pulses, slots))
+        ranges[:, 1:] *= random.random((pulses, slots - 1)) < second_share
+        one = replace(header, sequence=at, first_ticks=at * pulses * 50)
+        data = encode_datagram(one, number * 50, (at * pulses + number) % 524_288, ranges, 800, 450)
+        units[at] = np.frombuffer(data, dtype=np.uint8)
+    return units
+
+
+def measure_srep(repeats: int) -> Iterator[Figure]:
+    """SREP in three shapes."""
+    polygon = {"type": "polygon", "facets": 4}
+    for name, shape, config in (
+        ("SREP, 1 return a pulse", (512, 1, 0.0), {}),
+        ("SREP, 2 slots, 30 % used", (340, 2, 0.3), {}),
+        ("SREP, 2 slots, polygon", (340, 2, 0.3), {"geometry": polygon}),
+    ):
+        settings = DeviceSettings("scanner/bench", {"mirror_factor": 2.0, **config})
+        units = srep_units(*shape)
+        batches = batches_of(units)
+        rows = decode_all(lambda settings=settings: SrepParser(settings), batches)  # type: ignore[misc]
+        copy = copy_rows(RETURN_DTYPE, rows)
+
+        def least(units: ByteRows = units, copy: Callable[[], object] = copy) -> None:
+            for unit in units:
+                zlib.crc32(unit)
+            copy()
+
+        decode = rate(lambda s=settings, b=batches: decode_all(lambda: SrepParser(s), b), rows, repeats)  # type: ignore[misc]
+        yield Figure(name, "returns", decode, 15e6, rate(least, rows, repeats), "zlib.crc32 + copy of the rows")
+
+
+def velodyne_units(name: str, step_us: float) -> ByteRows:
+    """The data packets of a recording, several times over, with stamps that go on."""
+    packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
+    units = np.tile(once, (max(1, 3600 // len(once)), 1))
+    units.view(PACKET_DTYPE)["stamp_us"][:, 0] = np.rint(np.arange(len(units)) * step_us)
+    return units
+
+
+def measure_velodyne(repeats: int) -> Iterator[Figure]:
+    """VLP-16, both return modes, real packets."""
+    for name, recording, step_us in (
+        ("VLP-16, strongest return", "mrpt_vlp16_gps.pcap.gz", 1327.104),
+        ("VLP-16, dual return", "nebula_vlp16.pcap.gz", 663.552),
+    ):
+        units = velodyne_units(recording, step_us)
+        batches = batches_of(units)
+        make = lambda: VelodyneParser(DeviceSettings("scanner/bench"))  # noqa: E731
+        rows = decode_all(make, batches)
+        copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+
+        def least(units: ByteRows = units, taken: ByteRows = taken, copy: Callable[[], object] = copy) -> None:
+            np.copyto(taken, units)
+            copy()
+
+        decode = rate(lambda m=make, b=batches: decode_all(m, b), rows, repeats)  # type: ignore[misc]
+        yield Figure(name, "returns", decode, 10e6, rate(least, rows, repeats), "copy of packets and rows")
+
+
+# --- CAN ------------------------------------------------------------------------------------------------------------
+
+
+def imu_units(samples: int = 20_000) -> ByteRows:
+    """Frames of fixtures/config/imu.dbc as a 1 kHz unit sends them: ACC, GYR, SAMPLE, and SYNC each second."""
+    frames = np.zeros((samples, 3), dtype=[("id", "<u4"), ("length", "<u4"), ("data", "u1", 8)])
+    frames["id"], frames["length"] = [257, 258, 256], 6
+    random = np.random.default_rng(1)
+    frames["data"][:, :2] = random.integers(0, 256, (samples, 2, 8))
+    frames["data"][:, 2, :4] = (np.arange(samples, dtype="<u4") * 1000).view(np.uint8).reshape(-1, 4)
+    units = frames.reshape(-1).view(np.uint8).reshape(-1, 16)
+    sync = np.zeros((1, 16), dtype=np.uint8)
+    sync[0, :2], sync[0, 4] = [3, 1], 4
+    return np.insert(units, np.arange(0, len(units), 3000), sync, axis=0)
+
+
+def measure_can(repeats: int) -> Iterator[Figure]:
+    """CAN frames a second through a DBC: a bus of an IMU alone, and a car's bus with a CANmod.gps on it."""
+    signals = {
+        "specific_force": [f"ACC.acc_{axis}" for axis in "xyz"],
+        "angular_rate": [f"GYR.gyr_{axis}" for axis in "xyz"],
+        "sample_ticks": "SAMPLE.ticks",
+        "pps_ticks": "SYNC.pps_ticks",
+        "temperature": "SAMPLE.temperature",
+    }
+    dbc = {"dbc": (FIXTURES / "config" / "imu.dbc").read_bytes()}
+    table = {"dbc": "imu.dbc", "tick_hz": 1_000_000, "group": "last", "signals": signals}
+    settings = DeviceSettings("imu/bench", table, dbc)
+    log = FIXTURES / "canmod-gps" / "2F6913DB_00000004_00000001_candump.log.gz"
+    frames = b"".join(unit.data for unit in read_candump(log))
+    car = np.tile(np.frombuffer(frames, dtype=np.uint8).reshape(-1, 16), (10, 1))
+    makers: list[tuple[str, Callable[[], Parser], ByteRows]] = [
+        ("CAN, dbc, 3 frames a sample", lambda: DbcParser(settings), imu_units()),
+        ("CAN, canmod-gps recording", lambda: CanmodGpsParser(DeviceSettings("imu/bench")), car),
+    ]
+    for name, make, units in makers:
+        batches = batches_of(units)
+        copy, taken = copy_rows(IMU_DTYPE, decode_all(make, batches)), np.empty(units.shape, np.uint8)
+
+        def least(units: ByteRows = units, taken: ByteRows = taken, copy: Callable[[], object] = copy) -> None:
+            np.copyto(taken, units)
+            copy()
+
+        # parsers are made once here: reading a DBC file is no part of decoding frames
+        parser = make()
+        decode = rate(
+            lambda p=parser, b=batches: [p.feed_batch(batch) for batch in b],  # type: ignore[misc]
+            len(units),
+            repeats,
+        )
+        yield Figure(name, "frames", decode, 1e6, rate(least, len(units), repeats), "copy of frames and rows")
+
+
+# --- serial streams -------------------------------------------------------------------------------------------------
+
+
+def frames_in(path: Path) -> list[Frame]:
+    data = path.read_bytes()
+    framer = Framer(GNSS_KINDS, ParserCounters())
+    return framer.feed(gzip.decompress(data) if path.suffix == ".gz" else data, 0) + framer.close()
+
+
+def mixed_stream() -> tuple[bytes, int]:
+    """Frames of real UBX, NMEA and RTCM3 recordings dealt out in turn, 2 MB, and how many frames it holds."""
+    recordings = [path for kind in ("ubx", "nmea", "rtcm3") for path in sorted((FIXTURES / kind).glob("*"))]
+    by_kind: dict[str, list[bytes]] = {}
+    for path in recordings:
+        if not NO_RECORDING.search(path.name):
+            for frame in frames_in(path):
+                by_kind.setdefault(frame.kind, []).append(frame.data)
+    if set(by_kind) != {"ubx", "nmea", "rtcm3"}:
+        raise SystemExit(f"fixtures hold frames of {sorted(by_kind)} only; want ubx, nmea and rtcm3")
+    pieces: list[bytes] = []
+    size, turn = 0, 0
+    while size < 2_000_000:
+        for frames in by_kind.values():
+            pieces.append(frames[turn % len(frames)])
+            size += len(pieces[-1])
+        turn += 1
+    return b"".join(pieces), len(pieces)
+
+
+def measure_framing(repeats: int) -> Iterator[Figure]:
+    """Framing with checksums of the mixed stream, in reads of 4 KiB."""
+    stream, count = mixed_stream()
+    reads = [stream[at : at + READ_BYTES] for at in range(0, len(stream), READ_BYTES)]
+    sync = re.compile(rb"\$|\xb5\x62|\xd3[\x00-\x03]")
+
+    def frame_all() -> int:
+        framer = Framer(GNSS_KINDS, ParserCounters())
+        found = sum(len(framer.feed(read, 0)) for read in reads) + len(framer.close())
+        if found != count:
+            raise SystemExit(f"{found} frames framed of {count}")
+        return found
+
+    def least() -> None:
+        for match in sync.finditer(stream):
+            match.start()
+        zlib.crc32(stream)
+
+    name = f"framing, {len(stream) / count:.0f} bytes a frame"
+    limit = rate(least, len(stream), repeats)
+    yield Figure(name, "bytes", rate(frame_all, len(stream), repeats), 5e6, limit, "re over the syncs + zlib.crc32")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=15, help="measurements a figure, of which the median counts")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    arguments = parser.parse_args()
+    figures = []
+    print(f"{'decoding, one core':<30} {'rate':>10} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
+    for measure in (measure_srep, measure_velodyne, measure_can, measure_framing):
+        for figure in measure(arguments.repeats):
+            figures.append(figure)
+            asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"
+            print(
+                f"{figure.name:<30} {figure.rate / 1e6:>6.1f} M/s {asked:>8} {figure.limit / 1e6:>5.0f} M/s "
+                f"{figure.rate / figure.limit:>6.1%}  {figure.item}; {figure.limit_is}"
+            )
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(figure) for figure in figures], indent=1))
+
+
+if __name__ == "__main__":
+    main()
