@@ -286,7 +286,9 @@ class SrepParser(PacketParser):
         number = np.arange(pulses, dtype=np.uint64)
         shape = (n, pulses)
 
-        def every_pulse(values: NDArray[Any]) -> NDArray[Any]:
+        def every_pulse(values: NDArray[Any]) -> NDArray[Any] | int:
+            if (values == values[0]).all():
+                return int(values[0])
             return np.broadcast_to(values[:, np.newaxis], shape).reshape(-1)
 
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
