@@ -182,6 +182,17 @@ class TestAllWell:
         assert reports["scanner/roof"].problems == []
         assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
 
+    def test_an_imu_inside_a_gnss_stream_reads_along(self, tmp_path: Path) -> None:
+        """A NovAtel SPAN recording: one wire, two devices."""
+        data = (ROOT / "fixtures/novatel/ins1.gps").read_bytes()
+        imu = '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            reports = check(gnss(path, "novatel") + imu, tmp_path)
+        assert list(reports) == ["gnss/rover", "imu/main", "log"]
+        assert reports["imu/main"].records["InsSolution"] > 0
+        assert reports["imu/main"].bytes == reports["gnss/rover"].bytes > 0
+        assert reports["imu/main"].problems == []
+
     def test_the_auxiliary_port_has_its_own_line(self, tmp_path: Path) -> None:
         port, auxiliary = free_udp_port(), free_udp_port()
         with udp_sender(port, srep_datagram), udp_sender(auxiliary, lambda _: bytes(512)):
