@@ -95,9 +95,10 @@ class SocketCanTransport(DescriptorTransport):
     def _why(self, error: OSError) -> str:
         channel = self._channel
         if error.errno == errno.ENETDOWN:
-            bitrate = self._spec.options.get("bitrate", "<bit/s>")
-            return f"{self.name}: {channel} is down; `ip link set {channel} up type can bitrate {bitrate}`"
-        if error.errno == errno.ENODEV:
+            bitrate = self._spec.options.get("bitrate")
+            setting = f" type can bitrate {bitrate}" if bitrate else ""
+            return f"{self.name}: {channel} is down; `ip link set {channel} up{setting}`"
+        if error.errno in (errno.ENODEV, errno.ENXIO):
             return f"{self.name}: {channel} is gone or is no CAN interface; see `ip link show type can`"
         return f"{self.name}: CAN socket failed: {error.strerror}"
 
