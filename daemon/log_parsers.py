@@ -27,7 +27,7 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
     try:
         text = stored.decode()
         return Config(Tables.model_validate(tomllib.loads(text)), Path("config.toml"), text)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValidationError) as error:
         raise LogError(f"config.toml in the log: {str(error).splitlines()[0]}") from error
 
 
