@@ -184,6 +184,7 @@ def plain_table(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[str, Any]
 
 
 def attachment_name(key: FileKey, device: str, path: Path) -> str:
+    """What a device's file is called in a log."""
     if key == "dbc":
         return f"dbc/{path.name}"
     suffix = path.suffix if key == "geometry" else ".toml"
