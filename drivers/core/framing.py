@@ -64,6 +64,10 @@ class FrameKind:
     intact: Callable[[bytes], bool]
     message_name: Callable[[bytes], str]
 
+    def __deepcopy__(self, memo: dict[int, object]) -> FrameKind:
+        """A kind never changes: a parser's copy shares it."""
+        return self
+
 
 def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
     """One group a kind; matches a whole sync, or the beginning of one at the end of the buffer."""

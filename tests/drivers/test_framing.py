@@ -1,0 +1,258 @@
+"""Checksums against other implementations; the framer against every recording, false syncs, cuts and bounds."""
+
+from __future__ import annotations
+
+import functools
+import operator
+import random
+import zlib
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyrtcm import calc_crc24q as crc24q_reference  # type: ignore[import-untyped]
+from pyubx2 import calc_checksum as fletcher_reference
+
+from drivers.core.checksums import (
+    CRC24Q_STEP_BYTES,
+    FLETCHER_STEP_BYTES,
+    crc24q,
+    crc32_novatel,
+    nmea_xor,
+    ubx_fletcher,
+)
+from drivers.core.frame_kinds import (
+    GNSS_KINDS,
+    NMEA_MAX_BYTES,
+    NOVATEL,
+    NOVATEL_SHORT,
+    UBX_MAX_PAYLOAD_BYTES,
+)
+from drivers.core.framing import Frame, FrameKind, Framer
+from drivers.core.parser import StreamParser
+from drivers.gnss.nmea_sentences import encode_sentence
+from drivers.gnss.ubx_messages import encode_frame
+from georef.records import Chunk, Record
+from tests.drivers.harness import check_damage, check_garbage, check_stream
+from tests.drivers.recordings import every_recording, expected, recording
+
+ALL_KINDS = (*GNSS_KINDS, NOVATEL, NOVATEL_SHORT)
+
+
+class FramingParser(StreamParser):
+    """The framer alone, as a parser; keeps the frames unless told not to."""
+
+    def __init__(self, keep: bool = True) -> None:
+        super().__init__()
+        self.framer = Framer(ALL_KINDS, self.counters)
+        self.frames: list[Frame] = []
+        self.keep = keep
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        self._take(self.framer.feed(chunk.data, chunk.host_time_ns))
+        return []
+
+    def close(self) -> list[Record]:
+        self._take(self.framer.close())
+        return []
+
+    def _take(self, frames: list[Frame]) -> None:
+        if self.keep:
+            self.frames += frames
+
+
+def count_frames() -> FramingParser:
+    """For long runs, that copy the parser."""
+    return FramingParser(keep=False)
+
+
+def frames_of(*pieces: bytes) -> FramingParser:
+    """A parser that has taken the pieces, piece i at host time i, and is closed."""
+    parser = FramingParser()
+    for index, piece in enumerate(pieces):
+        parser.feed(Chunk("gnss/test", index, piece))
+    parser.close()
+    return parser
+
+
+# --- checksums ---
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.binary(max_size=300))
+def test_checksums_equal_other_implementations(data: bytes) -> None:
+    assert nmea_xor(data) == functools.reduce(operator.xor, data, 0)
+    assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
+    assert crc24q(data) == crc24q_reference(data)
+
+
+@pytest.mark.parametrize("length", [CRC24Q_STEP_BYTES - 1, CRC24Q_STEP_BYTES, CRC24Q_STEP_BYTES + 1, 1030, 1031, 5000])
+def test_crc24q_of_long_data_joins_its_steps(length: int) -> None:
+    data = random.Random(length).randbytes(length)
+    assert crc24q(data) == crc24q_reference(data)
+
+
+@pytest.mark.parametrize("length", [FLETCHER_STEP_BYTES - 1, FLETCHER_STEP_BYTES, FLETCHER_STEP_BYTES + 1, 30_000])
+def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
+    data = random.Random(length).randbytes(length)
+    assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
+
+
+def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
+    """OEM7 manual, "32-bit CRC": register 0, polynomial 0xEDB88320, low bit first, no inversion."""
+    data = random.Random(3).randbytes(500)
+    register = 0
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0xEDB88320 if register & 1 else 0)
+    assert crc32_novatel(data) == register != zlib.crc32(data)
+    assert crc32_novatel(data + register.to_bytes(4, "little")) == 0
+
+
+# --- every recording ---
+
+# Where others count otherwise. pynmeagps joins some makers' first field to the address (PFEC,GPatt), refuses sentences
+# it does not know or whose fields it cannot type though their checksum is good (FOO, PTNTA cut into a GPGSV, RMC with
+# a wrong speed, polls without fields); UBX configuration and aiding messages are named by class and number here.
+UNCOUNTED_BY_OTHERS = {
+    "furuno_nmea.log": {"PFEC": 2},
+    "isync.log": {"PTNTA": 1},
+    "pygpsdata-nmeafoo1.log": {"FOO": 1},
+    "pygpsdata-nmeafoo2.log": {"FOO": 1, "RMC": 1},
+    "quectel_nmea_poll.log": {"PQTMCFGMSGRATE": 1, "PQTMSN": 1},
+}
+NAMED_BY_NUMBER = ("CFG-", "MGA-", "MON-0a32", "MON-BATCH", "PFEC")
+
+
+def name_here(theirs: str) -> str:
+    """Our name of a message in expected.json."""
+    protocol, _, name = theirs.partition(":")
+    if protocol == "RTCM3":
+        return "RTCM" + name.split("_")[0]
+    return name[2:] if protocol == "NMEA" and not name.startswith("P") and len(name) == 5 else name
+
+
+@pytest.mark.parametrize(("family", "name"), every_recording())
+def test_every_recording_has_the_frames_others_found(family: str, name: str) -> None:
+    data, entry = recording(family, name), expected(family)[name]
+    parser = frames_of(data)
+    counters, scan = parser.counters, entry["frame_scan_own"]
+    kinds = Counter(frame.kind for frame in parser.frames)
+    assert (kinds["ubx"], kinds["rtcm3"], kinds["nmea"]) == (scan["ubx_ok"], scan["rtcm3_crc_ok"], scan["nmea_ok"])
+    assert kinds["novatel"] == kinds["novatel-short"] == 0
+    assert counters.bytes_framed == sum(len(frame.data) for frame in parser.frames)
+    assert counters.bytes == counters.bytes_framed + counters.bytes_skipped == len(data)
+    theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
+    for message, count in entry["messages"].items():
+        theirs[name_here(message)] += count
+    by_name = {key: count for key, count in counters.messages.items() if not key.startswith(NAMED_BY_NUMBER)}
+    assert by_name == {key: count for key, count in theirs.items() if not key.startswith(NAMED_BY_NUMBER)}
+
+
+def test_skipped_bytes_of_broken_files_are_those_that_belong_to_no_frame() -> None:
+    assert frames_of(recording("ubx", "pygpsdata-MIXED3BADCK.log")).counters.bad_checksums == 1
+    assert frames_of(recording("nmea", "pygpsdata-nmeabadck.log")).counters.bad_checksums == 2
+    assert frames_of(recording("ubx", "pygpsdata-BADEOF2.log")).counters.bytes_skipped == 9  # the cut-off third frame
+    assert frames_of(recording("ubx", "pygpsdata-BADHDR.log")).counters.bytes_skipped == 100  # its B5 77
+
+
+# --- false syncs, bounds, arrival ---
+
+GOOD = encode_sentence("GPZDA,120000.00,21,11,2026,00,00")
+FRAME = encode_frame(b"\x01\x22", bytes(20))
+
+
+@pytest.mark.parametrize(
+    "false_start",
+    [
+        b"\xb5b\x01\x07\xff\x1f",  # a length within the bound, so it is waited for
+        b"\xb5b\x01\x07\xff\xff",
+        b"\xd3\x03\xff",
+        b"\xd3",
+        b"\xaaD\x12\x1c\x2a\x00\x02\x20\x00\x50",
+        b"\xaaD\x13\xff",
+        b"$GPGGA,12",
+        b"$",
+        b"$$$$!A!",
+        b"[COM1]<OK\r\n",
+        b"\xb5",
+        b"*00\r\n",
+    ],
+)
+def test_good_frames_inside_a_false_one_are_found(false_start: bytes) -> None:
+    parser = frames_of(false_start + FRAME + GOOD + FRAME)
+    assert [frame.data for frame in parser.frames] == [FRAME, GOOD, FRAME]
+    assert parser.counters.bytes_skipped == len(false_start)
+
+
+@pytest.mark.parametrize("kind", ALL_KINDS, ids=lambda kind: kind.name)
+def test_a_false_sync_holds_back_no_more_than_its_bound(kind: FrameKind) -> None:
+    starts = {
+        "nmea": b"$GPTXT,",
+        "ubx": b"\xb5b\x01\x07" + UBX_MAX_PAYLOAD_BYTES.to_bytes(2, "little"),
+        "rtcm3": b"\xd3\x03\xff",
+        "novatel": b"\xaaD\x12\x40" + bytes(4) + (24 * 1024).to_bytes(2, "little"),
+        "novatel-short": b"\xaaD\x13\xff",
+    }
+    parser = FramingParser()
+    parser.feed(Chunk("gnss/test", 0, starts[kind.name]))
+    filler = b"x" * 64
+    fed = len(starts[kind.name])
+    while parser.counters.bytes_skipped == 0:
+        assert fed <= kind.max_bytes + len(filler)
+        parser.feed(Chunk("gnss/test", 0, filler))
+        fed += len(filler)
+    assert fed >= kind.max_bytes - 64
+
+
+def test_lengths_beyond_the_bound_are_counted_and_not_waited_for() -> None:
+    parser = FramingParser()
+    parser.feed(Chunk("gnss/test", 0, b"\xb5b\x01\x07\x01\x20" + FRAME))
+    assert [frame.data for frame in parser.frames] == [FRAME]
+    assert parser.counters.errors == {"ubx_length_over_bound": 1}
+
+
+def test_a_sentence_longer_than_the_bound_is_no_sentence() -> None:
+    longest = encode_sentence("PTEST," + "x" * (NMEA_MAX_BYTES - 12))
+    assert len(longest) == NMEA_MAX_BYTES
+    assert len(frames_of(longest).frames) == 1
+    assert frames_of(encode_sentence("PTEST," + "x" * NMEA_MAX_BYTES)).frames == []
+
+
+@pytest.mark.parametrize("ending", [b"\r\n", b"\n", b"", b"\r"])
+def test_a_sentence_ends_with_its_line_or_its_checksum(ending: bytes) -> None:
+    sentence = GOOD[:-2]
+    parser = frames_of(sentence + ending + FRAME)
+    taken = b"" if ending == b"\r" else ending
+    assert [frame.data for frame in parser.frames] == [sentence + taken, FRAME]
+
+
+def test_a_frame_arrives_with_its_last_byte() -> None:
+    """Also one that was held back behind a false sync: it keeps the time at which it was there."""
+    false = b"\xb5b\x01\x07\x80\x00"
+    parser = frames_of(b"x", FRAME[:5], FRAME[5:], false, FRAME, GOOD, bytes(200))
+    assert [(frame.host_time_ns, frame.data) for frame in parser.frames] == [(2, FRAME), (4, FRAME), (5, GOOD)]
+
+
+def test_an_empty_stream_closes() -> None:
+    parser = frames_of(b"")
+    assert (parser.counters.bytes, parser.frames) == (0, [])
+
+
+# --- cut and damaged ---
+
+
+@pytest.mark.parametrize("name", ["rtcm3.2.log", "pygpsdata-NTRIP-4076.log", "pygpsdata-MIXED-RTCM3.log"])
+def test_rtcm3_however_it_is_cut(name: str) -> None:
+    outcome = check_stream(count_frames, recording("rtcm3", name))
+    assert sum(outcome.counters["messages"].values()) == sum(expected("rtcm3")[name]["messages"].values())
+
+
+def test_rtcm3_damaged() -> None:
+    check_damage(count_frames, recording("rtcm3", "rtcm3.2.log"))
+
+
+def test_garbage_alone() -> None:
+    check_garbage(count_frames)
