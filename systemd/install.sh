@@ -1,5 +1,6 @@
 #!/bin/sh
-# Installs the recorder on an aircraft's computer, or removes it.   install.sh install|uninstall
+# Installs the recorder on an aircraft's computer, or removes it.   install.sh install|files|uninstall
+#   (files: all but the program, for who builds that by other means)
 #   PREFIX   where the program goes, /opt/swath by default; the unit's paths follow
 #   DESTDIR  a root to install into, for packagers: nothing is then started, created or loaded
 #   PYTHON   the system's Python 3.11 or newer; not one in a home directory, which the service cannot see
@@ -121,6 +122,7 @@ uninstall_all() {
 
 case "${1-}" in
     install) install_all ;;
+    files) install_files ;;
     uninstall) uninstall_all ;;
-    *) fail "use: install.sh install|uninstall" ;;
+    *) fail "use: install.sh install|files|uninstall" ;;
 esac

@@ -1,0 +1,130 @@
+"""What the contracts of import-linter cannot say: names, lists, sizes and what lies in the checkout."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import calib
+import daemon
+import drivers
+import georef
+import sim
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = {"daemon": daemon, "drivers": drivers, "georef": georef, "calib": calib, "sim": sim}
+LARGEST_FILE_BYTES = 2_000_000
+LARGEST_CHECKOUT_BYTES = 30_000_000
+SHARED_OF_GEOREF = {"georef.records", "georef.timescales"}
+PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "calib"}
+
+
+def project() -> dict[str, Any]:
+    """pyproject.toml."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def tracked() -> list[Path]:
+    """Files that git knows, as they lie here."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [path for name in listed.split("\0") if name and (path := ROOT / name).is_file()]
+
+
+def contract(name: str) -> dict[str, Any]:
+    """A contract of import-linter by its name."""
+    (found,) = [one for one in project()["tool"]["importlinter"]["contracts"] if one["name"] == name]
+    return dict(found)
+
+
+def test_top_level_names_are_ours() -> None:
+    """`daemon` and the others are common words: an installed package must not stand before them."""
+    for name, package in PACKAGES.items():
+        assert package.__file__ is not None
+        assert Path(package.__file__) == ROOT / name / "__init__.py"
+
+
+def test_every_package_is_listed_for_installation() -> None:
+    folders = {
+        str(path.parent.relative_to(ROOT)).replace("/", ".")
+        for name in PACKAGES
+        for path in (ROOT / name).rglob("__init__.py")
+    }
+    assert set(project()["tool"]["setuptools"]["packages"]) == folders
+
+
+def test_data_files_of_packages_are_listed_for_installation() -> None:
+    data = project()["tool"]["setuptools"]["package-data"]
+    listed = {path for name in PACKAGES for pattern in data[name] for path in (ROOT / name).glob(pattern)}
+    lying = {path for path in tracked() if path.relative_to(ROOT).parts[0] in PACKAGES and path.suffix != ".py"}
+    assert lying <= listed, f"not installed: {sorted(str(path) for path in lying - listed)}"
+
+
+def test_sim_is_forbidden_every_module_of_georef_but_the_shared_ones() -> None:
+    modules = {
+        f"georef.{path.stem}"
+        for path in (ROOT / "georef").iterdir()
+        if (path.suffix == ".py" and path.stem != "__init__") or (path / "__init__.py").exists()
+    }
+    forbidden = set(contract("sim does not share the mathematics it tests")["forbidden_modules"])
+    assert forbidden == (modules - SHARED_OF_GEOREF) | {"calib"}
+
+
+def test_files_and_checkout_stay_small() -> None:
+    sizes = {path: path.stat().st_size for path in tracked()}
+    assert [str(path) for path, size in sizes.items() if size > LARGEST_FILE_BYTES] == []
+    assert sum(sizes.values()) <= LARGEST_CHECKOUT_BYTES
+
+
+def test_no_file_names_a_place_on_somebodys_computer() -> None:
+    place = re.compile(rb"(?<![\w.$}/~-])/(?:root|work|home|Users)/[\w.-]+")
+    for path in tracked():
+        if "fixtures" in path.relative_to(ROOT).parts:
+            continue  # recordings and their sources say what they say
+        found = place.search(path.read_bytes())
+        assert found is None, f"{path.relative_to(ROOT)}: {found.group().decode() if found else ''}"
+
+
+def test_modules_stay_readable_in_one_sitting() -> None:
+    lines = {
+        str(path.relative_to(ROOT)): path.read_text().count("\n")
+        for path in tracked()
+        if path.suffix == ".py" and path.relative_to(ROOT).parts[0] in PACKAGES
+    }
+    assert {name: count for name, count in lines.items() if count > 400} == {}
+
+
+def test_every_device_has_a_page() -> None:
+    from drivers.core.registry import KINDS, all_drivers
+
+    protocols = {protocol for kind in KINDS for protocol in all_drivers(kind)}
+    pages = {path.stem for path in (ROOT / "docs/devices").glob("*.md")}
+    assert protocols - pages == set()
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    for page in [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}"
+
+
+def test_the_index_names_every_page() -> None:
+    index = (ROOT / "docs/index.md").read_text()
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")} - {"index.md"}
+    assert {page for page in pages if f"]({page})" not in index} == set()
+
+
+def test_importing_the_recorder_loads_nothing_of_processing() -> None:
+    code = (
+        "import sys, daemon.run, drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]; print(*sys.modules)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert "daemon" in loaded
+    assert loaded & PROCESSING_ONLY == set()

@@ -1,0 +1,167 @@
+"""`make install` into a folder, what the installed program can do with nothing else around it, and `make uninstall`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
+PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib")
+PLACED = {
+    "etc/chrony/conf.d/swath.conf",
+    "etc/swath/swath.toml",
+    "usr/lib/sysctl.d/90-swath.conf",
+    "usr/lib/systemd/network/80-swath-can.network",
+    "usr/lib/systemd/system/swathd.service",
+    "usr/lib/sysusers.d/swath.conf",
+    "usr/lib/tmpfiles.d/swath.conf",
+    "usr/lib/udev/rules.d/90-swath.rules",
+    "usr/local/bin/swath",
+}
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install"), pytest.mark.timeout(300)]
+
+
+def make(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run make in the project's folder."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "DESTDIR", "PREFIX"))}
+    command = ["make", "-s", *arguments]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False)
+
+
+def files_below(folder: Path) -> set[str]:
+    """All files and links, relative; the program's own folder only by its name."""
+    found = set()
+    for parent, folders, names in os.walk(folder):
+        if Path(parent) == folder / "opt":
+            found |= {f"opt/{name}" for name in folders}
+            folders.clear()
+        found |= {str((Path(parent) / name).relative_to(folder)) for name in names}
+    return found
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A root with the program installed into it, by any Python that a service could see."""
+    root = tmp_path_factory.mktemp("root")
+    done = make("install", f"DESTDIR={root}", *python_for_services())
+    assert done.returncode == 0, done.stderr
+    return root
+
+
+def python_for_services() -> list[str]:
+    """`PYTHON=` for make install: nothing where the system's Python will do, which is the default."""
+    system = Path("/usr/bin/python3")
+    probe = "import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))"
+    if system.exists() and subprocess.run([system, "-c", probe], capture_output=True, check=False).returncode == 0:
+        return []
+    return ["PYTHON=python3"]
+
+
+def run_installed(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the installed program's Python, away from the source tree."""
+    command = [str(root / "opt/swath/bin/python"), "-I", *arguments]
+    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_every_file_is_in_its_place_and_no_other(installed: Path) -> None:
+    assert files_below(installed) == PLACED | {"opt/swath"}
+
+
+def test_nothing_installed_names_the_packagers_folder(installed: Path) -> None:
+    texts = [installed / name for name in PLACED] + sorted((installed / "opt/swath/bin").iterdir())
+    for path in texts:
+        if not path.is_symlink():
+            assert str(installed).encode() not in path.read_bytes(), path
+
+
+def test_scripts_start_with_the_python_beside_them(installed: Path) -> None:
+    assert (installed / "opt/swath/bin/swath").read_text().startswith("#!/opt/swath/bin/python")
+    assert os.readlink(installed / "usr/local/bin/swath") == "/opt/swath/bin/swath"
+
+
+def test_bare_install_imports_all_packages_and_nothing_of_processing(installed: Path) -> None:
+    code = f"import importlib.util as u, {', '.join(PACKAGES)}; print([n for n in {PROCESSING_ONLY} if u.find_spec(n)])"
+    done = run_installed(installed, "-c", code)
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
+
+
+def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
+    """All modules import without the extras, so none was left out and none needs what is not installed."""
+    names = [
+        str(path.relative_to(ROOT).with_suffix("")).replace("/", ".").removesuffix(".__init__")
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+    ]
+    done = run_installed(installed, "-c", f"import importlib; [importlib.import_module(n) for n in {names!r}]")
+    assert done.returncode == 0, done.stderr
+
+
+def test_bare_install_lists_its_devices(installed: Path) -> None:
+    done = run_installed(installed, "-m", "daemon.cli.main", "devices", "--json")
+    assert done.returncode == 0, done.stderr
+    assert {"ubx", "novatel", "nmea", "canmod-gps", "srep"} <= {
+        row["protocol"] for row in json.loads(done.stdout)["devices"]
+    }
+
+
+def test_installed_example_configuration_is_valid(installed: Path) -> None:
+    done = run_installed(
+        installed, "-m", "daemon.cli.main", "check", "--offline", str(installed / "etc/swath/swath.toml")
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_uninstall_leaves_the_configuration_and_the_logs(installed: Path, tmp_path: Path) -> None:
+    """On a copy of the root without the program's bulk: what uninstall removes does not depend on it."""
+    for name in PLACED:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        source = installed / name
+        if source.is_symlink():
+            (tmp_path / name).symlink_to(os.readlink(source))
+        else:
+            (tmp_path / name).write_bytes(source.read_bytes())
+    (tmp_path / "opt/swath").mkdir(parents=True)
+    (tmp_path / "opt/swath/pyvenv.cfg").touch()
+    (tmp_path / "var/lib/swath").mkdir(parents=True)
+    (tmp_path / "var/lib/swath/flight_0.mcap").touch()
+    done = make("uninstall", f"DESTDIR={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert files_below(tmp_path) == {"etc/swath/swath.toml", "var/lib/swath/flight_0.mcap"}
+    assert "kept" in done.stdout
+
+
+def install_files(root: Path, prefix: str) -> str:
+    """Everything but the program, which takes longest; returns what the installer said."""
+    environment = os.environ | {"DESTDIR": str(root), "PREFIX": prefix}
+    command = ["sh", str(ROOT / "systemd/install.sh"), "files"]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=True).stdout
+
+
+def test_another_prefix_reaches_the_unit(tmp_path: Path) -> None:
+    install_files(tmp_path, "/srv/lidar")
+    unit = (tmp_path / "usr/lib/systemd/system/swathd.service").read_text()
+    assert "ExecStart=/srv/lidar/bin/swath run /etc/swath/swath.toml" in unit
+    assert "/opt/swath" not in unit
+    assert os.readlink(tmp_path / "usr/local/bin/swath") == "/srv/lidar/bin/swath"
+
+
+def test_own_configuration_is_never_overwritten(tmp_path: Path) -> None:
+    own = tmp_path / "etc/swath/swath.toml"
+    own.parent.mkdir(parents=True)
+    own.write_text("mine\n")
+    assert "kept" in install_files(tmp_path, "/opt/swath")
+    assert own.read_text() == "mine\n"
+
+
+def test_a_folder_with_other_things_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "usr/lib").mkdir(parents=True)
+    done = make("install", f"DESTDIR={tmp_path}", "PREFIX=/usr", *python_for_services())
+    assert done.returncode != 0
+    assert "holds something else" in done.stderr
+    assert files_below(tmp_path) == set()

@@ -1,0 +1,157 @@
+"""Every command and every configuration in README.md: run here, or checked by the test that the table names."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from daemon.cli.main import app
+from daemon.config import load_config
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    """The fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+
+
+def commands() -> list[str]:
+    """Every command line of the README: those after a prompt, and those that stand in the text."""
+    prompted = [line[2:] for block in blocks("console") for line in block.splitlines() if line.startswith("$ ")]
+    inline = re.findall(
+        r"`((?:sudo |make |swath |systemctl |pip )[^`]*)`", re.sub(r"^```.*?^```$", "", README, flags=re.M | re.S)
+    )
+    return list(dict.fromkeys(prompted + inline))
+
+
+def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    """A command in the project's folder, which must succeed."""
+    words = [str(word) for word in command]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, f"{words}: {done.stderr}"
+    return done
+
+
+def swath(*arguments: str | Path) -> str:
+    """`swath` as installed from here."""
+    return run(sys.executable, "-m", "daemon.cli.main", *arguments).stdout
+
+
+def make_target(name: str, *what_it_runs: str) -> Callable[[Path], None]:
+    """make test cannot run itself: what it would run is looked at."""
+
+    def check(_: Path) -> None:
+        planned = run("make", "-n", name).stdout
+        for words in what_it_runs:
+            assert words in planned
+
+    return check
+
+
+def run_devices(_: Path) -> None:
+    assert "velodyne-vlp16" in swath("devices")
+
+
+def aircraft_of_readme(folder: Path) -> Path:
+    """The README's configuration as a file."""
+    (text,) = blocks("toml")
+    path = folder / "swath.toml"
+    path.write_text(text)
+    return path
+
+
+def run_check_offline(folder: Path) -> None:
+    assert "valid; 4 sources: pps/main, gnss/rover, imu/main, scanner/left" in swath(
+        "check", "--offline", aircraft_of_readme(folder)
+    )
+
+
+def run_check(folder: Path) -> None:
+    """The aircraft's devices are not here, nor its clock: each is said to be wrong, and that is exit status 1."""
+    command = [sys.executable, "-m", "daemon.cli.main", "check", "--seconds", "0.2", str(aircraft_of_readme(folder))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1, done.stderr
+    assert "/dev/pps0" in done.stdout
+    assert "/dev/ttyUSB0" in done.stdout
+
+
+def record_a_little(folder: Path) -> Path:
+    """A log of a second, of a recorder without any device."""
+    logs = folder / "logs"
+    config = folder / "record.toml"
+    config.write_text(f'[session]\nname = "readme"\ndirectory = "{logs}"\nreserve_mb = 1\n')
+    swath("run", "--seconds", "1.2", config)
+    return logs
+
+
+def run_info(folder: Path) -> None:
+    assert "readme" in swath("info", record_a_little(folder))
+
+
+def run_recover(folder: Path) -> None:
+    swath("recover", record_a_little(folder))
+
+
+def unit_is_there(_: Path) -> None:
+    """systemctl would act on a service of this computer; that the unit is right is proven in test_systemd.py."""
+    assert (ROOT / "systemd/swathd.service").read_text().count("[Install]\nWantedBy=multi-user.target") == 1
+
+
+EXERCISED: dict[str, Callable[[Path], None]] = {
+    "make demo": make_target("demo", "-m demo"),
+    "make test": make_target("test", "ruff check", "mypy", "lint-imports", "-m pytest"),
+    "sudo make install": make_target("install", "install.sh install"),  # done for real in test_install.py
+    "sudo make uninstall": make_target("uninstall", "install.sh uninstall"),
+    "swath devices": run_devices,
+    "swath check --offline /etc/swath/swath.toml": run_check_offline,
+    "swath check /etc/swath/swath.toml": run_check,
+    "swath info /var/lib/swath": run_info,
+    "swath recover /var/lib/swath": run_recover,
+    "sudo systemctl enable --now swathd": unit_is_there,
+    "systemctl status swathd": unit_is_there,
+}
+
+
+@pytest.mark.parametrize("line", commands())
+def test_command_of_the_readme(line: str, tmp_path: Path) -> None:
+    assert line in EXERCISED, "say in EXERCISED how this command is tested"
+    EXERCISED[line](tmp_path)
+
+
+def test_the_table_holds_no_command_that_the_readme_lost() -> None:
+    assert set(EXERCISED) - set(commands()) == set()
+
+
+def test_first_commands_are_the_two_that_set_everything_up() -> None:
+    assert commands()[:2] == ["make demo", "make test"]
+    assert blocks("console")[0] == "$ make demo\n$ make test\n"
+
+
+def test_configuration_of_the_readme_is_a_whole_aircraft(tmp_path: Path) -> None:
+    config = load_config(aircraft_of_readme(tmp_path))
+    assert [device.source for device in config.devices()] == ["gnss/rover", "imu/main", "scanner/left"]
+
+
+def test_commands_named_in_the_pages_exist() -> None:
+    known = set(getattr(get_command(app), "commands", {}))
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        for name in re.findall(r"(?:`|\$ )swath ([a-z]+)\b", page.read_text()):
+            assert name in known, f"{page.name}: there is no `swath {name}`"
+
+
+def test_make_help_lists_every_target() -> None:
+    listed = {line.split()[1] for line in run("make", "help").stdout.splitlines()}
+    assert listed == {"help", "demo", "test", "test-long", "lint", "bench", "install", "uninstall", "clean"}
+
+
+def test_make_is_here() -> None:
+    assert shutil.which("make") is not None, "apt-get install make"
