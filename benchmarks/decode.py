@@ -27,7 +27,8 @@ from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Parser, ParserCounters
 from drivers.imu.canmod_gps import CanmodGpsParser
 from drivers.imu.dbc import DbcParser
-from drivers.scanner.srep import SrepHeader, SrepParser, encode_datagram
+from drivers.scanner.srep import SrepParser
+from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns

@@ -8,20 +8,35 @@ u64 counter fits.
 from __future__ import annotations
 
 import math
-import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
 from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.srep_layout import (
+    CRC,
+    FLAG_LASER_ON,
+    FLAG_PPS_LOCKED,
+    FLAG_RANGE_GATE,
+    HEADER_BYTES,
+    HEADER_DTYPE,
+    PULSE_HEAD_BYTES,
+    PULSE_WIDTH_UNIT_NS,
+    RANGE_UNIT_M,
+    SLOT_BYTES,
+    SrepHeader,
+    encode_datagram,
+    header_checks,
+    nanoseconds,
+    pulse_dtype,
+    pulse_times,
+)
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_PPS_LOCKED,
@@ -34,105 +49,7 @@ from georef.records import (
     StructArray,
 )
 
-MAGIC = 0x50455253  # "SREP" in memory order
-VERSION = 1
-MAX_RETURN_SLOTS = 15
-FLAG_PPS_LOCKED = 1
-FLAG_RANGE_GATE = 2
-FLAG_LASER_ON = 4
-ZONE_UNKNOWN = 255
-RANGE_UNIT_M = 1e-4
-PULSE_WIDTH_UNIT_NS = 0.01
-
-HEADER_DTYPE = np.dtype(
-    [
-        ("magic", "<u4"),
-        ("version", "u1"),
-        ("flags", "u1"),
-        ("pulses", "<u2"),
-        ("sequence", "<u4"),
-        ("scanner_id", "<u2"),
-        ("return_slots", "u1"),
-        ("mta_zone", "u1"),
-        ("pps_count", "<u4"),
-        ("tick_hz", "<u4"),
-        ("pps_ticks", "<u8"),
-        ("first_ticks", "<u8"),
-        ("encoder_counts", "<u4"),
-        ("prf_mhz", "<u4"),
-    ]
-)
-HEADER_BYTES = HEADER_DTYPE.itemsize
-CRC = struct.Struct("<I")
-PULSE_HEAD_BYTES = 8
-SLOT_BYTES = 8
-_SECONDS = 1 << 32
-_NS = 1_000_000_000
-
-
-@cache
-def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
-    """Layout of one pulse record with R return slots: 8 + 8·R bytes."""
-    slot = np.dtype([("range", "<u4"), ("intensity", "<u2"), ("pulse_width", "<u2")])
-    return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", slot, (return_slots,))])
-
-
-def datagram_bytes(pulses: int, return_slots: int) -> int:
-    """The only right length of a datagram."""
-    return HEADER_BYTES + pulses * (PULSE_HEAD_BYTES + SLOT_BYTES * return_slots) + CRC.size
-
-
-@dataclass(frozen=True, slots=True)
-class SrepHeader:
-    """What a datagram says beside its pulses; names and units of the protocol page."""
-
-    sequence: int = 0
-    scanner_id: int = 0
-    flags: int = 0
-    mta_zone: int = 0
-    pps_count: int = 0
-    tick_hz: int = 10_000_000
-    pps_ticks: int = 0
-    first_ticks: int = 0
-    encoder_counts: int = 524_288
-    prf_mhz: int = 0
-
-
-def encode_datagram(
-    header: SrepHeader,
-    ticks: ArrayLike,
-    encoder: ArrayLike,
-    range_0p1mm: ArrayLike,
-    intensity: ArrayLike = 0,
-    pulse_width_10ps: ArrayLike = 0,
-) -> bytes:
-    """One datagram.
-
-    Args:
-        header: all fields of the header but N and R.
-        ticks: (N,) u32 since first_ticks.
-        encoder: (N,) i32 counts.
-        range_0p1mm: (N, R) u32, 0 = no return; its shape gives N and R.
-        intensity, pulse_width_10ps: (N, R) u16, or one value for all.
-    """
-    ranges = np.asarray(range_0p1mm, dtype=np.uint32)
-    head = np.zeros(1, dtype=HEADER_DTYPE)
-    head["magic"], head["version"] = MAGIC, VERSION
-    head["pulses"], head["return_slots"] = ranges.shape
-    for name in SrepHeader.__dataclass_fields__:
-        head[name] = getattr(header, name)
-    body = np.zeros(len(ranges), dtype=pulse_dtype(ranges.shape[1]))
-    body["ticks"], body["encoder"] = ticks, encoder
-    body["slot"]["range"], body["slot"]["intensity"], body["slot"]["pulse_width"] = ranges, intensity, pulse_width_10ps
-    data = head.tobytes() + body.tobytes()
-    return data + CRC.pack(zlib.crc32(data))
-
-
-def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:
-    """Tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
-    hz = tick_hz.astype(np.uint64)
-    seconds, rest = np.divmod(ticks, hz)
-    return ((seconds % np.uint64(_SECONDS)) * np.uint64(_NS) + rest * np.uint64(_NS) // hz).astype(np.int64)
+__all__ = ["DRIVERS", "ScanAngle", "SrepHeader", "SrepParser", "encode_datagram"]
 
 
 class ScanAngle:
@@ -226,7 +143,7 @@ class SrepParser(PacketParser):
             return np.zeros(n, dtype=np.bool_), chosen
         header = _headers(units)
         good = np.ones(n, dtype=np.bool_)
-        for code, passes in _header_checks(header, length):
+        for code, passes in header_checks(header, length):
             self._refuse(code, int((good & ~passes).sum()))
             good &= passes
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
@@ -244,7 +161,7 @@ class SrepParser(PacketParser):
         follows = np.zeros(len(sequence), dtype=np.bool_)
         follows[1:] = (np.diff(sequence) == 1) & good[1:] & good[:-1]
         if self._last_sequence is not None:
-            follows[0] = int(sequence[0]) == (self._last_sequence + 1) % _SECONDS
+            follows[0] = int(sequence[0]) == (self._last_sequence + 1) % (1 << 32)
         self._last_sequence = int(sequence[-1]) if good[-1] else None
         return ~follows
 
@@ -300,7 +217,7 @@ class SrepParser(PacketParser):
             per_slot={"pulse_width_ns": slot["pulse_width"] * np.float32(PULSE_WIDTH_UNIT_NS)},
             per_pulse={
                 "host_time_ns": every_pulse(host_time_ns),
-                "device_time_ns": _pulse_times(header, body["ticks"]).reshape(-1),
+                "device_time_ns": pulse_times(header, body["ticks"]).reshape(-1),
                 "encoder_rad": angle.reshape(-1),
                 "pulse_id": ((unwrapped.astype(np.uint64) << np.uint64(16))[:, np.newaxis] + number).reshape(-1),
                 "channel": facet if isinstance(facet, int) else facet.reshape(-1),
@@ -314,23 +231,6 @@ def _headers(units: ByteRows) -> StructArray:
     return np.ascontiguousarray(units[:, :HEADER_BYTES]).view(HEADER_DTYPE).reshape(-1)
 
 
-def _header_checks(header: StructArray, length: int) -> list[tuple[str, BoolArray]]:
-    """What a header must say, by the code its failure is counted under; (n,) True where it does."""
-    pulses, slots = header["pulses"].astype(np.int64), header["return_slots"].astype(np.int64)
-    return [
-        ("bad_magic", header["magic"] == MAGIC),
-        ("bad_version", header["version"] == VERSION),
-        ("bad_length", datagram_bytes(1, 0) - PULSE_HEAD_BYTES + pulses * (8 + 8 * slots) == length),
-        (
-            "bad_header",
-            (slots >= 1)
-            & (slots <= MAX_RETURN_SLOTS)
-            & (header["tick_hz"] > 0)
-            & ((header["encoder_counts"] > 0) | (pulses == 0)),
-        ),
-    ]
-
-
 def _same_layout(header: StructArray) -> list[tuple[int, int]]:
     """Bounds of runs of datagrams with equal N, R and tick_hz, none of more than `BLOCK_SLOTS` slots (or one row)."""
     layout = np.stack([header[name].astype(np.int64) for name in ("pulses", "return_slots", "tick_hz")], axis=1)
@@ -340,20 +240,6 @@ def _same_layout(header: StructArray) -> list[tuple[int, int]]:
         step = max(1, BLOCK_SLOTS // max(1, int(layout[start, 0] * layout[start, 1])))
         bounds += [(at, min(at + step, stop)) for at in range(start, stop, step)]
     return bounds
-
-
-def _pulse_times(header: StructArray, ticks: NDArray[np.uint32]) -> Int64Array:
-    """Device times (n, N) of pulses ``ticks`` (n, N) after each datagram's first, of datagrams with one tick_hz.
-
-    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64.
-    """
-    hz = int(header["tick_hz"][0])
-    seconds, rest = np.divmod(header["first_ticks"], np.uint64(hz))
-    base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * _NS
-    after = ticks + rest.astype(np.int64)[:, np.newaxis]
-    after = after * (_NS // hz) if _NS % hz == 0 else after * _NS // hz
-    after += base[:, np.newaxis]
-    return after
 
 
 def _clock_samples(host_time_ns: Int64Array, header: StructArray, units: ByteRows) -> StructArray:
