@@ -16,7 +16,7 @@ from daemon.replay import source_of_topic
 from drivers.core.parser import Parser
 from georef.records import ChunkBatch, Int64Array
 
-GAP_FACTOR_BITS = 4  # a gap is 16 times the usual interval, and
+USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
 GAP_MIN_NS = 100_000_000
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
 
@@ -44,12 +44,12 @@ class Intervals:
             self.longest_ns, self.longest_at_ns = int(steps[widest]), int(times_ns[widest])
 
     def gaps(self) -> int:
-        """Intervals at least sixteen times the median one, and 0.1 s."""
+        """Intervals in a higher bin than the usual ones, so up to twice as long or longer, and of at least 0.1 s."""
         total = int(self.bins.sum())
         if total < 3:
             return 0
-        median_bin = int(np.searchsorted(self.bins.cumsum(), (total + 1) // 2))
-        first = max(median_bin + GAP_FACTOR_BITS, int(np.frexp(float(GAP_MIN_NS))[1]))
+        usual_bin = int(np.searchsorted(self.bins.cumsum(), USUAL_SHARE * total))
+        first = max(usual_bin + 1, int(np.frexp(float(GAP_MIN_NS))[1]))
         return int(self.bins[first:].sum())
 
 

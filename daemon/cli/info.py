@@ -53,7 +53,6 @@ def _unaccounted(numbers: dict[str, Any]) -> int:
 
 
 def _print_session(console: Console, numbers: dict[str, Any]) -> None:
-    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
@@ -62,12 +61,15 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     console.print(f"{parts}, {numbers['software']} on {numbers['host']} ({numbers['origin']})")
     for number in numbers["missing_parts"]:
         console.print(f"[red]part {number} is missing[/]")
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for column in ("source", "units", "bytes", "rate/s", "gaps", "longest s", "lost k/q/w", "time", "decoded"):
-        table.add_column(column, justify="left" if column in ("source", "time", "decoded") else "right")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("source", "units", "MB", "per s", "gaps", "longest", "lost k/q/w", "time"):
+        table.add_column(column, justify="left" if column in ("source", "time") else "right", no_wrap=True)
     for source, values in numbers["sources"].items():
         table.add_row(*_row(source, values))
     console.print(table)
+    for source, values in numbers["sources"].items():
+        if "decoded" in values:
+            console.print(f"{source}: {_decoded(values['decoded'])}", highlight=False)
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
@@ -90,13 +92,12 @@ def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
     return (
         source,
         f"{values['units']:,}",
-        f"{values['bytes']:,}",
+        f"{values['bytes'] / 1e6:,.2f}",
         rate,
         str(values["gaps"]),
-        f"{values['longest_gap_s']:.3f}",
+        f"{values['longest_gap_s']:.2f} s",
         losses if losses == "0/0/0" else f"[red]{losses}[/]",
         _time(values),
-        _decoded(values),
     )
 
 
@@ -105,15 +106,13 @@ def _time(values: dict[str, Any]) -> str:
     if state is None:
         return ""
     sigma = values["time_sigma_ns"]
-    return f"{state} ±{sigma / 1e3:.1f} µs" if sigma is not None and sigma < 1e6 else str(state)
+    return f"{state} ±{sigma / 1e3:.1f}µs" if sigma is not None and sigma < 1e6 else str(state)
 
 
-def _decoded(values: dict[str, Any]) -> str:
-    decoded = values.get("decoded")
-    if decoded is None:
-        return ""
-    told = [f"{count:,} {name}" for name, count in sorted(decoded["records"].items(), key=lambda item: -item[1])[:3]]
-    if decoded["bad_checksums"]:
-        told.append(f"{decoded['bad_checksums']} bad checksums")
-    told += [f"{count} {code}" for code, count in decoded["errors"].items()]
-    return ", ".join(told)
+def _decoded(decoded: dict[str, Any]) -> str:
+    told = [f"{count:,} {name}" for name, count in sorted(decoded["records"].items(), key=lambda item: -item[1])]
+    for key, words in (("bad_checksums", "bad checksums"), ("bad_messages", "bad messages")):
+        if decoded[key]:
+            told.append(f"{decoded[key]} {words}")
+    told += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    return ", ".join(told) or "nothing decoded"

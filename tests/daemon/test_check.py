@@ -24,7 +24,7 @@ import pytest
 from daemon.check import Report, bitrate_problems, check_everything
 from daemon.config import parse_config
 from daemon.identify import describe_tag
-from drivers.scanner.srep import SrepHeader, encode_datagram
+from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
 from georef.records import TimeScale, TimeTag
@@ -248,12 +248,23 @@ class TestSomethingElse:
             report = check(text + identity, tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["answers as srep, configured as velodyne-vlp16"]
 
-    def test_a_real_recording_of_another_receiver_is_named(self, tmp_path: Path) -> None:
-        """NovAtel, where NMEA is configured."""
-        data = gzip.decompress((ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz").read_bytes())
+    @pytest.mark.parametrize(
+        ("configured", "recording", "answers_as"),
+        [
+            ("nmea", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+            ("nmea", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+            ("novatel", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+            ("novatel", "nmea/nmea-rtk.log.gz", "nmea"),
+            ("ubx", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+        ],
+    )
+    def test_a_real_recording_of_another_receiver_is_named(
+        self, configured: str, recording: str, answers_as: str, tmp_path: Path
+    ) -> None:
+        data = gzip.decompress((ROOT / "fixtures" / recording).read_bytes())
         with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
-            report = check(gnss(path), tmp_path)["gnss/rover"]
-        assert report.problems == ["answers as novatel, configured as nmea"]
+            report = check(gnss(path, configured), tmp_path)["gnss/rover"]
+        assert report.problems == [f"answers as {answers_as}, configured as {configured}"]
 
     def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
         """A VLP-16, where a line scanner is configured."""

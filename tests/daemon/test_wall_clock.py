@@ -1,4 +1,4 @@
-"""The wall clock really stepped by an hour, forth and back, while recording. Run by itself: it moves everybody's clock."""
+"""The wall clock really stepped by an hour, forth and back, while recording. It moves everybody's clock."""
 
 from __future__ import annotations
 
