@@ -46,6 +46,24 @@ from georef.records import (
 TIME_NAMING = frozenset(("BESTPOS", "INSPVAX"))  # besides TIME: computed at the epoch in their header
 
 
+GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # what a body can become; the rest need not be decoded for it
+    nov.Time: (TimeMessage,),
+    nov.BestPos: (TimeMessage, GnssFix),
+    nov.BestVel: (GnssFix,),
+    nov.InsPva: (InsSolution,),
+    nov.InsPvax: (TimeMessage, InsSolution),
+    nov.InsAtt: (InsSolution,),
+    nov.InsAttx: (InsSolution,),
+    nov.RawImu: (ImuSamples,),
+    nov.RawImux: (ImuSamples,),
+    nov.CorrImu: (DeviceStatus,),
+    nov.CorrImuData: (DeviceStatus,),
+    nov.MarkTime: (EventMark,),
+    nov.Heading2: (GnssHeading,),
+    nov.InsConfig: (ImuSamples,),
+}
+
+
 def message_name(frame: bytes) -> str:
     """``BESTPOS``; ``NOVATEL-1234`` without a name here; answers to commands end in ``-response``."""
     number = int.from_bytes(frame[4:6], "little")
@@ -75,6 +93,7 @@ class NovatelParser(StreamParser):
         super().__init__()
         self._framer = Framer(FRAME_KINDS, self.counters)
         self._wanted = wanted
+        self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
         self._state = State(self.counters, configured_scale=imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
 
@@ -105,10 +124,12 @@ class NovatelParser(StreamParser):
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
         """One frame; a short body is counted."""
-        header, body = _split(frame)
+        layout = nov.LAYOUTS.get(int.from_bytes(frame.data[4:6], "little"))
+        if layout is None or layout.body not in self._bodies:
+            return []
+        header, body = _split(frame, layout.name)
         if header is None:
             return []
-        layout = nov.LAYOUTS[int.from_bytes(frame.data[4:6], "little")]
         if len(body) < layout.wire.size:
             self.counters.bad_messages += 1
             self.counters.errors["bad_length"] += 1
@@ -138,21 +159,18 @@ def _array(run: list[Row]) -> Record:
     return InsSolution(np.array(values, dtype=INS_DTYPE))
 
 
-def _split(frame: Frame) -> tuple[Header | None, bytes]:
-    """Header and body of a frame of a known log; None for others, and for answers to commands."""
+def _split(frame: Frame, name: str) -> tuple[Header | None, bytes]:
+    """Header and body of a frame; None for answers to commands and for other formats."""
     data = frame.data
-    layout = nov.LAYOUTS.get(int.from_bytes(data[4:6], "little"))
-    if layout is None:
-        return None, b""
     if data[:3] == nov.SYNC_SHORT:
         short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
-        header = Header(layout.name, frame.host_time_ns, short.week, short.milliseconds, None, 0)
+        header = Header(name, frame.host_time_ns, short.week, short.milliseconds, None, 0)
         return header, data[nov.SHORT_HEADER.size : -nov.CRC_BYTES]
     long = nov.LongHeader._make(nov.LONG_HEADER.unpack_from(data))
     if long.message_type & (nov.RESPONSE_BIT | nov.FORMAT_BITS):
         return None, b""
     source = long.message_type & nov.SOURCE_BITS
-    header = Header(layout.name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source)
+    header = Header(name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source)
     return header, data[long.header_bytes : -nov.CRC_BYTES]
 
 

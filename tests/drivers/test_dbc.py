@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from drivers.core.can_frames import (
     decode_can_frames,
     encode_can_frame,
 )
-from drivers.core.parser import Driver, DriverSettingsError, Parser
+from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser
 from drivers.core.registry import find_driver
 from drivers.imu.dbc import DbcParser, make_clock_parser
 from georef.records import ChunkBatch, DeviceClockSamples, Record, StructArray
@@ -394,3 +395,32 @@ def test_frames_round_trip_through_the_log_layout() -> None:
         encode_can_frame(1, bytes(9))
     with pytest.raises(ValueError, match="cannot carry 9 bytes"):
         encode_can_frame(1, bytes(9), fd=True)
+
+
+def test_a_makers_own_dbc_with_the_counter_first() -> None:
+    """SBG Ellipse: IMU_INFO with the time stamp opens a sample, ACCEL and GYRO follow (sbgECom, canProtocol.md)."""
+    prefix = "SBG_ECAN_MSG_IMU_"
+    signals = {
+        "specific_force": [f"{prefix}ACCEL.ACCEL_{axis}" for axis in "XYZ"],
+        "angular_rate": [f"{prefix}GYRO.GYRO_{axis}" for axis in "XYZ"],
+        "sample_ticks": f"{prefix}INFO.TIME_STAMP",
+        "temperature": f"{prefix}INFO.TEMPERATURE",
+    }
+    dbc = (Path(__file__).parents[2] / "fixtures/dbc/sbgCan.dbc").read_bytes()
+    config = {"dbc": "sbgCan.dbc", "signals": signals, "group": "first", "tick_hz": 1_000_000}
+    parser = DbcParser(DeviceSettings("imu/main", config, {"dbc": dbc}))
+    frames = [
+        frame
+        for number in range(3)
+        for frame in (
+            encode_can_frame(0x120, struct.pack("<IHh", 5000 * number, 0, 2150)),
+            encode_can_frame(0x121, struct.pack("<3h", 1, -2, 981)),
+            encode_can_frame(0x122, struct.pack("<3h", 100, 0, -100)),
+        )
+    ]
+    assert len(imu_rows(feed(parser, frames))) == 2, "the third may still get a second frame of a kind"
+    rows = imu_rows([*feed(parser, frames[:1]), *parser.close()])
+    np.testing.assert_allclose(rows["specific_force_b"], [[0.01, -0.02, 9.81]])
+    np.testing.assert_allclose(rows["angular_rate_b"], [[0.1, 0.0, -0.1]])
+    assert rows["temperature_c"].tolist() == [21.5]
+    assert rows["device_time_ns"].tolist() == [10_000_000]
