@@ -85,7 +85,11 @@ class Recorder:
             )
 
     def __enter__(self) -> Recorder:
-        self.wait_ready()
+        try:
+            self.wait_ready()
+        except AssertionError:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *unused: object) -> None:
