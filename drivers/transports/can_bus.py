@@ -26,6 +26,7 @@ from drivers.transports.uri import TransportSpec
 KERNEL_STAMPED = frozenset({"udp_multicast"})
 MAX_FRAMES = 1000  # bounds one receive
 SLICE_S = 0.1  # a bus without a descriptor is asked in slices, so that a close from outside is noticed
+BATCH_S = 0.004
 BUFFER_BYTES = 4 << 20
 SEND_TIMEOUT_S = 1.0
 
@@ -128,9 +129,12 @@ class PythonCanTransport(DescriptorTransport):
         """What the bus has, after waiting for the first."""
         messages: list[can.Message] = []
         if self._fd >= 0:
+            deadline_s = time.monotonic() + timeout_s
             events = gate.wait(timeout_s)
             if not events:
                 return []
+            if self._kernel_stamped:  # what is stamped may wait for company
+                gate.pause(min(BATCH_S, deadline_s - time.monotonic()))
         else:
             messages += self._first_in_slices(gate, timeout_s)
             if not messages:

@@ -170,18 +170,6 @@ def test_classic_and_fd_frames_mixed(transport: PythonCanTransport, bus: can.Bus
     assert [block.units.shape for block in blocks] == [(2, 16), (2, 72), (2, 16)]
 
 
-def test_ipv6_group() -> None:
-    text = f"can:udp_multicast:ff15:7079:7468:6f6e:6465:6d6f:6d63:6173?port={free_port()}"
-    first, second = open_transport(parse_transport(text)), open_transport(parse_transport(text))
-    first.open()
-    second.open()
-    frame = encode_can_frame(0x321, b"hello")
-    first.send(frame)
-    assert frames(collect(second, 1)) == [frame]
-    first.close()
-    second.close()
-
-
 def test_error_frames_and_bus_off_are_units_and_counted(transport: PythonCanTransport, bus: can.BusABC) -> None:
     for error_class in (0x04, 0x40):  # controller problems; bus off
         bus.send(can.Message(arbitration_id=error_class, is_extended_id=False, is_error_frame=True, data=bytes(8)))
