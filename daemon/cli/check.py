@@ -65,7 +65,7 @@ def _print_reports(reports: list[Report]) -> None:
     for title in ("source", "protocol", "opens", "bytes", "records", "time", ""):
         table.add_column(title, justify="right" if title == "bytes" else "left", no_wrap=title in ("source", "opens"))
     for report in reports:
-        records = ", ".join(f"{name} {count}" for name, count in report.records.most_common())
+        records = ", ".join(f"{name} {count}" for name, count in report.records.most_common() if count)
         count = f"{report.bytes:,}" if report.bytes else ""
         verdict = Text("wrong", style="red") if report.problems else Text("ok", style="green")
         opens = "yes" if report.opens else "no"
