@@ -11,7 +11,7 @@ TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their
 COARSE_SIGMA_NS = 300_000_000.0
 AMBIGUOUS_SIGMA_NS = 1e9
 STEADY_READINGS = 3
-STEADY_SPAN_NS = 5 * SECOND_NS
+STEADY_SPAN_NS = 3 * SECOND_NS
 WALL_STEP_NS = 50_000_000  # a change of wall − host beyond this (and 500 ppm) starts the wall clock's probation anew
 WALL_MAX_AGE_NS = 120 * SECOND_NS
 WALL_DECIDES_SIGMA_S = 0.1
@@ -64,6 +64,11 @@ class WallClock:
             self._steady, self._steady_since_ns = 0, host_ns
         self._steady += 1
         self._host_ns, self._offset_ns, self._disciplined, self._sigma_s = host_ns, offset, disciplined, sigma_s
+
+    def on_probation(self, host_ns: int) -> bool:
+        """Disciplined and recent, but not yet watched for long enough to decide anything."""
+        recent = self._disciplined and abs(host_ns - self._host_ns) <= WALL_MAX_AGE_NS
+        return recent and self._sigma_s <= WALL_DECIDES_SIGMA_S and self.utc_offset_ns(host_ns) is None
 
     def utc_offset_ns(self, host_ns: int) -> int | None:
         """Wall − host where it may decide between seconds: disciplined, steady, recent, sigma ≤ 0.1 s."""

@@ -57,7 +57,7 @@ class LabelKeeper:
         if labeller.label is None:
             if verdict.ambiguous:
                 self.set_conflict(train, host_ns, verdict.ambiguous)
-            else:
+            elif verdict.basis == "bound" or not self._wall.on_probation(host_ns):
                 self._clear_conflict(train, host_ns)
                 labeller.label, labeller.basis = verdict.offset, verdict
                 self._events.add(host_ns, Severity.INFO, "second_known", f"by {verdict.text}")

@@ -177,12 +177,7 @@ class Labeller:
         fresh = [v for v in sure if not v.late]
         if not doubt and fresh:
             gps_scale = any(not v.key.utc for v in fresh)
-            if (
-                wall is None
-                or wall == fresh[0].offset
-                or self.label == fresh[0].offset
-                or (gps_scale and wall_leap is not LeapTrust.SAID)
-            ):
+            if wall is None or wall == fresh[0].offset or (gps_scale and wall_leap is not LeapTrust.SAID):
                 return self._by(fresh[0], "vote")
             doubt = f"messages and the disciplined wall clock differ by {wall - (fresh[0].offset or 0)} s"
         if not doubt:

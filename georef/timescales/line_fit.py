@@ -30,6 +30,7 @@ NOISE_MEMORY = 128  # edges
 MAD_WINDOW = 64
 OUTLIER_MAD = 3 * 1.4826
 TRUNCATED_VARIANCE = 0.9733  # of a normal distribution cut at 3 sigma
+QUIET_EDGES, TOO_QUIET, QUIET_MARGIN = 16, 0.35, 2.0  # innovations half as large as they should be: the noise is less
 OUTLIERS_IN_A_ROW = 4  # after so many they are the truth
 HORIZONS = (16, 64, 256)  # seconds over which past predictions are compared with what came
 HORIZON_MEMORY = 1200  # edges
@@ -204,8 +205,11 @@ class LineBank:
         recent = self._normalised
         scale = OUTLIER_MAD
         if len(recent) >= 8:
-            ordered = sorted(recent)
-            scale = OUTLIER_MAD * max(ordered[len(ordered) // 2], 1.0 / 1.4826)
+            median = sorted(recent)[len(recent) // 2]
+            scale = OUTLIER_MAD * max(median, 1.0 / 1.4826)
+            if median < TOO_QUIET and len(recent) >= QUIET_EDGES:
+                self._noise *= QUIET_MARGIN * (1.4826 * median) ** 2
+                recent.clear()
         recent.append(abs(normalised))
         if abs(normalised) <= scale or self._outliers_in_a_row >= OUTLIERS_IN_A_ROW - 1:
             self._outliers_in_a_row = 0

@@ -1,0 +1,339 @@
+"""Which second: 0 wrong ones while LOCKED or HOLDOVER, over 1e5 simulated seconds of everything that goes wrong.
+
+Simulated (clock_simulation.py): 23 ppm, a random walk of the frequency of 2e-9/√s, ramps of 0.5 ppm/min where said;
+stamps of 1.5 µs or 300 µs; 1 % outliers of 300 µs, 2 to 10 % missing and 1 to 5 % spurious edges; messages 5 ms to
+0.9 s late with up to 20 % stalls to 1.5 s. A wrong second is an error above 0.5 s.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from georef.timescales import PpsClock, TimeState
+from tests.georef.clock_run import Outcome, run
+from tests.georef.clock_simulation import (
+    NS,
+    Edges,
+    Oscillator,
+    Sender,
+    Simulation,
+    gps_second,
+    utc_tag,
+    week_tag,
+)
+
+START = 1_479_297_618  # 2026-11-21T12:00:00Z
+SECONDS = 3000
+UTC = utc_tag(18)
+LEAP_AT = gps_second(dt.datetime(2028, 6, 30, 23, 59, 59, tzinfo=dt.UTC), 18) + 1
+LOCKED, HOLDOVER, COARSE, NO_TIME = TimeState.LOCKED, TimeState.HOLDOVER, TimeState.COARSE, TimeState.NO_TIME
+
+
+def nmea(delay_s: float = 0.2, jitter_s: float = 0.01, **more: Any) -> list[Sender]:
+    """RMC and ZDA of one receiver, one after the other."""
+    return [
+        Sender("RMC", UTC, delay_s=delay_s, jitter_s=jitter_s, **more),
+        Sender("ZDA", UTC, delay_s=delay_s + 0.02, jitter_s=jitter_s, **more),
+    ]
+
+
+def tim_tp() -> Sender:
+    """The bound message that names the next edge."""
+    return Sender("TIM-TP", week_tag(), names_edge=NamesEdge.NEXT, bound=True, delay_s=0.1)
+
+
+def time_gps(**more: Any) -> Sender:
+    """Week, time of week, from some second on leap seconds."""
+    return Sender("NAV-TIMEGPS", week_tag(leap=18), **more)
+
+
+@dataclass
+class Case:
+    """A scenario and what must come of it. steady: the state of all but a few seconds after the first 30."""
+
+    name: str
+    senders: list[Sender]
+    steady: TimeState = LOCKED
+    edges: Edges = field(default_factory=Edges)
+    assumed_leap: int | None = 18
+    start: int = START
+    ramps: bool = False
+    events: tuple[str, ...] = ("second_known",)
+    wall: Callable[[int, int], tuple[int, bool]] | None = None  # second, true GPS ns: realtime ns, disciplined
+
+    def run(self) -> tuple[Simulation, Outcome]:
+        """The simulation and what the clock made of it."""
+        oscillator = Oscillator(SECONDS, seed=len(self.name), ramps=self.ramps)
+        simulation = Simulation(self.start, oscillator, self.edges, self.senders, seed=len(self.name) + 7)
+        clock = PpsClock(self.assumed_leap)
+
+        def wall(second: int, host_ns: int) -> None:
+            if self.wall is not None:
+                realtime, disciplined = self.wall(second, simulation.true_gps_ns(host_ns))
+                clock.set_wall_clock(host_ns, realtime, disciplined=disciplined, sigma_s=0.01)
+
+        return simulation, run(simulation, clock, each_second=wall)
+
+
+def unix_ns(gps_ns: int) -> int:
+    """CLOCK_REALTIME of a GPS time with 18 leap seconds."""
+    return gps_ns + (315_964_800 - 18) * NS
+
+
+def stepped_wall(second: int, gps_ns: int) -> tuple[int, bool]:
+    """A wall clock that claims discipline while it is stepped ± 1 h and slewed by 100 ppm."""
+    hours = 1 if 1000 <= second < 1500 else -1 if 2000 <= second < 2500 else 0
+    return unix_ns(gps_ns) + hours * 3600 * NS + second * 100_000, True
+
+
+def cold(second: int) -> bool:
+    """The first minutes of a receiver that knows nothing yet."""
+    return second >= 400
+
+
+CASES = [
+    Case("message 5 ms late", [Sender("RMC", UTC, delay_s=0.006, jitter_s=0.001)]),
+    Case("messages 15 ms late", nmea(0.015, 0.002)),
+    Case("messages 0.2 s late", nmea(0.2)),
+    Case("message 0.6 s late with 0.1 s jitter", [Sender("RMC", UTC, delay_s=0.6, jitter_s=0.1)]),
+    Case("2 % stalls to 1.5 s", nmea(0.1, stalls=0.02)),
+    Case("20 % stalls to 1.5 s", nmea(0.3, stalls=0.2)),
+    Case("20 % stalls to 1.5 s, slow line, GPS scale", [Sender("TIME", week_tag(), delay_s=0.5, stalls=0.2)]),
+    Case("10 % missing, 5 % spurious", nmea(), edges=Edges(missing=0.1, spurious=0.05)),
+    Case("user-space stamps", nmea(), edges=Edges(noise_ns=300e3, missing=0.1, spurious=0.05)),
+    Case("ramps", nmea(stalls=0.1), ramps=True, edges=Edges(missing=0.05, spurious=0.05)),
+    Case("ramps, user-space stamps", nmea(), ramps=True, edges=Edges(noise_ns=300e3)),
+    Case("leap second, NMEA only", [Sender("RMC", utc_tag(18, LEAP_AT))], start=LEAP_AT - 1500),
+    Case(
+        "leap second, said", [Sender("PVT", utc_tag(18, LEAP_AT, said=True))], start=LEAP_AT - 1500, assumed_leap=None
+    ),
+    Case(
+        "leap second, NMEA beside a receiver that says",
+        [Sender("RMC", utc_tag(18, LEAP_AT)), Sender("PVT", utc_tag(18, LEAP_AT, said=True))],
+        start=LEAP_AT - 1500,
+        events=("second_known",),
+    ),
+    Case("week 2047 to 2048", [Sender("TIME", week_tag())], start=2048 * 604_800 - 1500),
+    Case("week 4095 to 4096", [Sender("TIME", week_tag())], start=4096 * 604_800 - 1500),
+    Case(
+        "week turns over 5 s later than the time of week",
+        [Sender("TIME", week_tag(), error_s=lambda s: -604_800 if 1500 <= s < 1505 else 0)],
+        start=2048 * 604_800 - 1500,
+    ),
+    Case("hour and day wrap, no date beside", [*nmea(), Sender("GGA", utc_tag(18, dated=False))], start=START + 41_700),
+    Case(
+        "cold start: invalid and wrong until the receiver knows",
+        nmea(valid=cold, error_s=lambda s: 0 if cold(s) else -3),
+        events=("second_known",),
+    ),
+    Case(
+        "cold start: default leap count, then said",
+        [
+            *nmea(error_s=lambda s: 0 if s >= 700 else 2),
+            Sender("NAV-TIMEGPS", lambda s: week_tag(leap=18 if s >= START + 700 else None)(s)),
+        ],
+        events=("second_ambiguous", "second_known"),
+    ),
+    Case("leap unknown", nmea(), COARSE, assumed_leap=None, events=("leap_unknown",)),
+    Case(
+        "assumed leap count too small, then said",
+        [*nmea(), time_gps(silent=lambda s: s < 700)],
+        assumed_leap=17,
+        events=("leap_unknown", "leap_seconds_changed", "second_known"),
+    ),
+    Case("steady 0.8 s", [Sender("RMC", UTC, delay_s=0.8)], COARSE, events=("second_ambiguous",)),
+    Case("0.9 s with 0.08 s jitter", [Sender("RMC", UTC, delay_s=0.9, jitter_s=0.08)], COARSE),
+    Case(
+        "straddling: one sentence before the next edge, one after",
+        [Sender("RMC", UTC, delay_s=0.96), Sender("ZDA", UTC, delay_s=1.04)],
+        COARSE,
+        events=("second_ambiguous",),
+    ),
+    Case("steady 0.8 s, bound message decides", [*nmea(0.8), tim_tp()]),
+    Case("steady 0.85 s, wall clock decides", nmea(0.85), wall=lambda _, gps: (unix_ns(gps), True)),
+    Case("steady 1.2 s, wall clock decides", nmea(1.2), wall=lambda _, gps: (unix_ns(gps), True)),
+    Case("steady 0.8 s, wall clock not disciplined", nmea(0.8), COARSE, wall=lambda _, gps: (unix_ns(gps), False)),
+    Case("wall clock stepped and slewed", nmea(), wall=stepped_wall),
+    Case(
+        "two receivers contradict",
+        [*nmea(), Sender("RMC", UTC, source="gnss/base", error_s=lambda s: 1)],
+        COARSE,
+        events=("second_ambiguous",),
+    ),
+    Case(
+        "two receivers contradict, bound message decides",
+        [*nmea(), Sender("RMC", UTC, source="gnss/base", error_s=lambda s: 1), tim_tp()],
+    ),
+    Case("PPS without time", [], NO_TIME, events=()),
+    Case("time without PPS", nmea(), COARSE, edges=Edges(silent=lambda s: True), events=()),
+    Case(
+        "inverted polarity: edges 0.1 s late",
+        nmea(0.04),
+        COARSE,
+        edges=Edges(late_s=lambda s: 0.1),
+        events=("second_ambiguous",),
+    ),
+]
+
+
+def expected_events(case: Case) -> tuple[str, ...]:
+    """Those named, and for COARSE by delay the one that says why."""
+    return ("second_ambiguous",) if case.steady is COARSE and case.events == ("second_known",) else case.events
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_no_wrong_second(case: Case) -> None:
+    """0 wrong seconds; the steady state is the one expected; the log says why."""
+    _, outcome = case.run()
+    assert outcome.wrong_seconds == 0
+    late = outcome.counts(720 if case.name.startswith(("cold", "assumed")) else 30)
+    assert late[case.steady] >= 0.995 * late.total(), late
+    if case.steady is not LOCKED:
+        assert not outcome.seconds, "never LOCKED"
+    for code in expected_events(case):
+        assert code in outcome.codes
+
+
+def test_the_simulated_time_is_long_enough() -> None:
+    """The cases above are 1e5 seconds together."""
+    assert len(CASES) * SECONDS >= 100_000
+
+
+def simulate(
+    senders: list[Sender], edges: Edges | None = None, clock: PpsClock | None = None, seconds: int = 2500
+) -> tuple[Simulation, Outcome]:
+    """One run on its own."""
+    simulation = Simulation(START, Oscillator(seconds, seed=5), edges or Edges(), senders, seed=11)
+    return simulation, run(simulation, clock or PpsClock(18))
+
+
+def test_edges_stop_and_come_back() -> None:
+    """HOLDOVER with a growing sigma; LOCKED at once when they are back; nothing relabelled."""
+    _, outcome = simulate(nmea(), Edges(silent=lambda s: 1000 <= s < 1900))
+    assert outcome.wrong_seconds == 0
+    assert outcome.counts(1010, 1890) == {HOLDOVER: 880}
+    assert outcome.counts(1910)[LOCKED] == len(outcome.states) - 1910
+    at = outcome.seconds.index(1100)
+    assert outcome.sigmas_ns[at] < outcome.sigmas_ns[at + 300] < outcome.sigmas_ns[at + 700]
+    assert outcome.codes == ["second_known"]
+
+
+def test_lost_when_sigma_says_so() -> None:
+    """HOLDOVER ends in LOST where the sigma passes the limit; time is still given, with that sigma."""
+    clock = PpsClock(18, lost_sigma_ns=20_000.0)
+    _, outcome = simulate(nmea(), Edges(silent=lambda s: s >= 1000), clock)
+    states = outcome.counts(1000)
+    assert states[HOLDOVER] > 30
+    assert outcome.states[-1] is TimeState.LOST
+    assert max(outcome.sigmas_ns) <= 20_000.0
+
+
+def test_receiver_restart_off_phase() -> None:
+    """A restarting receiver pulses at any phase and says its time is invalid: HOLDOVER meanwhile, then on as before."""
+    edges = Edges(late_s=lambda s: 0.37 if 1000 <= s < 1100 else 0.0)
+    _, outcome = simulate(nmea(valid=lambda s: not 1000 <= s < 1110), edges)
+    assert outcome.wrong_seconds == 0
+    assert outcome.counts(1010, 1098) == {HOLDOVER: 88}
+    assert outcome.counts(1110)[LOCKED] == len(outcome.states) - 1110
+    assert outcome.codes == ["second_known"]
+
+
+def test_edges_at_a_new_phase_with_time() -> None:
+    """Edges that move by 0.1 s (polarity swapped) and stay: relocked, and the log says by how much."""
+    _, outcome = simulate(nmea(0.3), Edges(late_s=lambda s: 0.1 if s >= 1000 else 0.0))
+    assert outcome.wrong_seconds == 0
+    assert "pps_relocked" in outcome.codes
+    assert "-100.0" in next(text for _, code, text in outcome.events if code == "pps_relocked")
+    assert outcome.counts(1100)[LOCKED] == len(outcome.states) - 1100
+
+
+def test_receiver_restart_with_wrong_time_it_vouches_for() -> None:
+    """Valid but one second off for a while: the label is held, the state COARSE until they agree again."""
+    _, outcome = simulate(nmea(error_s=lambda s: -1 if 1000 <= s < 1100 else 0))
+    assert outcome.wrong_seconds == 0
+    assert outcome.counts(1020, 1099) == {COARSE: 79}
+    assert outcome.codes == ["second_known", "second_ambiguous", "second_confirmed"]
+    assert outcome.counts(1120)[LOCKED] == len(outcome.states) - 1120
+
+
+def test_leap_count_said_relabels_in_one_logged_step() -> None:
+    """Assumed 19, said 18: two events, all seconds since lock move together, history included."""
+    senders = [Sender("RMC", UTC), time_gps(silent=lambda s: s < 500)]
+    clock = PpsClock(19, keep_history=True)
+    simulation, outcome = simulate(senders, clock=clock, seconds=1000)
+    assert outcome.codes == ["second_known", "leap_seconds_changed", "relabelled"]
+    assert [second for second, _, _ in outcome.events[1:]] == [500, 500]
+    hosts = np.array([simulation.host_ns(s + 0.25) for s in range(10, 900)])
+    truth = np.array([simulation.true_gps_ns(int(host)) for host in hosts])
+    assert np.max(np.abs(clock.gps_from_host(hosts)[0] - truth)) < 10_000
+    status = clock.status(simulation.host_ns(900))
+    assert (status.leap_seconds, status.leap_origin) == (18, "receiver")
+
+
+def test_bound_message_corrects_a_label_aloud() -> None:
+    """Messages 1.2 s late look 0.2 s late: undetectable alone, and the label moves, logged, when TIM-TP comes."""
+    senders = [*nmea(1.2), tim_tp()]
+    senders[-1].silent = lambda s: s < 500
+    _, outcome = simulate(senders, seconds=1000)
+    assert "relabelled" in outcome.codes
+    errors = [error for second, error in zip(outcome.seconds, outcome.errors_ns, strict=True) if second > 520]
+    assert max(abs(error) for error in errors) < 10_000
+    assert outcome.counts(520)[LOCKED] == len(outcome.states) - 520
+
+
+def test_coarse_time_is_good_to_half_a_second() -> None:
+    """Without PPS the time is within its ± 0.5 s for any delay up to 0.7 s."""
+    for delay in (0.01, 0.2, 0.5, 0.7):
+        simulation, outcome = simulate([Sender("RMC", UTC, delay_s=delay)], Edges(silent=lambda s: True), seconds=200)
+        host = simulation.host_ns(150.3)
+        status = outcome.clock.status(host)
+        assert status.offset_ns is not None
+        assert abs(host + status.offset_ns - simulation.true_gps_ns(host)) < NS // 2
+        assert status.sigma_ns == pytest.approx(0.3 * NS)
+
+
+def test_quantisation_of_the_edge_is_taken_off() -> None:
+    """TIM-TP's qErr belongs to the edge it names: with it the edges fit several times better than without."""
+    errors = np.rint(np.random.default_rng(3).uniform(-100.0, 100.0, 602))
+
+    def noise(told: bool) -> float:
+        clock = PpsClock(18)
+        for second in range(600):
+            host = 10**12 + second * (NS + 23_000)
+            week, of_week = divmod(START + second + 1, 604_800)
+            clock.add_edge(host + int(errors[second]), second)
+            tag = TimeTag(TimeScale.GPS, of_week * NS, week)
+            quantisation = float(errors[second + 1]) if told else 0.0
+            message = TimeMessage(host + NS // 10, tag, NamesEdge.NEXT, bound=True, quantisation_ns=quantisation)
+            clock.add_message("gnss/rover", message)
+        noise_ns = clock.status(10**12 + 600 * NS).noise_ns
+        assert noise_ns is not None
+        return noise_ns
+
+    assert noise(told=False) == pytest.approx(200.0 / 12**0.5, rel=0.25)
+    assert noise(told=True) < 10.0
+
+
+def test_quantisation_told_after_the_edge() -> None:
+    """A message that names the previous edge corrects it afterwards, as if it had been known before."""
+    errors = np.rint(np.random.default_rng(4).uniform(-100.0, 100.0, 602))
+    clock = PpsClock(18)
+    for second in range(600):
+        host = 10**12 + second * (NS + 23_000)
+        week, of_week = divmod(START + second, 604_800)
+        clock.add_edge(host + int(errors[second]), second)
+        tag = TimeTag(TimeScale.GPS, of_week * NS, week)
+        message = TimeMessage(
+            host + NS // 10, tag, NamesEdge.PREVIOUS, bound=True, quantisation_ns=float(errors[second])
+        )
+        clock.add_message("gnss/rover", message)
+    host = 10**12 + 599 * (NS + 23_000)
+    gps, _ = clock.gps_from_host(np.array([host]))
+    assert abs(int(gps[0]) - (START + 599) * NS) < 15
