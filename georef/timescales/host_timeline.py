@@ -105,4 +105,5 @@ class HostTimeline:
         offsets = np.interp(elapsed, (knots - knots[0]).astype(np.float64), relative)
         slope = self._slope / (1.0 + self._slope) if inverse else self._slope
         beyond = np.maximum(times - knots[-1], 0).astype(np.float64)
-        return np.asarray(first + np.rint(offsets + slope * beyond), dtype=np.int64)
+        rounded: Int64Array = np.rint(offsets + slope * beyond).astype(np.int64)
+        return rounded + first

@@ -95,7 +95,7 @@ class PpsClock:
     def add_edge(self, host_ns: int, sequence: int = 0) -> None:
         """One edge at a host time. sequence (the kernel's) is not needed: the edge's place is its time."""
         del sequence
-        host = host_ns - self._delay_ns
+        host = int(host_ns) - self._delay_ns
         if self._edges and host <= self._edges[-1]:
             self._refuse_edge("backwards")
             return

@@ -1,0 +1,231 @@
+"""Device clocks: latched edges, UTC-hour stamps, arrivals alone; restarts, missing and spurious latches, delays."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, StructArray, TimeMessage, TimeScale, TimeTag
+from georef.timescales import DeviceClock, PpsClock, TimeState
+from tests.georef.clock_run import rms
+
+NS = 1_000_000_000
+START_S = 1_479_297_618  # 2026-11-21T12:00:00Z: on the UTC hour with 18 leap seconds
+HOST_0 = 5_000_000_000_000
+HOST_RATE = 1.0 + 23e-6
+POWER_ON_NS = 77_000_000_000  # device time at START_S
+DEVICE_RATE = 1.0 - 41e-6
+
+
+def host_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
+    """Host time of true seconds since START_S."""
+    return HOST_0 + np.rint(np.asarray(true_s, dtype=np.float64) * HOST_RATE * NS).astype(np.int64)
+
+
+def device_ns(true_s: NDArray[np.float64] | float) -> NDArray[np.int64]:
+    """Device time of true seconds since START_S, in whole 100 ns ticks."""
+    ticks = np.rint((POWER_ON_NS + np.asarray(true_s, dtype=np.float64) * DEVICE_RATE * NS) / 100.0)
+    return ticks.astype(np.int64) * 100
+
+
+def host_clock(seconds: int, *, message_s: float = 0.1, keep_history: bool = True) -> PpsClock:
+    """A host's clock with an edge and a message every second."""
+    clock = PpsClock(18, keep_history=keep_history)
+    for second in range(seconds):
+        edge = int(host_ns(second))
+        clock.add_edge(edge, second)
+        week, of_week = divmod(START_S + second, 604_800)
+        tag = TimeTag(TimeScale.GPS, of_week * NS, week)
+        arrival = edge + round(message_s * NS)
+        clock.add_message("gnss/rover", TimeMessage(arrival, tag, NamesEdge.PREVIOUS, message="TIME"))
+    assert clock.status(int(host_ns(seconds))).state is TimeState.LOCKED
+    return clock
+
+
+def rows_of(
+    true_s: NDArray[np.float64],
+    latency_s: NDArray[np.float64] | float = 0.0005,
+    *,
+    latched: bool = True,
+    locked: int = -1,
+) -> StructArray:
+    """Rows sent at true seconds and received some latency later; the latch is that of the last whole second."""
+    rows = np.zeros(len(true_s), dtype=DEVICE_CLOCK_DTYPE)
+    rows["host_time_ns"] = host_ns(true_s + latency_s)
+    rows["device_time_ns"] = device_ns(true_s)
+    rows["pps_time_ns"] = device_ns(np.floor(true_s)) if latched else -1
+    rows["pps_count"] = np.floor(true_s).astype(np.int64) + 1 if latched else -1
+    rows["locked"] = locked
+    return rows
+
+
+def errors_ns(
+    clock: DeviceClock, true_s: NDArray[np.float64], host: NDArray[np.int64] | None = None
+) -> NDArray[np.float64]:
+    """Error of device times of true seconds."""
+    gps, sigma = clock.gps_from_device(device_ns(true_s), host)
+    assert np.all(np.isfinite(sigma))
+    return np.asarray((gps - START_S * NS) - np.rint(true_s * NS), dtype=np.float64)
+
+
+def test_latched_device_is_good_to_its_ticks() -> None:
+    """100 ns ticks: between and after edges within 0.3 µs, whatever the datagrams' latency (up to 0.25 s)."""
+    random = np.random.default_rng(1)
+    clock = DeviceClock(host_clock(120))
+    times = np.arange(20.003, 110.0, 0.02)
+    clock.add(rows_of(times, random.uniform(0.0, 0.25, len(times))))
+    assert np.max(np.abs(errors_ns(clock, np.arange(21.0, 109.0, 0.0371)))) < 300
+    assert abs(errors_ns(clock, np.array([112.0]))[0]) < 2_000
+    status = clock.status()
+    assert status.latched
+    assert status.drift_ppm == pytest.approx(-41.0, abs=0.1)
+    assert (status.edges_used, status.segments) == (90, 1)
+
+
+def test_batches_give_what_one_gives() -> None:
+    """Rows in batches of any size make the same clock."""
+    host = host_clock(60)
+    times = np.arange(20.003, 50.0, 0.02)
+    whole, parts = DeviceClock(host), DeviceClock(host)
+    rows = rows_of(times)
+    whole.add(rows)
+    for start in range(0, len(rows), 37):
+        parts.add(rows[start : start + 37])
+    asked = device_ns(np.arange(20.0, 51.0, 0.1))
+    np.testing.assert_array_equal(whole.gps_from_device(asked)[0], parts.gps_from_device(asked)[0])
+
+
+def test_stalled_datagrams_do_not_shift_the_second() -> None:
+    """First datagrams of a second that come 1.0 s late name the next edge; most others outvote them."""
+    times = np.arange(20.003, 60.0, 0.02)
+    latency = np.where((times % 1.0 < 0.02) & (np.floor(times) % 8 == 3), 1.0, 0.001)
+    clock = DeviceClock(host_clock(120))
+    clock.add(rows_of(times, latency))
+    assert np.max(np.abs(errors_ns(clock, np.arange(21.0, 59.0, 0.1)))) < 300
+
+
+def test_refused_beyond_three_tenths() -> None:
+    """Latched edges the host saw 0.4 s off are not paired: arrivals are used instead, with a sigma that says so."""
+    times = np.arange(20.003, 60.0, 0.02)
+    clock = DeviceClock(host_clock(120))
+    clock.add(rows_of(times, 0.4))
+    _, sigma = clock.gps_from_device(device_ns(np.array([40.0])))
+    assert sigma[0] > 1e6
+
+
+def test_missing_and_spurious_latches() -> None:
+    """A latch that stays away for 20 s is bridged; one between two seconds is refused and counted."""
+    times = np.arange(20.003, 90.0, 0.02)
+    rows = rows_of(times)
+    gone = (times > 40) & (times < 60)
+    rows["pps_time_ns"][gone] = device_ns(40.0)
+    spurious = (times > 70.5) & (times < 71.0)
+    rows["pps_time_ns"][spurious] = device_ns(70.4)
+    clock = DeviceClock(host_clock(120))
+    clock.add(rows)
+    assert clock.status().refused == {"spacing": 1}
+    assert np.max(np.abs(errors_ns(clock, np.arange(21.0, 89.0, 0.0371)))) < 300
+
+
+def test_a_first_latch_that_was_none() -> None:
+    """A spurious first latch makes all others look wrong: the chain begins anew and the time is right."""
+    times = np.arange(20.503, 60.0, 0.02)
+    rows = rows_of(times)
+    rows["pps_time_ns"][times < 21] = device_ns(20.2)
+    clock = DeviceClock(host_clock(120))
+    clock.add(rows)
+    assert np.max(np.abs(errors_ns(clock, np.arange(30.0, 59.0, 0.1)))) < 300
+
+
+def test_restart_is_a_new_segment() -> None:
+    """The counter starts again from little: the host time chooses the segment; both are right."""
+    times = np.arange(20.003, 60.0, 0.02)
+    before, after = rows_of(times), rows_of(times + 50.0)
+    reset = int(device_ns(70.0)) - 5 * NS
+    for column in ("device_time_ns", "pps_time_ns"):
+        after[column] -= reset
+    after["pps_count"] -= 68
+    clock = DeviceClock(host_clock(120))
+    clock.add(np.concatenate((before, after)))
+    assert clock.status().segments == 2
+    assert np.max(np.abs(errors_ns(clock, times[100:1900], host_ns(times[100:1900])))) < 300
+    gps, _ = clock.gps_from_device(device_ns(times + 50.0) - reset)
+    late = gps[100:1900] - START_S * NS - np.rint((times[100:1900] + 50.0) * NS)
+    assert np.max(np.abs(late)) < 300
+
+
+def test_label_that_comes_late_reaches_the_past() -> None:
+    """Edges latched before the host knew its second are labelled once it does."""
+    host = PpsClock(18, keep_history=True)
+    clock = DeviceClock(host)
+    times = np.arange(2.003, 30.0, 0.02)
+    for second in range(40):
+        host.add_edge(int(host_ns(second)), second)
+    clock.add(rows_of(times))
+    assert np.all(np.isinf(clock.gps_from_device(device_ns(times))[1]))
+    for second in range(30, 40):
+        week, of_week = divmod(START_S + second, 604_800)
+        message = TimeMessage(
+            int(host_ns(second + 0.1)), TimeTag(TimeScale.GPS, of_week * NS, week), NamesEdge.PREVIOUS
+        )
+        host.add_message("gnss/rover", message)
+    assert np.max(np.abs(errors_ns(clock, times[60:]))) < 300
+
+
+def test_without_latch_the_least_delayed_count() -> None:
+    """Latency 1 ms plus an exponential tail of 5 ms mean: within the stated sigma, and never silently as if latched."""
+    random = np.random.default_rng(2)
+    clock = DeviceClock(host_clock(400))
+    times = np.arange(20.0, 390.0, 0.02)
+    clock.add(rows_of(times, 0.001 + random.exponential(0.005, len(times)), latched=False))
+    asked = np.arange(30.0, 380.0, 0.5)
+    gps, sigma = clock.gps_from_device(device_ns(asked))
+    error = gps - START_S * NS - np.rint(asked * NS)
+    assert not clock.status().latched
+    assert 1e6 < np.median(sigma) < 5e6
+    assert rms(error / sigma) < 1.25
+    assert np.max(np.abs(error)) < 3e6
+
+
+def test_hour_stamps_while_locked_only() -> None:
+    """Velodyne: µs past the UTC hour, over its turn, while locked; before that from power-on, which is not UTC."""
+    host = host_clock(7300, message_s=0.05)
+    times = np.arange(100.0, 7200.0, 0.5)
+    locked = times >= 1000.0
+    rows = rows_of(times, latched=False)
+    past_hour = np.rint(times * 1e6).astype(np.int64) * 1000 % (3600 * NS)
+    rows["device_time_ns"] = np.where(locked, past_hour, rows["device_time_ns"])
+    rows["locked"] = locked
+    clock = DeviceClock(host, past_utc_hour=True, keep_history=True)
+    clock.add(rows)
+    gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
+    error = gps - START_S * NS - np.rint(times * NS)
+    assert np.max(np.abs(error[locked])) < 1_000
+    assert np.all(sigma[locked] == 20_000.0)
+    assert np.max(np.abs(error[~locked])) < 3e6
+    assert np.all(sigma[~locked] > 1e6)
+
+
+def test_hour_stamps_that_contradict_the_clock_are_refused() -> None:
+    """A head that says locked but is 5 s off is not believed; refusals are counted."""
+    times = np.arange(100.0, 200.0, 0.5)
+    rows = rows_of(times, latched=False, locked=1)
+    rows["device_time_ns"] = np.rint((times + 5.0) * 1e6).astype(np.int64) * 1000
+    clock = DeviceClock(host_clock(220), past_utc_hour=True)
+    clock.add(rows)
+    _, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
+    assert np.all(sigma > 1e6)
+    assert clock.status().refused["past_hour"] == len(rows)
+
+
+def test_nothing_known_is_said() -> None:
+    """No rows, or a host without time: sigma is inf, nothing raises."""
+    empty = DeviceClock(PpsClock(18))
+    assert math.isinf(empty.gps_from_device(np.array([5]))[1][0])
+    empty.add(np.zeros(0, dtype=DEVICE_CLOCK_DTYPE))
+    empty.add(rows_of(np.arange(1.0, 5.0, 0.1)))
+    assert math.isinf(empty.gps_from_device(np.array([5]))[1][0])
+    assert empty.gps_from_device(np.zeros(0, dtype=np.int64))[0].size == 0
