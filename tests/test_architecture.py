@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
@@ -117,6 +118,43 @@ def test_the_index_names_every_page() -> None:
     index = (ROOT / "docs/index.md").read_text()
     pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")} - {"index.md"}
     assert {page for page in pages if f"]({page})" not in index} == set()
+
+
+def event_codes() -> set[str]:
+    """The code of every event posted: third argument, second where it is said once only."""
+    place = {"post": 2, "make": 2, "add": 2, "add_once": 1}
+    codes = set()
+    for path in [*(ROOT / "daemon").rglob("*.py"), *(ROOT / "georef").rglob("*.py")]:
+        for call in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(call, ast.Call):
+                continue
+            name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+            if name in place and len(call.args) >= place[name] + 2 - (name == "add_once"):
+                argument = call.args[place[name]]
+                if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
+                    codes.add(argument.value)
+    return codes
+
+
+def test_every_event_is_explained() -> None:
+    codes = event_codes()
+    assert len(codes) > 25
+    explained = set(re.findall(r"`([a-z_]+)`", (ROOT / "docs/recording.md").read_text()))
+    assert codes - explained == set()
+
+
+def test_the_example_of_a_new_device_is_a_driver() -> None:
+    from drivers.core.parser import DeviceSettings, Driver
+    from georef.records import Chunk
+
+    (example,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/adding-a-device.md").read_text(), re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    (driver,) = names["DRIVERS"]
+    assert isinstance(driver, Driver)
+    parser = driver.make_parser(DeviceSettings("gnss/rover"))
+    assert parser.feed(Chunk("gnss/rover", 0, b"abc")) == []
+    assert parser.counters.bytes == parser.counters.bytes_skipped == 3
 
 
 def test_importing_the_recorder_loads_nothing_of_processing() -> None:
