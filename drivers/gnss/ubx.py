@@ -249,7 +249,7 @@ class UbxParser(StreamParser):
                     channel=f"EXTINT{message.channel}",
                     rising=rising,
                     count=message.rising_count if rising else None,
-                    sigma_s=message.accuracy_ns * 1e-9,
+                    sigma_s=message.accuracy_ns / 1e9,
                     valid=valid,
                     message="TIM-TM2",
                 )

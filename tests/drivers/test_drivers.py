@@ -1,0 +1,93 @@
+"""Every driver there is, found by what it declares: it has recordings, and random bytes do not raise in it.
+
+A driver's recordings lie in ``fixtures/<protocol>/`` or in that of its family, the protocol's name up to a hyphen
+(``velodyne-vlp16`` in ``fixtures/velodyne/``), with a SOURCE.md that says where they come from.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser
+from drivers.core.registry import KINDS, UnknownProtocolError, all_drivers, find_driver
+from georef.records import Chunk, ChunkBatch
+from tests.drivers.recordings import FIXTURES
+
+DRIVERS = [driver for kind in KINDS for driver in all_drivers(kind).values()]
+
+
+def families(protocol: str) -> list[str]:
+    """The protocol's name and what is left of it before each hyphen."""
+    return list(accumulate(protocol.split("-"), lambda head, part: f"{head}-{part}"))
+
+
+def of_protocol(driver: Driver) -> str:
+    return driver.protocol
+
+
+def test_there_are_drivers_of_every_kind() -> None:
+    assert {driver.kind for driver in DRIVERS} == set(KINDS)
+
+
+@pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
+def test_every_driver_has_recordings_with_their_source(driver: Driver) -> None:
+    folders = [FIXTURES / name for name in families(driver.protocol)]
+    found = [folder for folder in folders if (folder / "SOURCE.md").is_file()]
+    assert found, f"{driver.protocol}: no fixtures/{driver.protocol}/SOURCE.md, nor of its family"
+    captures = [path for path in found[-1].iterdir() if path.name != "SOURCE.md"]
+    assert captures, f"{found[-1]} holds no recording"
+    assert (found[-1] / "SOURCE.md").read_text().strip()
+
+
+@pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
+def test_every_driver_says_what_it_is(driver: Driver) -> None:
+    assert driver.summary
+    assert len(driver.summary) <= 110
+    assert driver.transports
+    assert driver.yields
+    assert find_driver(driver.kind, driver.protocol) is driver
+
+
+def refuses(driver: Driver) -> bool:
+    """Whether the driver cannot be made without settings, saying which it needs."""
+    try:
+        driver.make_parser(DeviceSettings(f"{driver.kind}/test"))
+    except DriverSettingsError as error:
+        assert any(key in str(error) for key in driver.needs), f"{driver.protocol} does not name what it needs: {error}"
+        return True
+    return False
+
+
+@pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
+def test_only_a_driver_that_declares_needs_refuses_to_work_without_settings(driver: Driver) -> None:
+    assert not refuses(driver) or driver.needs
+
+
+def test_an_unknown_protocol_names_those_there_are() -> None:
+    with pytest.raises(UnknownProtocolError, match=r"nmea, .*ubx"):
+        find_driver("gnss", "nema")
+
+
+def make_and_feed(parser: Parser, units: list[bytes]) -> None:
+    """Feed one by one and as batches, then close; every byte is counted."""
+    for index, unit in enumerate(units):
+        parser.feed(Chunk("test/test", index, unit))
+    for index, unit in enumerate(units):
+        rows = np.frombuffer(unit * 2, dtype=np.uint8).reshape(2, -1)
+        parser.feed_batch(ChunkBatch("test/test", np.array([index, index], dtype=np.int64), rows))
+    parser.close()
+    assert parser.counters.bytes == 3 * sum(map(len, units))
+
+
+@pytest.mark.parametrize("driver", [driver for driver in DRIVERS if not refuses(driver)], ids=of_protocol)
+@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(units=st.lists(st.one_of(st.binary(max_size=300), st.binary(min_size=16, max_size=16)), max_size=8))
+def test_random_bytes_never_raise(driver: Driver, units: list[bytes]) -> None:
+    for make in (driver.make_parser, driver.make_time_parser):
+        if make is not None:
+            make_and_feed(make(DeviceSettings(f"{driver.kind}/test")), units)
