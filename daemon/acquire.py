@@ -119,6 +119,11 @@ class Receiver(threading.Thread, ABC):
             self.shared.events.post(Severity.CRITICAL, self.source, "receiver_failed", text)
             raise
 
+    @property
+    @abstractmethod
+    def opening(self) -> bool:
+        """Whether the device is being opened at this moment."""
+
     @abstractmethod
     def receive_once(self) -> None:
         """One wait and what came of it."""
@@ -190,6 +195,11 @@ class UnitReceiver(Receiver):
         self._channel_ids: dict[tuple[str, int] | None, int] = {}
         self._sequences: dict[int, int] = {}
         self._told_buffer = False
+
+    @property
+    def opening(self) -> bool:
+        """Whether the device is being opened at this moment."""
+        return self._session.state is SessionState.OPENING
 
     def receive_once(self) -> None:
         """Wait for units, stamp them, hand them over, then look for time in them."""
@@ -288,6 +298,11 @@ class PpsReceiver(Receiver):
         self._edge_seen = edge_seen
         self._channel = JsonChannel(shared.channels, self.source, f"/pps/{name}", "swath.Pps")
         self._sequence: int | None = None
+
+    @property
+    def opening(self) -> bool:
+        """Whether the device is being opened at this moment."""
+        return self._session.state is SessionState.OPENING
 
     def receive_once(self) -> None:
         """Wait for edges and hand them over."""

@@ -13,13 +13,19 @@ from daemon.acquire import Receiver
 from daemon.recorder import WriterHealth, Writing
 
 PROGRESS_S = 2.0
+OPENING_S = 20.0  # a driver may take its time to open: python-can sleeps 2 s for a serial CAN adapter
 
 
 def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: int | None = None) -> list[str]:
     """Names of the threads that have not made progress within `PROGRESS_S`; empty is healthy."""
     now = time.monotonic_ns() if now_ns is None else now_ns
     limit = now - int(PROGRESS_S * 1e9)
-    stuck = [receiver.source for receiver in receivers if receiver.came_back_ns < limit]
+    opening_limit = now - int(OPENING_S * 1e9)
+    stuck = [
+        receiver.source
+        for receiver in receivers
+        if receiver.came_back_ns < (opening_limit if receiver.opening else limit)
+    ]
     # A status a second: the last one may be a second old and its successor have two seconds to reach the disk.
     if writer.status_ns < limit - int(1e9):
         stuck.append("writer")

@@ -193,6 +193,8 @@ def play(
         stopped: ends the play early when true.
     """
     report = PlayReport()
+    # loopback keeps the order of datagrams only while they are sent from one processor
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     start_ns = time.monotonic_ns()
     realtime_ns = time.time_ns()
     first_ns: int | None = None

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
 
 SIZE_MB = 24
 
@@ -48,12 +48,13 @@ class Flood:
 
     def send(self, seconds: float) -> None:
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            for _ in range(self._burst):
-                data = self.sent.to_bytes(8, "little") + os.urandom(1198)
-                self._socket.sendto(data, ("127.0.0.1", self._port))
-                self.sent += 1
-            time.sleep(0.005)
+        with one_processor():
+            while time.monotonic() < end:
+                for _ in range(self._burst):
+                    data = self.sent.to_bytes(8, "little") + os.urandom(1198)
+                    self._socket.sendto(data, ("127.0.0.1", self._port))
+                    self.sent += 1
+                time.sleep(0.005)
 
     def send_until(self, condition, timeout_s: float = 60.0) -> None:  # type: ignore[no-untyped-def]
         end = time.monotonic() + timeout_s

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
 
 SREP = """
 [scanner.left]
@@ -79,15 +79,15 @@ def test_every_byte_of_every_wire_is_in_the_log(tmp_path: Path, logs: Path, send
     lines = []
     with Recorder(tmp_path, config) as recorder, fifo.open("w") as edges:
         recorder.wait_said("device_opened", times=3)
-        for index, datagram in enumerate(datagrams):
-            sender.sendto(datagram, ("127.0.0.1", port))
-            if index % 50 == 0:
-                now = time.time_ns()
-                edges.write(f"{now} {index // 50 + 1}\n")
-                edges.flush()
-                lines.append(nmea_zda(index))
-                pty.write(lines[-1])
-                time.sleep(0.1)
+        with one_processor():
+            for index, datagram in enumerate(datagrams):
+                sender.sendto(datagram, ("127.0.0.1", port))
+                if index % 50 == 0:
+                    edges.write(f"{time.time_ns()} {index // 50 + 1}\n")
+                    edges.flush()
+                    lines.append(nmea_zda(index))
+                    pty.write(lines[-1])
+                    time.sleep(0.1)
         time.sleep(1.3)
         assert recorder.stop() == 0, recorder.stderr()
     pty.unplug()

@@ -1,0 +1,359 @@
+"""The log: official readers accept what is written; what is broken is told, skipped and mended, never believed."""
+
+from __future__ import annotations
+
+import io
+import resource
+import shutil
+import struct
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import Writer
+
+from daemon.log.format import ChannelSpec, LogError, SessionInfo, safe_attachment_path
+from daemon.log.reader import Session, open_logs
+from daemon.log.recover import examine, recover
+from daemon.log.scan import MAX_CHUNK_BYTES, Damage, scan, unpack_chunk
+from daemon.log.writer import LogWriteError, PartWriter, encode_block, encode_json
+
+START_NS = 1_800_000_000_000_000_000
+INFO = SessionInfo("flight-20261121T100000Z-ab12", "swath test", "host", "boot", START_NS, 1000)
+SCANNER = ChannelSpec("/scanner/left/raw", "x-swath-udp", {"protocol": "srep"}, None, "scanner")
+ROVER = ChannelSpec("/gnss/rover/raw", "x-swath-serial", {"protocol": "nmea"}, None, "other")
+EVENTS = ChannelSpec("/events", "json", {}, "swath.Event", "other")
+Content = dict[str, list[tuple[int, bytes]]]
+
+
+def write_part(
+    path: Path, *, part: int = 0, compression: str = "auto", blocks: int = 60, finish: bool = True
+) -> Content:
+    """A part with two chunk classes; returns what is in it."""
+    rng = np.random.default_rng(part)
+    content: Content = {"/scanner/left/raw": [], "/gnss/rover/raw": [], "/events": []}
+    writer = PartWriter(path, INFO, part, compression=compression)
+    writer.add_attachment("config.toml", "application/toml", b"[session]\n", START_NS)
+    for channel_id, spec in enumerate((SCANNER, ROVER, EVENTS), start=1):
+        writer.add_channel(channel_id, spec)
+    for number in range(blocks):
+        base = START_NS + (part * 1000 + number) * 4_000_000
+        units = rng.integers(0, 256, (20, 1206), dtype=np.uint8)
+        times = base + np.arange(20, dtype=np.int64) * 200_000
+        writer.add(encode_block(1, number * 20, times, units))
+        content["/scanner/left/raw"] += [(int(t), u.tobytes()) for t, u in zip(times, units, strict=True)]
+        read = rng.integers(0, 256, (1, 10 + number), dtype=np.uint8)
+        writer.add(encode_block(2, number, np.array([base + 1000], dtype=np.int64), read))
+        content["/gnss/rover/raw"].append((base + 1000, read.tobytes()))
+        if number % 10 == 9:
+            event = {"time_ns": base, "severity": "info", "source": "test", "code": "tick", "text": str(number)}
+            block = encode_json(3, number // 10, base + 2000, event)
+            writer.add(block)
+            content["/events"].append((base + 2000, bytes(block.data)[31:]))
+            writer.flush()
+    if finish:
+        writer.finish()
+    else:
+        writer.flush()
+        writer.close()
+    return content
+
+
+def read_all(session: Session) -> Content:
+    content: Content = {}
+    for batch in session.batches():
+        rows = content.setdefault(batch.channel.topic, [])
+        rows += [(t, u.tobytes()) for t, u in zip(batch.log_time_ns.tolist(), batch.units, strict=True)]
+    return content
+
+
+def official(path: Path, *, seeking: bool = True) -> Content:
+    content: Content = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True) if seeking else NonSeekingReader(file, validate_crcs=True)
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            content.setdefault(channel.topic, []).append((message.log_time, message.data))
+    return content
+
+
+def doctor(path: Path) -> subprocess.CompletedProcess[str]:
+    command = [str(Path(sys.executable).parent / "pymcap-cli"), "doctor", str(path)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Content]:
+    path = tmp_path_factory.mktemp("log") / f"{INFO.session_id}_0.mcap"
+    return path, write_part(path)
+
+
+@pytest.mark.parametrize("compression", ["auto", "none", "lz4", "zstd"])
+def test_official_readers_and_ours_agree(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "a.mcap"
+    content = write_part(path, compression=compression)
+    assert official(path) == content
+    assert official(path, seeking=False) == content
+    (session,) = open_logs([path])
+    assert read_all(session) == content
+    assert session.damage == []
+    verdict = doctor(path)
+    assert verdict.returncode == 0, verdict.stdout
+    assert "│ error" not in verdict.stdout, verdict.stdout
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == sum(map(len, content.values()))
+    assert {channel.topic: channel.schema_id != 0 for channel in summary.channels.values()} == {
+        "/scanner/left/raw": False,
+        "/gnss/rover/raw": False,
+        "/events": True,
+    }
+    kinds = {index.compression for index in summary.chunk_indexes}
+    assert kinds == ({"", "lz4"} if compression == "auto" else {compression.replace("none", "")})
+
+
+def test_session_metadata_and_attachment_for_others(whole: tuple[Path, Content]) -> None:
+    with whole[0].open("rb") as file:
+        reader = make_reader(file)
+        (metadata,) = reader.iter_metadata()
+        (attachment,) = reader.iter_attachments()
+    assert metadata.metadata == INFO.to_metadata(0)
+    assert (attachment.name, attachment.data) == ("config.toml", b"[session]\n")
+
+
+def test_a_part_is_never_overwritten(whole: tuple[Path, Content]) -> None:
+    before = whole[0].read_bytes()
+    with pytest.raises(FileExistsError):
+        PartWriter(whole[0], INFO, 0)
+    assert whole[0].read_bytes() == before
+
+
+def test_by_time_merges_the_chunk_classes(whole: tuple[Path, Content]) -> None:
+    (session,) = open_logs([whole[0]])
+    times: list[int] = []
+    found: Content = {}
+    for batch in session.batches_by_time():
+        times += batch.log_time_ns.tolist()
+        rows = found.setdefault(batch.channel.topic, [])
+        rows += [(t, u.tobytes()) for t, u in zip(batch.log_time_ns.tolist(), batch.units, strict=True)]
+    assert times == sorted(times)
+    assert found == whole[1]
+
+
+def test_topics_can_be_chosen(whole: tuple[Path, Content]) -> None:
+    (session,) = open_logs([whole[0]])
+    topics = {batch.channel.topic for batch in session.batches(lambda topic: topic.startswith("/gnss"))}
+    assert topics == {"/gnss/rover/raw"}
+
+
+# ------------------------------------------------------------------ cut and damaged
+
+
+def is_prefix(found: Content, content: Content) -> bool:
+    return all(found[topic] == content[topic][: len(found[topic])] for topic in found)
+
+
+def test_cut_anywhere_gives_every_whole_chunk_and_recovers(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+    data = whole[0].read_bytes()
+    boundaries = []
+    for found in scan(io.BytesIO(data), len(data)):
+        assert not isinstance(found, Damage)
+        boundaries += [found.offset - 1, found.offset, found.offset + 1]
+    rng = np.random.default_rng(3)
+    cuts = [cut for cut in boundaries if cut > 700] + rng.integers(700, len(data), 40).tolist()
+    counts = []
+    for cut in sorted(cuts):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(data[:cut])
+        (session,) = open_logs([path])
+        content = read_all(session)
+        assert is_prefix(content, whole[1]), cut
+        counts.append(sum(map(len, content.values())))
+        assert session.damage, "a file without its end must say so"
+        report = recover(path)
+        assert report.recovered is not None
+        assert official(report.recovered) == content
+        report.recovered.unlink()
+    assert counts == sorted(counts)
+    assert counts[-1] == sum(map(len, whole[1].values()))
+
+
+def test_recovered_file_is_good_for_the_doctor_and_supersedes(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+    path = tmp_path / whole[0].name
+    path.write_bytes(whole[0].read_bytes()[:900_000])
+    before = path.read_bytes()
+    report = recover(path)
+    assert report.recovered is not None
+    assert path.read_bytes() == before
+    verdict = doctor(report.recovered)
+    assert verdict.returncode == 0, verdict.stdout
+    (session,) = open_logs([tmp_path])
+    assert [part.path for part in session.parts] == [report.recovered]
+    assert session.attachments() == {"config.toml": b"[session]\n"}
+    with pytest.raises(LogError, match="is there already"):
+        recover(path)
+    assert recover(report.recovered).whole
+
+
+def test_tail_of_zeros(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+    """What ext4 leaves after a power cut: the length is there, the bytes are not."""
+    data = whole[0].read_bytes()
+    path = tmp_path / "zeros.mcap"
+    path.write_bytes(data[:800_000] + bytes(len(data) - 800_000))
+    (session,) = open_logs([path])
+    content = read_all(session)
+    assert is_prefix(content, whole[1])
+    assert sum(map(len, content.values())) > 400
+    assert session.damage
+
+
+def test_zeros_in_the_middle_lose_the_chunks_they_touch(tmp_path: Path, whole: tuple[Path, Content]) -> None:
+    data = bytearray(whole[0].read_bytes())
+    chunks = [found for found in scan(io.BytesIO(bytes(data)), len(data)) if not isinstance(found, Damage)]
+    chunks = [found for found in chunks if found.opcode == 6]
+    at = 700_000
+    data[at : at + 65536] = bytes(65536)
+    touched = [found for found in chunks if found.offset < at + 65536 and found.offset + found.length > at]
+    path = tmp_path / "middle.mcap"
+    path.write_bytes(bytes(data))
+    (session,) = open_logs([path])
+    content = read_all(session)
+    lost = {topic: set(rows) - set(content.get(topic, [])) for topic, rows in whole[1].items()}
+    assert all(set(rows) <= set(whole[1][topic]) for topic, rows in content.items())
+    expected = sum(len(batch) for batch in lost.values())
+    assert 0 < expected <= 500
+    report = examine(path)
+    assert report.chunks == len(chunks) - len(touched)
+    known = [entry.messages for entry in report.damage]
+    if all(count is not None for count in known):
+        assert sum(count or 0 for count in known) == expected
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_any_damage_is_told_and_nothing_false_is_given(
+    tmp_path: Path, whole: tuple[Path, Content], data: st.DataObject
+) -> None:
+    content = bytearray(whole[0].read_bytes())
+    size = len(content) - 2000
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, size))
+        junk = data.draw(st.binary(min_size=1, max_size=300))
+        if data.draw(st.booleans()):
+            content[at : at + len(junk)] = junk
+        else:
+            del content[at : at + len(junk)]
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(bytes(content))
+    try:
+        (session,) = open_logs([path])
+    except LogError:
+        return  # its head was hit
+    found = read_all(session)
+    for topic, rows in found.items():
+        assert set(rows) <= set(whole[1].get(topic, [])), topic
+
+
+# ------------------------------------------------------------------ strangers
+
+
+def test_absurd_lengths_and_bombs_are_refused(tmp_path: Path) -> None:
+    bomb = struct.pack("<QQQII", 0, 1, 1 << 40, 0, 3) + b"lz4" + struct.pack("<Q", 4) + b"\0" * 4
+    with pytest.raises(LogError, match="claims"):
+        unpack_chunk(bomb)
+    packed = zstandard.ZstdCompressor().compress(bytes(64 << 20))
+    small_claim = struct.pack("<QQQII", 0, 1, 1000, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    with pytest.raises(LogError, match="instead of 1000"):
+        unpack_chunk(small_claim)
+    assert MAX_CHUNK_BYTES <= 256 << 20
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc/passwd", "a/../../b", "", "a\\b", "a\0b"])
+def test_attachment_names_that_are_paths_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(LogError, match="is no name"):
+        safe_attachment_path(tmp_path, name)
+    assert safe_attachment_path(tmp_path, "dbc/imu.dbc") == tmp_path / "dbc" / "imu.dbc"
+
+
+def test_files_that_are_no_logs_are_refused_in_a_line(tmp_path: Path) -> None:
+    for name, data in (("text.mcap", b"hello"), ("empty.mcap", b""), ("magic.mcap", b"\x89MCAP0\r\n")):
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(LogError) as error:
+            open_logs([path])
+        assert name in str(error.value)
+        assert "\n" not in str(error.value)
+    stranger = tmp_path / "ros.mcap"
+    with stranger.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="x")
+        writer.finish()
+    with pytest.raises(LogError, match="profile 'ros2'"):
+        open_logs([stranger])
+    empty = tmp_path / "folder"
+    empty.mkdir()
+    with pytest.raises(LogError, match="no such file"):
+        open_logs([tmp_path / "nothing"])
+    with pytest.raises(LogError, match="no logs"):
+        open_logs([empty])
+
+
+# ------------------------------------------------------------------ parts
+
+
+def test_parts_are_ordered_and_a_missing_one_is_named(tmp_path: Path) -> None:
+    contents = [write_part(tmp_path / f"z{9 - part}.mcap", part=part, blocks=20) for part in range(4)]
+    (session,) = open_logs([tmp_path])
+    assert [part.number for part in session.parts] == [0, 1, 2, 3]
+    joined: Content = {topic: [row for content in contents for row in content[topic]] for topic in contents[0]}
+    assert read_all(session) == joined
+    (tmp_path / "z7.mcap").unlink()
+    (session,) = open_logs([tmp_path])
+    assert session.missing_parts == [2]
+    shutil.copy(tmp_path / "z9.mcap", tmp_path / "copy.mcap")
+    with pytest.raises(LogError, match="is part 0 of its session, and so is"):
+        open_logs([tmp_path])
+
+
+# ------------------------------------------------------------------ a disk that refuses
+
+
+def test_refused_chunk_is_counted_cut_back_and_the_writer_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "limited.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    writer.add_channel(2, ROVER)
+    units = np.zeros((400, 1206), np.uint8)
+    times = START_NS + np.arange(400, dtype=np.int64)
+    kept: Counter[int] = Counter()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_200_000, hard))
+        writer.add(encode_block(1, 0, times, units))
+        writer.flush()
+        kept[1] = 400
+        size = path.stat().st_size
+        writer.add(encode_block(1, 400, times, units))
+        writer.add(encode_block(1, 800, times, units))
+        with pytest.raises(LogWriteError) as error:
+            writer.flush()
+        assert error.value.filename == str(path)
+        assert path.stat().st_size == size == writer.bytes_written
+        writer.add(encode_block(2, 0, times[:3], units[:3, :7]))
+        writer.flush()
+        kept[2] = 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert writer.written == kept
+    assert writer.lost == Counter({1: 800})
+    writer.finish()
+    assert {topic: len(rows) for topic, rows in official(path).items()} == {SCANNER.topic: 400, ROVER.topic: 3}
+    assert doctor(path).returncode == 0
