@@ -65,9 +65,7 @@ def refusal(driver: Driver) -> str:
 @pytest.mark.parametrize("driver", DRIVERS, ids=of_protocol)
 def test_only_a_driver_that_declares_needs_refuses_to_work_without_settings(driver: Driver) -> None:
     said = refusal(driver)
-    assert not said or any(key in said for key in driver.needs), (
-        f"{driver.protocol} does not name what it needs: {said}"
-    )
+    assert not said or any(key in said for key in driver.needs), f"names none of {driver.needs}: {said}"
 
 
 def test_an_unknown_protocol_names_those_there_are() -> None:

@@ -61,6 +61,7 @@ WITH_POSITIONS = [
     "gp-320fw-2019-04-06-overflow.log",
     "hemi.log",
     "isync.log",
+    "nmea-fuzzy-cases.log",
     "nmea-rtk.log",
     "polarx2.log",
     "quectelLC79D-1.log",

@@ -132,6 +132,8 @@ def test_fixes_are_gpsds(name: str) -> None:
         assert math.degrees(fix.lat_rad) == pytest.approx(report["lat"], abs=1.01e-7)
         assert math.degrees(fix.lon_rad) == pytest.approx(report["lon"], abs=1.01e-7)
         assert fix.height_m == pytest.approx(report["altHAE"], abs=0.0011)
+        assert fix.velocity_l is not None
+        assert math.hypot(*fix.velocity_l[:2]) == pytest.approx(report["speed"], abs=0.0011)
         compared += 1
     assert compared >= 19
     assert compared >= len(found) - 2
