@@ -138,7 +138,7 @@ class _Excess:
             return 0.0
         chance = noise * math.sqrt(2.0 / self._count) + self._variance * math.sqrt(2.0 * self.horizon / self._count)
         shrunk = self._excess * self._count / (self._count + self.horizon)
-        return max(0.0, shrunk - chance)
+        return max(0.0, shrunk - 0.5 * chance)
 
     def shrink(self) -> float:
         """Measured over predicted variance, at most 1: least squares of e² = R + f·V and a prior."""
