@@ -33,7 +33,7 @@ make_venv() {
             fail "$python lacks its venv module, and apt-get could not install python$version-venv"
     fi
     echo "creating $folder with $("$python" -V 2>&1)"
-    quietly "$python" -m venv "$folder" || fail "cannot create the virtual environment $folder"
+    quietly "$python" -m venv "$folder" || { rm -rf "$folder"; fail "cannot create the virtual environment $folder"; }
 }
 
 pip_install() {
