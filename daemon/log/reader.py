@@ -7,7 +7,6 @@ its CRC has been checked; what cannot be read is skipped and stands in `Session.
 from __future__ import annotations
 
 import heapq
-import io
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from mcap import records
-from mcap.data_stream import ReadDataStream
 
 from daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, ChunkClass, LogError, SessionInfo
 from daemon.log.scan import (
@@ -29,6 +27,7 @@ from daemon.log.scan import (
     OP_SCHEMA,
     Damage,
     Record,
+    parse_record,
     scan,
 )
 from georef.records import ByteRows, Int64Array
@@ -122,7 +121,7 @@ class Session:
         for part in self.parts:
             for record in self._records(part):
                 if record.opcode == OP_ATTACHMENT:
-                    attachment = records.Attachment.read(ReadDataStream(io.BytesIO(record.body)))
+                    attachment = parse_record(records.Attachment, record.body)
                     found.setdefault(attachment.name, attachment.data)
         return found
 
@@ -132,7 +131,10 @@ class Session:
             schemas: dict[int, str] = {}
             for record in self._records(part):
                 if record.opcode == OP_CHUNK:
-                    yield list(chunk_batches(record.body, channels, schemas, topics))
+                    try:
+                        yield list(chunk_batches(record.body, channels, schemas, topics))
+                    except LogError as error:
+                        self._note(part, Damage(record.offset, record.length, str(error)))
                 elif record.opcode == OP_CHANNEL:
                     _take_channel(record.body, channels, schemas)
                 elif record.opcode == OP_SCHEMA:
@@ -145,9 +147,12 @@ class Session:
                 if isinstance(found, Record):
                     yield found
                 else:
-                    entry = PartDamage(part.path, found)
-                    if entry not in self.damage:
-                        self.damage.append(entry)
+                    self._note(part, found)
+
+    def _note(self, part: Part, damage: Damage) -> None:
+        entry = PartDamage(part.path, damage)
+        if entry not in self.damage:
+            self.damage.append(entry)
 
 
 def open_logs(paths: Sequence[Path | str]) -> list[Session]:
@@ -200,11 +205,11 @@ def read_part_head(path: Path) -> Part:
                 if isinstance(found, Damage):
                     break
                 if found.opcode == OP_HEADER:
-                    profile = records.Header.read(ReadDataStream(io.BytesIO(found.body))).profile
+                    profile = parse_record(records.Header, found.body).profile
                     if profile != PROFILE:
                         raise LogError(f"{path}: is an MCAP file of profile {profile!r}, not {PROFILE!r}")
                 elif found.opcode == OP_METADATA:
-                    metadata = records.Metadata.read(ReadDataStream(io.BytesIO(found.body)))
+                    metadata = parse_record(records.Metadata, found.body)
                     if metadata.name == SESSION_METADATA:
                         info, number = SessionInfo.from_metadata(metadata.metadata)
                         return Part(path, info, number)
@@ -266,7 +271,7 @@ def _batch(spec: ChannelSpec, channel_id: int, rows: ByteRows) -> LogBatch:
 
 
 def _take_channel(body: bytes, channels: dict[int, ChannelSpec], schemas: dict[int, str]) -> None:
-    channel = records.Channel.read(ReadDataStream(io.BytesIO(body)))
+    channel = parse_record(records.Channel, body)
     chunk_class: ChunkClass = "scanner" if channel.topic.startswith("/scanner/") else "other"
     channels[channel.id] = ChannelSpec(
         channel.topic, channel.message_encoding, channel.metadata, schemas.get(channel.schema_id), chunk_class
@@ -274,7 +279,7 @@ def _take_channel(body: bytes, channels: dict[int, ChannelSpec], schemas: dict[i
 
 
 def _take_schema(body: bytes, schemas: dict[int, str]) -> None:
-    schema = records.Schema.read(ReadDataStream(io.BytesIO(body)))
+    schema = parse_record(records.Schema, body)
     schemas[schema.id] = schema.name
 
 

@@ -6,7 +6,6 @@ and told. The copy has index and footer, so that every MCAP reader opens it.
 
 from __future__ import annotations
 
-import io
 import os
 import shutil
 from collections import Counter
@@ -14,11 +13,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap import records
-from mcap.data_stream import ReadDataStream
 
 from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
 from daemon.log.reader import RECOVERED, chunk_batches, read_part_head
-from daemon.log.scan import OP_ATTACHMENT, OP_CHANNEL, OP_CHUNK, OP_METADATA, OP_SCHEMA, Damage, Record, scan
+from daemon.log.scan import (
+    OP_ATTACHMENT,
+    OP_CHANNEL,
+    OP_CHUNK,
+    OP_METADATA,
+    OP_SCHEMA,
+    Damage,
+    Record,
+    parse_record,
+    scan,
+)
 from daemon.log.writer import PartWriter, encode_raw
 
 
@@ -155,10 +163,10 @@ def _copy_chunk(
 
 def _copy_outside(found: Record, writer: PartWriter) -> None:
     if found.opcode == OP_ATTACHMENT:
-        attachment = records.Attachment.read(ReadDataStream(io.BytesIO(found.body)))
+        attachment = parse_record(records.Attachment, found.body)
         writer.add_attachment(attachment.name, attachment.media_type, attachment.data, attachment.log_time)
     elif found.opcode == OP_METADATA:
-        metadata = records.Metadata.read(ReadDataStream(io.BytesIO(found.body)))
+        metadata = parse_record(records.Metadata, found.body)
         if metadata.name != SESSION_METADATA:
             writer.add_metadata(metadata.name, metadata.metadata)
 

@@ -6,14 +6,18 @@ place where a record can begin.
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import lz4.frame
 import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 
 from daemon.log.format import MAGIC, LogError
 
@@ -26,6 +30,14 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, len
 OP_HEADER, OP_FOOTER, OP_SCHEMA, OP_CHANNEL, OP_MESSAGE = 1, 2, 3, 4, 5
 OP_CHUNK, OP_MESSAGE_INDEX, OP_ATTACHMENT, OP_METADATA, OP_DATA_END = 6, 7, 9, 12, 15
 _OPCODES = frozenset(range(1, 16))
+_CONTENT: dict[int, type[records.McapRecord]] = {
+    OP_HEADER: records.Header,
+    OP_SCHEMA: records.Schema,
+    OP_CHANNEL: records.Channel,
+    OP_ATTACHMENT: records.Attachment,
+    OP_METADATA: records.Metadata,
+}
+RecordT = TypeVar("RecordT", bound=records.McapRecord)
 _RESYNC_STEP = 1 << 20
 
 
@@ -121,10 +133,7 @@ def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
     if opcode not in _OPCODES or length > MAX_RECORD_BYTES or offset + total > size:
         return nothing
     if opcode != OP_CHUNK:
-        body = file.read(length)
-        if opcode == OP_ATTACHMENT and not _attachment_is_whole(body):
-            return Damage(offset, total, "attachment with a wrong CRC")
-        return Record(opcode, offset, total, body)
+        return _outside_chunks(opcode, offset, total, file.read(length))
     body = file.read(length)
     if len(body) < _CHUNK_HEAD.size or not _plausible_chunk(body):
         return nothing
@@ -132,6 +141,31 @@ def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
         return Record(opcode, offset, total, unpack_chunk(body))
     except LogError as error:
         return Damage(offset, total, str(error), _indexed_messages(file, offset + total, size))
+
+
+def _outside_chunks(opcode: int, offset: int, total: int, body: bytes) -> Record | Damage:
+    """A record that has no CRC of its own (but an attachment's): its content must be what its opcode says."""
+    if opcode == OP_ATTACHMENT and not _attachment_is_whole(body):
+        return Damage(offset, total, "attachment with a wrong CRC")
+    try:
+        if opcode in _CONTENT:
+            parse_record(_CONTENT[opcode], body)
+    except LogError as error:
+        return Damage(offset, total, str(error))
+    return Record(opcode, offset, total, body)
+
+
+def parse_record(kind: type[RecordT], body: bytes) -> RecordT:
+    """The content of a record.
+
+    Raises:
+        LogError: it is not what its opcode says.
+    """
+    try:
+        parsed: RecordT = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
+    except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
+        raise LogError(f"{kind.__name__} record that cannot be read: {error}") from error
+    return parsed
 
 
 def _plausible_chunk(body: bytes) -> bool:

@@ -237,17 +237,20 @@ def test_zeros_in_the_middle_lose_the_chunks_they_touch(tmp_path: Path, whole: t
         assert sum(count or 0 for count in known) == expected
 
 
+DAMAGE = st.lists(
+    st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=300), st.booleans()), min_size=1, max_size=4
+)
+
+
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
+@given(DAMAGE)
 def test_any_damage_is_told_and_nothing_false_is_given(
-    tmp_path: Path, whole: tuple[Path, Content], data: st.DataObject
+    tmp_path: Path, whole: tuple[Path, Content], damage: list[tuple[float, bytes, bool]]
 ) -> None:
     content = bytearray(whole[0].read_bytes())
-    size = len(content) - 2000
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, size))
-        junk = data.draw(st.binary(min_size=1, max_size=300))
-        if data.draw(st.booleans()):
+    for share, junk, overwrite in damage:
+        at = round(share * (len(content) - len(junk)))
+        if overwrite:
             content[at : at + len(junk)] = junk
         else:
             del content[at : at + len(junk)]
