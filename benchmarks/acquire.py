@@ -104,8 +104,8 @@ def last_status(folder: Path) -> dict[str, dict[str, int]]:
 
 def record_udp(length: int, rate: float, seconds: float) -> Figure:
     """Datagrams to the log."""
-    with tempfile.TemporaryDirectory() as name:
-        folder, port = Path(name), free_port()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder, port = Path(scratch), free_port()
         with recorder(folder, scanner_table(port)) as process:
             before, started = cpu_s(process.pid), time.monotonic()
             load = sender("udp", port, length, rate, seconds)
@@ -121,7 +121,8 @@ def record_udp(length: int, rate: float, seconds: float) -> Figure:
     sent, took = int(sent_text), float(took_text)
     note = f"{sent / took:,.0f} datagrams/s, {sent * length / took / 1e6:.0f} MB/s"
     lost = {key: status[key] for key in ("lost_kernel", "lost_queue", "lost_write") if status[key]}
-    return Figure(f"UDP {rate:,.0f} × {length} B/s", sent, status["written"], cpu, None, highest, note + str(lost or ""))
+    name = f"UDP {rate:,.0f} × {length} B/s"
+    return Figure(name, sent, status["written"], cpu, None, highest, note + str(lost or ""))
 
 
 BARE = """

@@ -56,7 +56,9 @@ async def repair_left_open(
 
 async def _repair(path: Path, reserve_bytes: int, events: Events) -> bool:
     """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
-    command = [sys.executable, "-m", "daemon.cli.main", "recover", "--background"]
+    # a child inherits the recorder's real-time priority: it must be idle before its interpreter even starts
+    command = ["chrt", "--idle", "0"] if shutil.which("chrt") else []
+    command += [sys.executable, "-m", "daemon.cli.main", "recover", "--background"]
     command += ["--keep-free-mb", str(reserve_bytes // 1_000_000), str(path)]
     process = await asyncio.create_subprocess_exec(
         *command,
