@@ -17,8 +17,8 @@ from daemon.block_queue import BlockQueue, QueueItem, SourceCount
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.events import Events, Severity
 from daemon.host_clock import HostClock, StampConverter, read_clock_pair
+from daemon.log.encode import encode_block
 from daemon.log.format import ChannelSpec, ChunkClass
-from daemon.log.writer import encode_block
 from daemon.threads import name_thread
 from drivers.session import Session, SessionState
 from drivers.transports.base import RawEdge, UnitBlock

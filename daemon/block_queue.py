@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from daemon.log.writer import EncodedBlock
+from daemon.log.encode import EncodedBlock
 
 
 @dataclass(frozen=True, slots=True)

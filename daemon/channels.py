@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field
 
+from daemon.log.encode import EncodedBlock, encode_json
 from daemon.log.format import ChannelSpec
-from daemon.log.writer import EncodedBlock, encode_json
 
 
 @dataclass(slots=True)

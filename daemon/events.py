@@ -11,7 +11,7 @@ from enum import StrEnum
 from daemon.block_queue import BlockQueue, QueueItem
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.host_clock import HostClock
-from daemon.log.writer import EncodedBlock
+from daemon.log.encode import EncodedBlock
 
 log = logging.getLogger("swath")
 

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from daemon.channels import ChannelTable
+from daemon.log.encode import EncodedBlock
 from daemon.log.format import SessionInfo
-from daemon.log.writer import EncodedBlock, PartWriter
+from daemon.log.writer import PartWriter
 
 RECORDING_SIGN = "recording.json"
 _DROP_CACHE_AFTER_S = 60.0

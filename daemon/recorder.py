@@ -20,7 +20,8 @@ from daemon.block_queue import BlockQueue, QueueItem, SourceCount
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.events import Events, Severity
 from daemon.host_clock import HostClock
-from daemon.log.writer import EncodedBlock, PartWriter
+from daemon.log.encode import EncodedBlock
+from daemon.log.writer import PartWriter
 from daemon.parts import Parts
 from daemon.threads import name_thread
 

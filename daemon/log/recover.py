@@ -14,6 +14,7 @@ from pathlib import Path
 
 from mcap import records
 
+from daemon.log.encode import encode_raw
 from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
 from daemon.log.reader import RECOVERED, chunk_batches, read_part_head
 from daemon.log.scan import (
@@ -27,7 +28,7 @@ from daemon.log.scan import (
     parse_record,
     scan,
 )
-from daemon.log.writer import PartWriter, encode_raw
+from daemon.log.writer import PartWriter
 
 
 @dataclass(slots=True)

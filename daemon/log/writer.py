@@ -1,29 +1,26 @@
-"""Writes the parts of a log. Messages are laid out in bulk by NumPy; every chunk goes to the kernel at once.
+"""Writes the parts of a log; every chunk goes to the kernel at once.
 
-MCAP specification, version 0: a message record is opcode 5, length u64, channel u16, sequence u32, log time u64,
-publish time u64, data. Every chunk begins with the schemas and channels that it uses, so that it can be read alone.
+Every chunk begins with the schemas and channels that it uses, so that it can be read alone.
 """
 
 from __future__ import annotations
 
 import errno
-import json
 import os
 import struct
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import lz4.frame
-import numpy as np
 import zstandard
 from mcap import records
-from mcap.data_stream import RecordBuilder
 
+from daemon.log.encode import EncodedBlock, message_index
 from daemon.log.format import (
     CHUNK_BYTES,
     CHUNK_CLASSES,
@@ -31,94 +28,19 @@ from daemon.log.format import (
     LIBRARY,
     MAGIC,
     PROFILE,
-    SCHEMA_IDS,
-    SCHEMAS,
     SESSION_METADATA,
     ChannelSpec,
     ChunkClass,
     SessionInfo,
 )
-from georef.records import ByteRows, Int64Array
+from daemon.log.summary import ChunkPieces, Summary, channel_record, record_bytes, schema_record
 
-MESSAGE_HEADER_BYTES = 31
-_OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX, _OP_FOOTER = 5, 6, 7, 2
+_OP_CHUNK, _OP_FOOTER = 6, 2
 _FIXED_CHUNK_FIELDS = 40  # start u64, end u64, size u64, crc u32, compression length u32, records length u64
 
 
 class LogWriteError(OSError):
     """The disk refused a record; the file was cut back to the last whole one and stays usable."""
-
-
-@dataclass(frozen=True, slots=True)
-class EncodedBlock:
-    """Message records of one channel, ready to be laid into a chunk.
-
-    Attributes:
-        count: messages.
-        log_time_ns: (n,) int64.
-        offsets: (n,) int64, of each record within ``data``.
-        data: the records.
-    """
-
-    channel_id: int
-    count: int
-    log_time_ns: Int64Array
-    offsets: Int64Array
-    data: memoryview
-
-
-def encode_block(
-    channel_id: int,
-    first_sequence: int,
-    log_time_ns: Int64Array,
-    units: ByteRows,
-    publish_time_ns: Int64Array | None = None,
-) -> EncodedBlock:
-    """Messages of equal length, one a unit.
-
-    Args:
-        channel_id: of all.
-        first_sequence: number of the first; u32, wraps.
-        log_time_ns: (n,).
-        units: (n, length) uint8.
-        publish_time_ns: (n,); the log time where None.
-    """
-    count, length = units.shape
-    layout = np.dtype(
-        [
-            ("opcode", "u1"),
-            ("length", "<u8"),
-            ("channel", "<u2"),
-            ("sequence", "<u4"),
-            ("log_time", "<u8"),
-            ("publish_time", "<u8"),
-            ("data", "u1", (length,)),
-        ]
-    )
-    rows = np.empty(count, layout)
-    rows["opcode"] = _OP_MESSAGE
-    rows["length"] = MESSAGE_HEADER_BYTES - 9 + length
-    rows["channel"] = channel_id
-    rows["sequence"] = (first_sequence + np.arange(count, dtype=np.uint64)) & 0xFFFFFFFF
-    rows["log_time"] = log_time_ns
-    rows["publish_time"] = log_time_ns if publish_time_ns is None else publish_time_ns
-    rows["data"] = units
-    offsets = np.arange(count, dtype=np.int64) * layout.itemsize
-    return EncodedBlock(channel_id, count, log_time_ns, offsets, rows.view(np.uint8).data)
-
-
-def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:
-    """Whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
-    count, stride = rows.shape
-    offsets = np.arange(count, dtype=np.int64) * stride
-    return EncodedBlock(channel_id, count, log_time_ns, offsets, np.ascontiguousarray(rows).reshape(-1).data)
-
-
-def encode_json(channel_id: int, sequence: int, log_time_ns: int, value: Mapping[str, Any]) -> EncodedBlock:
-    """One JSON message."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
-    unit = np.frombuffer(text, np.uint8).reshape(1, -1)
-    return encode_block(channel_id, sequence, np.array([log_time_ns], dtype=np.int64), unit)
 
 
 @dataclass(slots=True)
@@ -161,10 +83,10 @@ class PartWriter:
         self._compression = compression
         self._specs: dict[int, ChannelSpec] = {}
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
-        self._summary = _Summary()
+        self._summary = Summary()
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         try:
-            self._write([MAGIC, _record(records.Header(profile=PROFILE, library=LIBRARY))])
+            self._write([MAGIC, record_bytes(records.Header(profile=PROFILE, library=LIBRARY))])
             self.add_metadata(SESSION_METADATA, session.to_metadata(part))
             os.fsync(self._fd)
             _sync_directory(path.parent)
@@ -180,7 +102,7 @@ class PartWriter:
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Write a metadata record; raises `LogWriteError`."""
-        record = _record(records.Metadata(name=name, metadata=values))
+        record = record_bytes(records.Metadata(name=name, metadata=values))
         offset = self._write([record])
         self._summary.metadata.append(records.MetadataIndex(offset=offset, length=len(record), name=name))
 
@@ -189,7 +111,7 @@ class PartWriter:
         attachment = records.Attachment(
             create_time=log_time_ns, log_time=log_time_ns, name=name, media_type=media_type, data=data
         )
-        record = _record(attachment)
+        record = record_bytes(attachment)
         offset = self._write([record])
         index = records.AttachmentIndex(
             offset=offset,
@@ -266,8 +188,8 @@ class PartWriter:
         chunk.blocks[channel_id] = []
         if spec.schema is not None and spec.schema not in chunk.schemas:
             chunk.schemas.add(spec.schema)
-            chunk.append(_record(_schema(spec.schema)))
-        chunk.append(_record(_channel(channel_id, spec)))
+            chunk.append(record_bytes(schema_record(spec.schema)))
+        chunk.append(record_bytes(channel_record(channel_id, spec)))
 
     def _close_chunk(self, chunk_class: ChunkClass) -> None:
         chunk = self._chunks.pop(chunk_class)
@@ -281,7 +203,7 @@ class PartWriter:
         self.written.update(counts)
         self._summary.add_chunk(offset, pieces, counts)
 
-    def _lay_out(self, chunk_class: ChunkClass, chunk: _OpenChunk) -> _ChunkPieces:
+    def _lay_out(self, chunk_class: ChunkClass, chunk: _OpenChunk) -> ChunkPieces:
         crc = 0
         for piece in chunk.pieces:
             crc = zlib.crc32(piece, crc)
@@ -297,9 +219,9 @@ class PartWriter:
         chunk_length = position
         for channel_id, blocks in chunk.blocks.items():
             index_offsets[channel_id] = position
-            indexes.append(_message_index(channel_id, blocks))
+            indexes.append(message_index(channel_id, blocks))
             position += len(indexes[-1])
-        return _ChunkPieces(
+        return ChunkPieces(
             [head, *body, *indexes],
             start,
             end,
@@ -325,7 +247,7 @@ class PartWriter:
     # ------------------------------------------------------------------ the end
 
     def _write_end(self) -> None:
-        data_end = _record(records.DataEnd(data_section_crc=0))
+        data_end = record_bytes(records.DataEnd(data_section_crc=0))
         self._write([data_end])
         summary_start = self.bytes_written
         sections = self._summary.sections(self._specs)
@@ -335,7 +257,7 @@ class PartWriter:
             length = sum(map(len, group))
             if length:
                 offset = records.SummaryOffset(group_opcode=opcode, group_start=position, group_length=length)
-                offsets += _record(offset)
+                offsets += record_bytes(offset)
             position += length
         offset_start = summary_start + len(body)
         footer_head = struct.pack("<BQQQ", _OP_FOOTER, 20, summary_start, offset_start)
@@ -380,109 +302,6 @@ def _after(views: list[memoryview], count: int) -> list[memoryview]:
             return [view[count:], *views[number + 1 :]]
         count -= view.nbytes
     return []
-
-
-@dataclass(slots=True)
-class _ChunkPieces:
-    """A chunk as it goes to disk, and what its index entry needs."""
-
-    all: list[Any]
-    start: int
-    end: int
-    chunk_length: int
-    index_length: int
-    index_offsets: dict[int, int]
-    compression: bytes
-    stored: int
-    size: int
-
-
-@dataclass(slots=True)
-class _Summary:
-    """What the end of the file will say."""
-
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-    messages: Counter[int] = field(default_factory=Counter)
-    start: int | None = None
-    end: int = 0
-
-    def add_chunk(self, offset: int, pieces: _ChunkPieces, counts: Counter[int]) -> None:
-        """Note a chunk that has been written at ``offset``."""
-        self.messages.update(counts)
-        self.start = pieces.start if self.start is None else min(self.start, pieces.start)
-        self.end = max(self.end, pieces.end)
-        index = records.ChunkIndex(
-            chunk_length=pieces.chunk_length,
-            chunk_start_offset=offset,
-            compression=pieces.compression.decode(),
-            compressed_size=pieces.stored,
-            message_end_time=pieces.end,
-            message_index_length=pieces.index_length,
-            message_index_offsets={id_: offset + at for id_, at in pieces.index_offsets.items()},
-            message_start_time=pieces.start,
-            uncompressed_size=pieces.size,
-        )
-        self.chunks.append(index)
-
-    def sections(self, specs: Mapping[int, ChannelSpec]) -> list[tuple[int, list[bytes]]]:
-        """The summary's groups: opcode and records, those of the channels that have messages."""
-        used = {id_: specs[id_] for id_ in self.messages}
-        schemas = sorted({spec.schema for spec in used.values() if spec.schema is not None})
-        statistics = records.Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(used),
-            channel_message_counts=dict(self.messages),
-            chunk_count=len(self.chunks),
-            message_count=self.messages.total(),
-            message_end_time=self.end,
-            message_start_time=self.start or 0,
-            metadata_count=len(self.metadata),
-            schema_count=len(schemas),
-        )
-        return [
-            (3, [_record(_schema(name)) for name in schemas]),
-            (4, [_record(_channel(id_, spec)) for id_, spec in used.items()]),
-            (0x0B, [_record(statistics)]),
-            (0x08, [_record(index) for index in self.chunks]),
-            (0x0A, [_record(index) for index in self.attachments]),
-            (0x0D, [_record(index) for index in self.metadata]),
-        ]
-
-
-def _record(record: records.McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    data: bytes = builder.end()
-    return data
-
-
-def _schema(name: str) -> records.Schema:
-    return records.Schema(data=SCHEMAS[name], encoding="jsonschema", id=SCHEMA_IDS[name], name=name)
-
-
-def _channel(channel_id: int, spec: ChannelSpec) -> records.Channel:
-    return records.Channel(
-        id=channel_id,
-        topic=spec.topic,
-        message_encoding=spec.message_encoding,
-        metadata=spec.metadata,
-        schema_id=0 if spec.schema is None else SCHEMA_IDS[spec.schema],
-    )
-
-
-def _message_index(channel_id: int, blocks: list[tuple[int, EncodedBlock]]) -> bytes:
-    """The message index record of one channel in a chunk: (log time, offset) pairs."""
-    count = sum(block.count for _, block in blocks)
-    pairs = np.empty(count, np.dtype([("time", "<u8"), ("offset", "<u8")]))
-    at = 0
-    for start, block in blocks:
-        pairs["time"][at : at + block.count] = block.log_time_ns
-        pairs["offset"][at : at + block.count] = block.offsets + start
-        at += block.count
-    body = pairs.tobytes()
-    return struct.pack("<BQHI", _OP_MESSAGE_INDEX, 6 + len(body), channel_id, len(body)) + body
 
 
 def _sync_directory(folder: Path) -> None:

@@ -1,0 +1,105 @@
+"""Messages as they stand in a chunk, laid out in bulk by NumPy.
+
+MCAP specification, version 0: a message record is opcode 5, length u64, channel u16, sequence u32, log time u64,
+publish time u64, data.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from georef.records import ByteRows, Int64Array
+
+MESSAGE_HEADER_BYTES = 31
+_OP_MESSAGE, _OP_MESSAGE_INDEX = 5, 7
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedBlock:
+    """Message records of one channel, ready to be laid into a chunk.
+
+    Attributes:
+        count: messages.
+        log_time_ns: (n,) int64.
+        offsets: (n,) int64, of each record within ``data``.
+        data: the records.
+    """
+
+    channel_id: int
+    count: int
+    log_time_ns: Int64Array
+    offsets: Int64Array
+    data: memoryview
+
+
+def encode_block(
+    channel_id: int,
+    first_sequence: int,
+    log_time_ns: Int64Array,
+    units: ByteRows,
+    publish_time_ns: Int64Array | None = None,
+) -> EncodedBlock:
+    """Messages of equal length, one a unit.
+
+    Args:
+        channel_id: of all.
+        first_sequence: number of the first; u32, wraps.
+        log_time_ns: (n,).
+        units: (n, length) uint8.
+        publish_time_ns: (n,); the log time where None.
+    """
+    count, length = units.shape
+    layout = np.dtype(
+        [
+            ("opcode", "u1"),
+            ("length", "<u8"),
+            ("channel", "<u2"),
+            ("sequence", "<u4"),
+            ("log_time", "<u8"),
+            ("publish_time", "<u8"),
+            ("data", "u1", (length,)),
+        ]
+    )
+    rows = np.empty(count, layout)
+    rows["opcode"] = _OP_MESSAGE
+    rows["length"] = MESSAGE_HEADER_BYTES - 9 + length
+    rows["channel"] = channel_id
+    rows["sequence"] = (first_sequence + np.arange(count, dtype=np.uint64)) & 0xFFFFFFFF
+    rows["log_time"] = log_time_ns
+    rows["publish_time"] = log_time_ns if publish_time_ns is None else publish_time_ns
+    rows["data"] = units
+    offsets = np.arange(count, dtype=np.int64) * layout.itemsize
+    return EncodedBlock(channel_id, count, log_time_ns, offsets, rows.view(np.uint8).data)
+
+
+def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:
+    """Whole message records of a log, (n, 31 + length) uint8, to be written again as they are."""
+    count, stride = rows.shape
+    offsets = np.arange(count, dtype=np.int64) * stride
+    return EncodedBlock(channel_id, count, log_time_ns, offsets, np.ascontiguousarray(rows).reshape(-1).data)
+
+
+def encode_json(channel_id: int, sequence: int, log_time_ns: int, value: Mapping[str, Any]) -> EncodedBlock:
+    """One JSON message."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+    unit = np.frombuffer(text, np.uint8).reshape(1, -1)
+    return encode_block(channel_id, sequence, np.array([log_time_ns], dtype=np.int64), unit)
+
+
+def message_index(channel_id: int, blocks: list[tuple[int, EncodedBlock]]) -> bytes:
+    """The message index record of one channel in a chunk: (log time, offset) pairs."""
+    count = sum(block.count for _, block in blocks)
+    pairs = np.empty(count, np.dtype([("time", "<u8"), ("offset", "<u8")]))
+    at = 0
+    for start, block in blocks:
+        pairs["time"][at : at + block.count] = block.log_time_ns
+        pairs["offset"][at : at + block.count] = block.offsets + start
+        at += block.count
+    body = pairs.tobytes()
+    return struct.pack("<BQHI", _OP_MESSAGE_INDEX, 6 + len(body), channel_id, len(body)) + body

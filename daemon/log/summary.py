@@ -1,0 +1,103 @@
+"""What the end of a part says: channels, statistics, and where the chunks, attachments and metadata are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from mcap import records
+from mcap.data_stream import RecordBuilder
+
+from daemon.log.format import SCHEMA_IDS, SCHEMAS, ChannelSpec
+
+
+@dataclass(slots=True)
+class ChunkPieces:
+    """A chunk as it goes to disk, and what its index entry needs."""
+
+    all: list[Any]
+    start: int
+    end: int
+    chunk_length: int
+    index_length: int
+    index_offsets: dict[int, int]
+    compression: bytes
+    stored: int
+    size: int
+
+
+@dataclass(slots=True)
+class Summary:
+    """What the end of the file will say."""
+
+    chunks: list[records.ChunkIndex] = field(default_factory=list)
+    attachments: list[records.AttachmentIndex] = field(default_factory=list)
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
+    messages: Counter[int] = field(default_factory=Counter)
+    start: int | None = None
+    end: int = 0
+
+    def add_chunk(self, offset: int, pieces: ChunkPieces, counts: Counter[int]) -> None:
+        """Note a chunk that has been written at ``offset``."""
+        self.messages.update(counts)
+        self.start = pieces.start if self.start is None else min(self.start, pieces.start)
+        self.end = max(self.end, pieces.end)
+        index = records.ChunkIndex(
+            chunk_length=pieces.chunk_length,
+            chunk_start_offset=offset,
+            compression=pieces.compression.decode(),
+            compressed_size=pieces.stored,
+            message_end_time=pieces.end,
+            message_index_length=pieces.index_length,
+            message_index_offsets={id_: offset + at for id_, at in pieces.index_offsets.items()},
+            message_start_time=pieces.start,
+            uncompressed_size=pieces.size,
+        )
+        self.chunks.append(index)
+
+    def sections(self, specs: Mapping[int, ChannelSpec]) -> list[tuple[int, list[bytes]]]:
+        """The summary's groups: opcode and records, those of the channels that have messages."""
+        used = {id_: specs[id_] for id_ in self.messages}
+        schemas = sorted({spec.schema for spec in used.values() if spec.schema is not None})
+        statistics = records.Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(used),
+            channel_message_counts=dict(self.messages),
+            chunk_count=len(self.chunks),
+            message_count=self.messages.total(),
+            message_end_time=self.end,
+            message_start_time=self.start or 0,
+            metadata_count=len(self.metadata),
+            schema_count=len(schemas),
+        )
+        return [
+            (3, [record_bytes(schema_record(name)) for name in schemas]),
+            (4, [record_bytes(channel_record(id_, spec)) for id_, spec in used.items()]),
+            (0x0B, [record_bytes(statistics)]),
+            (0x08, [record_bytes(index) for index in self.chunks]),
+            (0x0A, [record_bytes(index) for index in self.attachments]),
+            (0x0D, [record_bytes(index) for index in self.metadata]),
+        ]
+
+
+def record_bytes(record: records.McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+def schema_record(name: str) -> records.Schema:
+    return records.Schema(data=SCHEMAS[name], encoding="jsonschema", id=SCHEMA_IDS[name], name=name)
+
+
+def channel_record(channel_id: int, spec: ChannelSpec) -> records.Channel:
+    return records.Channel(
+        id=channel_id,
+        topic=spec.topic,
+        message_encoding=spec.message_encoding,
+        metadata=spec.metadata,
+        schema_id=0 if spec.schema is None else SCHEMA_IDS[spec.schema],
+    )
