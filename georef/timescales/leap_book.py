@@ -48,8 +48,10 @@ class LeapBook:
         return self._said.get(source)
 
     def on(self, source: str, date: dt.date) -> LeapSeconds:
-        """The count for a UTC message of a source on a date."""
+        """The count for a UTC message of a source on a date; source "": as far as anybody knows."""
         inserted = self._inserted.get(source)
+        if inserted is None and not source:
+            inserted = next(iter(self._inserted.values()), None)
         if inserted is not None and date >= inserted[0]:
             return LeapSeconds(inserted[1], "second_60")
         return self._without_insertion(source, date)

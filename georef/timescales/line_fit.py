@@ -31,6 +31,7 @@ MAD_WINDOW = 64
 OUTLIER_MAD = 3 * 1.4826
 TRUNCATED_VARIANCE = 0.9733  # of a normal distribution cut at 3 sigma
 QUIET_EDGES, TOO_QUIET, QUIET_MARGIN = 16, 0.35, 2.0  # innovations half as large as they should be: the noise is less
+TOO_LOUD = 1.2  # median of normalised innovations, 0.67 where all is well: a first lock on edges even by chance
 OUTLIERS_IN_A_ROW = 4  # after so many they are the truth
 HORIZONS = (16, 64, 256)  # seconds over which past predictions are compared with what came
 HORIZON_MEMORY = 1200  # edges
@@ -210,6 +211,9 @@ class LineBank:
             if median < TOO_QUIET and len(recent) >= QUIET_EDGES:
                 self._noise *= QUIET_MARGIN * (1.4826 * median) ** 2
                 recent.clear()
+            elif median > TOO_LOUD:
+                self._noisier((1.4826 * median) ** 2)
+                recent.clear()
         recent.append(abs(normalised))
         if abs(normalised) <= scale or self._outliers_in_a_row >= OUTLIERS_IN_A_ROW - 1:
             self._outliers_in_a_row = 0
@@ -217,6 +221,16 @@ class LineBank:
         self._outliers_in_a_row += 1
         self.outliers += 1
         return True
+
+    def _noisier(self, factor: float) -> None:
+        """The stamps' variance was this much too small, and so was all that was computed with it."""
+        self._noise *= factor
+        for i in range(len(self._pxx)):
+            self._pxx[i] *= factor
+            self._pxy[i] *= factor
+            self._pyy[i] *= factor
+        self.knot = self._moments(self.knot.index)
+        self._past[-1] = self.knot
 
     def _learn_noise(self, normalised: float, variance: float) -> None:
         """R = E[(1 − K) e²] = R·E[e²/S]: pulled towards what the inliers show, as fast as their number allows."""

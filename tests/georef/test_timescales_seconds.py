@@ -288,6 +288,50 @@ def test_bound_message_corrects_a_label_aloud() -> None:
     assert outcome.counts(520)[LOCKED] == len(outcome.states) - 520
 
 
+def test_messages_that_become_late_do_not_shake_a_held_label() -> None:
+    """Edges carry the label on: a delay that grows from 0.3 s to 0.85 s is a warning, and the seconds stay right."""
+    early = [Sender("RMC", UTC, delay_s=0.3, silent=lambda s: s >= 500)]
+    late = [Sender("RMC", UTC, delay_s=0.85, silent=lambda s: s < 500)]
+    _, outcome = simulate([*early, *late], seconds=1000)
+    assert outcome.wrong_seconds == 0
+    assert outcome.codes == ["second_known", "messages_late"]
+    assert outcome.counts(20) == {LOCKED: len(outcome.states) - 20}
+
+
+def test_table_is_enough_where_it_reaches() -> None:
+    """UTC of 2019, nothing configured: the built-in table knows. Configured against it is a guess."""
+    start = gps_second(dt.datetime(2019, 5, 1, tzinfo=dt.UTC), 18)
+
+    def last(assumed: int | None) -> tuple[TimeState, str]:
+        simulation = Simulation(start, Oscillator(100, seed=5), Edges(), nmea(), seed=11)
+        clock = run(simulation, PpsClock(assumed)).clock
+        status = clock.status(simulation.host_ns(98.5))
+        return status.state, status.leap_origin
+
+    assert last(None) == (LOCKED, "table")
+    assert last(18) == (LOCKED, "configured")
+    assert last(16) == (COARSE, "guess")
+
+
+def test_names_edge_can_be_overridden() -> None:
+    """A receiver whose sentence names the edge to come, told so by the configuration: the second is right."""
+    senders = [Sender("ZDA", UTC, delay_s=0.3, error_s=lambda s: 1)]
+    simulation = Simulation(START, Oscillator(100, seed=5), Edges(), senders, seed=11)
+    outcome = run(simulation, PpsClock(18, names_edge=NamesEdge.NEXT))
+    assert outcome.wrong_seconds == 0
+    assert outcome.states[-1] is LOCKED
+
+
+def test_delay_is_subtracted() -> None:
+    """A cable and capture delay of 5 µs, configured: gone."""
+    simulation = Simulation(
+        START, Oscillator(300, seed=5), Edges(noise_ns=50.0, late_s=lambda s: 5e-6), nmea(), seed=11
+    )
+    biased, right = run(simulation, PpsClock(18)), run(simulation, PpsClock(18, delay_ns=5000))
+    assert np.mean(biased.errors_ns[100:]) == pytest.approx(-5000, abs=100)
+    assert np.mean(right.errors_ns[100:]) == pytest.approx(0, abs=100)
+
+
 def test_coarse_time_is_good_to_half_a_second() -> None:
     """Without PPS the time is within its ± 0.5 s for any delay up to 0.7 s."""
     for delay in (0.01, 0.2, 0.5, 0.7):
