@@ -1,6 +1,7 @@
 """All benchmarks, one after the other: ``python -m benchmarks``; each has options of its own, see its ``--help``."""
 
-from benchmarks import acquire, decode
+from benchmarks import acquire, clock, decode
 
 decode.main()
+clock.main()
 acquire.main()
