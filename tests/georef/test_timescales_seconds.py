@@ -313,6 +313,25 @@ def test_table_is_enough_where_it_reaches() -> None:
     assert last(16) == (COARSE, "guess")
 
 
+def test_edges_may_be_told_after_their_messages() -> None:
+    """The PPS thread wakes 80 ms late, so messages 15 ms after an edge are told before it: the same seconds, LOCKED."""
+    simulation = Simulation(START, Oscillator(300, seed=5), Edges(), nmea(0.015, 0.001), seed=11)
+    told = sorted(simulation, key=lambda event: event[0] + (NS * 80 // 1000 if event[1] == "edge" else 0))
+    assert [event[1] for event in told[:4]] != [event[1] for event in list(simulation)[:4]]
+    clock = PpsClock(18)
+    for host_ns, _, source, message in told:
+        if message is None:
+            clock.add_edge(host_ns, 0)
+        else:
+            clock.add_message(source, message)
+    host = simulation.host_ns(297.9)
+    status = clock.status(host)
+    assert status.state is LOCKED
+    assert status.offset_ns is not None
+    assert abs(host + status.offset_ns - simulation.true_gps_ns(host)) < 10_000
+    assert [event.code for event in clock.drain_events()] == ["second_known"]
+
+
 def test_names_edge_can_be_overridden() -> None:
     """A receiver whose sentence names the edge to come, told so by the configuration: the second is right."""
     senders = [Sender("ZDA", UTC, delay_s=0.3, error_s=lambda s: 1)]
