@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import heapq
 import os
+import random
 import shutil
 import signal
 import socket
@@ -51,7 +52,7 @@ protocol = "novatel"
 pps = "main"
 
 [imu.main]
-transport = "can:udp_multicast:239.74.163.2"
+transport = "can:udp_multicast:{group}"
 protocol = "canmod-gps"
 
 [scanner.top]
@@ -167,7 +168,9 @@ def demonstrate(console: Console, folder: Path, seconds: float) -> bool:
     """Record, show, prove."""
     data_port, position_port = free_ports(2)
     config_path = folder / "swath.toml"
-    config_path.write_text(CONFIG.format(folder=folder, data_port=data_port, position_port=position_port))
+    group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"  # nobody else's bus
+    text = CONFIG.format(folder=folder, group=group, data_port=data_port, position_port=position_port)
+    config_path.write_text(text)
     opened = open_outputs(load_config(config_path), with_pps=True)
     outputs = {source: Hashed(output) for source, output in opened.items()}
     try:

@@ -1,0 +1,73 @@
+"""The demonstration itself, shortened: what `make demo` runs must pass, and its proof must be able to fail."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from daemon.wire_player import Output, PlayReport
+from demo.__main__ import Hashed, prove
+from tests.daemon.log_check import LogContent, read_log
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = ("gnss/rover", "imu/main", "scanner/top", "scanner/top/aux")
+
+
+class Nowhere(Output):
+    """Takes everything."""
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        return True
+
+    def close(self) -> None:
+        return None
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    folder = tmp_path_factory.mktemp("demo")
+    command = [sys.executable, "-m", "demo", "--seconds", "10", "--keep", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout, folder / "logs"
+
+
+def sent_as_logged(content: LogContent, report: PlayReport) -> dict[str, Hashed]:
+    """Outputs that have sent exactly what is in a log."""
+    outputs: dict[str, Hashed] = {source: Hashed(Nowhere()) for source in SOURCES}
+    for source, output in outputs.items():
+        for _, data in content.units[source]:
+            output.send(data, 0)
+    report.units["pps/main"] = len(content.messages["/pps/main"])
+    return outputs | {"pps/main": Hashed(Nowhere())}
+
+
+@pytest.mark.slow
+def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]) -> None:
+    text, logs = played
+    assert "demonstration passed" in text
+    assert "every unit is accounted for" in text
+    assert text.count(" same ") == 5
+    assert "LOCKED" in text
+    content = read_log(logs)
+    assert all(content.units[source] for source in SOURCES)
+    assert [event["severity"] for _, event in content.messages["/events"] if event["severity"] != "info"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", [*SOURCES, "pps/main"])
+def test_its_proof_fails_when_anything_differs(played: tuple[str, Path], source: str) -> None:
+    _, logs = played
+    content, report = read_log(logs), PlayReport()
+    quiet = Console(quiet=True)
+    outputs = sent_as_logged(content, report)
+    assert prove(quiet, logs, outputs, report)
+    if source == "pps/main":
+        report.units[source] += 1
+    else:
+        outputs[source].send(b"\0", 0)
+    assert not prove(quiet, logs, outputs, report)
