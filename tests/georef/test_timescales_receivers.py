@@ -1,0 +1,71 @@
+"""Real receivers' time messages on one clock: UTC with leap seconds and week with time of week name one second.
+
+The recordings carry no arrival times, so the edges are put where the receiver's own seconds begin and its messages
+50 ms later; what is tested is that all kinds of messages agree, and that the label is the receiver's second.
+"""
+
+from __future__ import annotations
+
+import gzip
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.core.parser import DeviceSettings
+from drivers.core.registry import find_driver
+from georef.records import Chunk, NamesEdge, TimeMessage
+from georef.timescales import SECOND_NS, PpsClock, TimeState, whole_gps_ns
+
+FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
+HOST_0 = 10**13
+RECORDINGS = [
+    ("ubx/ublox-8-time.log.gz", "ubx", {"NAV-SOL", "NAV-TIMEGPS"}),
+    ("ubx/ublox-zed-f9p-hp.log.gz", "ubx", {"NAV-PVT", "NAV-TIMEGPS", "NAV-TIMELS"}),
+    ("ubx/ublox-zed-f9t-rtcm3.log.gz", "ubx", {"NAV-PVT", "NAV-TIMEGPS"}),
+    ("novatel/propak6-basic-fix.gps.gz", "novatel", {"INSPVAX"}),
+    ("novatel/time.gps", "novatel", {"TIME"}),
+]
+
+
+def messages_of(path: Path, protocol: str) -> list[TimeMessage]:
+    """All time messages of a recording, in order."""
+    data = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    parser = find_driver("gnss", protocol).make_parser(DeviceSettings("gnss/rover"))
+    records = [
+        record for at in range(0, len(data), 64) for record in parser.feed(Chunk("gnss/rover", 0, data[at : at + 64]))
+    ]
+    return [record for record in records if isinstance(record, TimeMessage)]
+
+
+@pytest.mark.parametrize(("name", "protocol", "kinds"), RECORDINGS, ids=[name for name, _, _ in RECORDINGS])
+def test_all_messages_name_the_same_second(name: str, protocol: str, kinds: set[str]) -> None:
+    """LOCKED on the receiver's own second, no voter contradicts, nothing unplaced."""
+    clock = PpsClock(18)
+    first_ns = second_ns = None
+    voters = set()
+    for number, message in enumerate(messages_of(FIXTURES / name, protocol)):
+        gps_ns = whole_gps_ns(message.time, 18)
+        if (
+            gps_ns is not None
+            and message.valid
+            and message.names_edge is NamesEdge.PREVIOUS
+            and gps_ns % SECOND_NS == 0
+        ):
+            first_ns = first_ns or gps_ns
+            for edge_ns in range(second_ns or first_ns - SECOND_NS, gps_ns, SECOND_NS):
+                clock.add_edge(HOST_0 + edge_ns + SECOND_NS - first_ns, 0)
+            second_ns = max(gps_ns, second_ns or 0)
+        if first_ns is None or second_ns is None:
+            continue
+        voters.add(message.message)
+        arrival = HOST_0 + second_ns - first_ns + SECOND_NS // 20 + number % 10 * 1_000_000
+        clock.add_message("gnss/rover", replace(message, host_time_ns=arrival))
+    assert first_ns is not None
+    assert second_ns is not None
+    status = clock.status(HOST_0 + second_ns - first_ns + SECOND_NS // 10)
+    assert status.state is TimeState.LOCKED
+    assert status.offset_ns == pytest.approx(first_ns - HOST_0, abs=1000)
+    assert [event.code for event in clock.drain_events()] == ["second_known"]
+    assert "unplaced" not in status.messages_refused
+    assert kinds <= voters
