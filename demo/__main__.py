@@ -9,7 +9,6 @@ import argparse
 import hashlib
 import heapq
 import os
-import random
 import shutil
 import signal
 import socket
@@ -52,7 +51,7 @@ protocol = "novatel"
 pps = "main"
 
 [imu.main]
-transport = "can:udp_multicast:{group}"
+transport = "can:udp_multicast:239.74.163.2?port={can_port}"
 protocol = "canmod-gps"
 
 [scanner.top]
@@ -166,10 +165,9 @@ def prove(console: Console, logs: Path, outputs: dict[str, Hashed], report: Play
 
 def demonstrate(console: Console, folder: Path, seconds: float) -> bool:
     """Record, show, prove."""
-    data_port, position_port = free_ports(2)
+    data_port, position_port, can_port = free_ports(3)
     config_path = folder / "swath.toml"
-    group = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"  # nobody else's bus
-    text = CONFIG.format(folder=folder, group=group, data_port=data_port, position_port=position_port)
+    text = CONFIG.format(folder=folder, can_port=can_port, data_port=data_port, position_port=position_port)
     config_path.write_text(text)
     opened = open_outputs(load_config(config_path), with_pps=True)
     outputs = {source: Hashed(output) for source, output in opened.items()}
