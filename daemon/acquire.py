@@ -14,19 +14,23 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from daemon.block_queue import BlockQueue, QueueItem, SourceCount
-from daemon.channels import ChannelTable, JsonChannel
+from daemon.channels import ChannelTable
 from daemon.events import Events, Severity
 from daemon.host_clock import HostClock, StampConverter, read_clock_pair
-from daemon.log.encode import encode_block
+from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from daemon.log.format import ChannelSpec, ChunkClass
 from daemon.threads import name_thread
 from drivers.session import Session, SessionState
-from drivers.transports.base import RawEdge, UnitBlock
+from drivers.transports.base import UnitBlock
 from georef.records import Int64Array
 
 WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
 ACCOUNT_S = 0.25  # and says how much it has lost at least this often
 SILENT_AFTER_S = 3.0
+DRAIN_S = 1.0  # at the end, what the kernel already holds is still taken, for no longer than this
+MAX_SENDERS = 256  # of one UDP port with a channel each; a port scanner must not fill the log with channels
+QUEUE_TOLD_S = 1.0  # the queue counts as having room again when it refused nothing for so long
+BLOCK_BYTES = 512 * 1024  # a larger one is handed over in pieces, so that chunks stay near their 1 MiB
 
 UnitsSeen = Callable[[Int64Array, UnitBlock], None]
 
@@ -92,12 +96,14 @@ class Receiver(threading.Thread, ABC):
 
     Attributes:
         came_back_ns: CLOCK_MONOTONIC of the last return from a wait, for the watchdog.
+        failed: the thread ended by a defect.
     """
 
     def __init__(self, source: str, shared: Shared) -> None:
         super().__init__(name=source, daemon=True)
         self.source = source
         self.came_back_ns = time.monotonic_ns()
+        self.failed = False
         self.shared = shared
         self.account = _Account()
         self.stamps = StampConverter(shared.clock)
@@ -105,6 +111,8 @@ class Receiver(threading.Thread, ABC):
         self._told_state = SessionState.CLOSED
         self._told_silent = False
         self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
+        self._refused_ns: int | None = None  # CLOCK_MONOTONIC when the queue last had no room
+        self._lost_before = 0  # lost_queue when it began to have none
 
     def run(self) -> None:
         """Receive until told to stop; an error here is a defect, which the watchdog turns into a restart."""
@@ -115,6 +123,7 @@ class Receiver(threading.Thread, ABC):
                 self.came_back_ns = time.monotonic_ns()
             self.finish()
         except Exception as error:
+            self.failed = True
             text = f"receive thread failed: {type(error).__name__}: {error}"
             self.shared.events.post(Severity.CRITICAL, self.source, "receiver_failed", text)
             raise
@@ -125,12 +134,39 @@ class Receiver(threading.Thread, ABC):
         """Whether the device is being opened at this moment."""
 
     @abstractmethod
+    def take(self, timeout_s: float) -> int | None:
+        """Wait, hand over what came; the host time of the newest unit, None when there was none."""
+
+    @abstractmethod
     def receive_once(self) -> None:
         """One wait and what came of it."""
 
     @abstractmethod
     def finish(self) -> None:
         """Close the device and give the last account."""
+
+    def drain(self) -> None:
+        """Take what the kernel held when the end was asked for."""
+        ended_ns, limit_ns = self.shared.clock.now_ns(), time.monotonic_ns() + int(DRAIN_S * 1e9)
+        while time.monotonic_ns() < limit_ns:
+            newest_ns = self.take(0.0)
+            if newest_ns is None or newest_ns >= ended_ns:
+                return
+
+    def hand_over(self, block: EncodedBlock) -> None:
+        """Put a block and the account so far into the queue; what it refuses is counted, and told once an episode."""
+        now_ns = time.monotonic_ns()
+        if not self.shared.queue.put(QueueItem(self.source, block, self.account.snapshot())):
+            if self._refused_ns is None:
+                self._lost_before = self.account.lost_queue
+                text = "the writer does not keep up and its queue is full; units are being dropped and counted"
+                self.shared.events.post(Severity.CRITICAL, self.source, "queue_full", text)
+            self._refused_ns = now_ns
+            self.account.lost_queue += block.count
+        elif self._refused_ns is not None and now_ns - self._refused_ns > QUEUE_TOLD_S * 1e9:
+            self._refused_ns = None
+            text = f"the queue has room again; {self.account.lost_queue - self._lost_before} units were dropped"
+            self.shared.events.post(Severity.WARNING, self.source, "queue_drained", text)
 
     def tell_account(self, *, now: bool = False) -> None:
         """Let the recorder know the totals even when no unit came."""
@@ -201,25 +237,33 @@ class UnitReceiver(Receiver):
         """Whether the device is being opened at this moment."""
         return self._session.state is SessionState.OPENING
 
-    def receive_once(self) -> None:
+    def take(self, timeout_s: float) -> int | None:
         """Wait for units, stamp them, hand them over, then look for time in them."""
-        blocks = self._session.receive(WAIT_S)
-        if blocks:
-            times = self._stamp(blocks)
-            self._update_kernel_losses(force=False)
+        blocks = self._session.receive(timeout_s)
+        if not blocks:
+            return None
+        times = self._stamp(blocks)
+        self._update_kernel_losses(force=False)
+        for block, log_time_ns in zip(blocks, times, strict=True):
+            self._hand_over(block, log_time_ns)
+        if self._units_seen is not None:
             for block, log_time_ns in zip(blocks, times, strict=True):
-                self._hand_over(block, log_time_ns)
-            if self._units_seen is not None:
-                for block, log_time_ns in zip(blocks, times, strict=True):
-                    self._units_seen(log_time_ns, block)
+                self._units_seen(log_time_ns, block)
+        return int(times[-1][-1])
+
+    def receive_once(self) -> None:
+        """One wait; then what there is to tell of the device and of losses."""
+        took = self.take(WAIT_S) is not None
         self.tell_state(self._session.state, self._session.last_error)
-        self._update_kernel_losses(force=not blocks)
+        self._update_kernel_losses(force=not took)
         self.tell_account()
 
     def finish(self) -> None:
-        """Close; the kernel's last word on losses is read before."""
-        self._update_kernel_losses(force=True)
+        """Take the rest and close; the kernel's last word on losses is that of the closed socket."""
+        if self._session.state is SessionState.OPEN:
+            self.drain()
         self._session.close()
+        self._update_kernel_losses(force=True)
         self.tell_account(now=True)
 
     def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
@@ -240,27 +284,34 @@ class UnitReceiver(Receiver):
     def _hand_over(self, block: UnitBlock, log_time_ns: Int64Array) -> None:
         count, length = block.units.shape
         channel_id = self._channel(block.peer)
-        sequence = self._sequences[channel_id]
-        self._sequences[channel_id] = (sequence + count) & 0xFFFFFFFF
-        encoded = encode_block(channel_id, sequence, log_time_ns, block.units)
-        self.note_units(count, length, int(log_time_ns[-1]))
-        if not self.shared.queue.put(QueueItem(self.source, encoded, self.account.snapshot())):
-            if self.account.lost_queue == 0:
-                text = "the writer does not keep up and its queue is full; units are being dropped and counted"
-                self.shared.events.post(Severity.CRITICAL, self.source, "queue_full", text)
-            self.account.lost_queue += count
+        step = max(1, BLOCK_BYTES // (length + MESSAGE_HEADER_BYTES))
+        for first in range(0, count, step):
+            units, times = block.units[first : first + step], log_time_ns[first : first + step]
+            sequence = self._sequences[channel_id]
+            self._sequences[channel_id] = (sequence + len(units)) & 0xFFFFFFFF
+            self.note_units(len(units), length, int(times[-1]))
+            self.hand_over(encode_block(channel_id, sequence, times, units))
 
     def _channel(self, peer: tuple[str, int] | None) -> int:
         channel_id = self._channel_ids.get(peer)
         if channel_id is None:
-            metadata = dict(self._wire.metadata)
-            if peer is not None:
-                metadata |= {"source_address": peer[0], "source_port": str(peer[1])}
-            wire = self._wire
-            spec = ChannelSpec(wire.topic, wire.encoding, metadata, None, wire.chunk_class)
-            channel_id = self.shared.channels.add(self.source, spec)
-            self._channel_ids[peer] = channel_id
-            self._sequences[channel_id] = 0
+            if len(self._channel_ids) >= MAX_SENDERS:
+                peer = None
+            channel_id = self._channel_ids.get(peer) or self._add_channel(peer)
+        return channel_id
+
+    def _add_channel(self, peer: tuple[str, int] | None) -> int:
+        metadata = dict(self._wire.metadata)
+        if peer is not None:
+            metadata |= {"source_address": peer[0], "source_port": str(peer[1])}
+        elif self._channel_ids:
+            text = f"more than {MAX_SENDERS} senders; the further ones are recorded on one channel that names no sender"
+            self.shared.events.post(Severity.WARNING, self.source, "many_senders", text)
+        wire = self._wire
+        spec = ChannelSpec(wire.topic, wire.encoding, metadata, None, wire.chunk_class)
+        channel_id = self.shared.channels.add(self.source, spec)
+        self._channel_ids[peer] = channel_id
+        self._sequences[channel_id] = 0
         return channel_id
 
     def _update_kernel_losses(self, *, force: bool) -> None:
@@ -281,64 +332,3 @@ class UnitReceiver(Receiver):
             self._told_buffer = True
             text = f"receive buffer of {granted} bytes granted, {wanted} wanted: sysctl -w net.core.rmem_max=67108864"
             self.shared.events.post(Severity.WARNING, self.source, "receive_buffer_small", text)
-
-
-class PpsReceiver(Receiver):
-    """Takes the edges of one PPS source; every edge goes to ``/pps/<name>``, accepted by the clock or not."""
-
-    def __init__(
-        self,
-        name: str,
-        session: Session[RawEdge],
-        shared: Shared,
-        edge_seen: Callable[[int, int], None],
-    ) -> None:
-        super().__init__(f"pps/{name}", shared)
-        self._session = session
-        self._edge_seen = edge_seen
-        self._channel = JsonChannel(shared.channels, self.source, f"/pps/{name}", "swath.Pps")
-        self._sequence: int | None = None
-
-    @property
-    def opening(self) -> bool:
-        """Whether the device is being opened at this moment."""
-        return self._session.state is SessionState.OPENING
-
-    def receive_once(self) -> None:
-        """Wait for edges and hand them over."""
-        edges = self._session.receive(WAIT_S)
-        if edges:
-            stamps = np.array([edge.realtime_ns for edge in edges], dtype=np.int64)
-            times = self.stamps.convert_at(stamps, len(edges), read_clock_pair())
-            self.account.ambiguous = self.stamps.ambiguous
-            for edge, host_ns in zip(edges, times.tolist(), strict=True):
-                self._hand_over(edge, host_ns)
-        self.tell_state(self._session.state, self._session.last_error)
-        self.tell_account()
-
-    def finish(self) -> None:
-        """Close and give the last account."""
-        self._session.close()
-        self.tell_account(now=True)
-
-    def _hand_over(self, edge: RawEdge, host_ns: int) -> None:
-        self._count_missed(edge.sequence)
-        value: dict[str, object] = {
-            "edge_time_ns": host_ns,
-            "sequence": edge.sequence,
-            "edge": edge.edge,
-            "realtime_ns": edge.realtime_ns,
-        }
-        encoded = self._channel.encode(self.shared.clock.now_ns(), value)
-        self.note_units(1, len(encoded.data), host_ns)
-        if not self.shared.queue.put(QueueItem(self.source, encoded, self.account.snapshot())):
-            self.account.lost_queue += 1
-        self._edge_seen(host_ns, edge.sequence)
-
-    def _count_missed(self, sequence: int) -> None:
-        """The kernel keeps one edge: those it overwrote before they were fetched show as a jump of its sequence."""
-        previous, self._sequence = self._sequence, sequence
-        if previous is not None and 1 < sequence - previous < 1000:
-            missed = sequence - previous - 1
-            self.account.lost_kernel += missed
-            self.account.units += missed

@@ -14,7 +14,7 @@ class ChannelTable:
     """All channels of a session, in the order in which they appeared."""
 
     specs: dict[int, ChannelSpec] = field(default_factory=dict)
-    sources: dict[int, str] = field(default_factory=dict)
+    _of_source: dict[str, list[int]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, source: str, spec: ChannelSpec) -> int:
@@ -22,8 +22,13 @@ class ChannelTable:
         with self._lock:
             channel_id = len(self.specs) + 1
             self.specs[channel_id] = spec
-            self.sources[channel_id] = source
+            self._of_source.setdefault(source, []).append(channel_id)
         return channel_id
+
+    def of_source(self, source: str) -> list[int]:
+        """Ids of a source's channels."""
+        with self._lock:
+            return list(self._of_source.get(source, ()))
 
 
 class JsonChannel:

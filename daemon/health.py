@@ -45,7 +45,7 @@ def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
         return f"NOT RECORDING: {writer.reason}"
     troubles = [text for text in map(_trouble, writer.statuses.items()) if text]
     sources = len(writer.statuses)
-    told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in"
+    told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in" if sources else "begins"
     room = f"{writer.free_bytes / 1e9:.1f} GB free"
     if writer.bytes_per_s > 0:
         room += f" ({duration_text(writer.free_bytes / writer.bytes_per_s)})"

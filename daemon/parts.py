@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -56,27 +57,44 @@ class Parts:
     written: Counter[int] = field(default_factory=Counter)
     lost: Counter[int] = field(default_factory=Counter)
     _known: set[int] = field(default_factory=set)
+    _released_bytes: int = 0
     _finished: deque[tuple[float, Path]] = field(default_factory=deque)
 
-    def next_path(self) -> Path:
-        """Where the next part will be."""
-        return self.directory / f"{self.info.session_id}_{self.part + 1}.mcap"
-
-    def open_next(self, log_time_ns: int) -> None:
+    def open_next(self, log_time_ns: int) -> PartWriter | None:
         """Open the next part, with session and attachments, and say in ``recording.json`` that it is growing.
 
+        Returns:
+            The part that was current, its counts kept; the caller finishes it.
+
         Raises:
-            OSError: it cannot be created.
+            OSError: it cannot be created; the current part stays, and nothing is left of the attempt.
         """
-        path = self.next_path()
-        writer = PartWriter(path, self.info, self.part + 1, compression=self.compression)
-        for attachment in self.attachments:
-            writer.add_attachment(attachment.name, attachment.media_type, attachment.data, log_time_ns)
-        self.part += 1
-        self.current = writer
+        self.directory.mkdir(parents=True, exist_ok=True)
+        number, path = self._next()
+        writer = PartWriter(path, self.info, number, compression=self.compression)
+        try:
+            for attachment in self.attachments:
+                writer.add_attachment(attachment.name, attachment.media_type, attachment.data, log_time_ns)
+            self._write_sign(number, path)
+        except OSError:
+            writer.abandon()
+            raise
+        before = self.release()
+        self.part, self.current = number, writer
         self._known = set()
         self.opened_monotonic_s = time.monotonic()
-        self._write_sign(path)
+        return before
+
+    def _next(self) -> tuple[int, Path]:
+        """Number and path of the next part; a name that is taken is passed over, never written to."""
+        number = self.part + 1
+        while os.path.lexists(path := self.directory / f"{self.info.session_id}_{number}.mcap"):
+            number += 1
+        return number, path
+
+    def has_gone(self) -> bool:
+        """Whether the current part is no longer where it was made: removed, moved, or its folder with it."""
+        return self.current is not None and not self.current.stands_at(self.current.path)
 
     def add(self, block: EncodedBlock) -> None:
         """Lay a block into the current part; raises OSError when a chunk that it closed could not be written."""
@@ -86,14 +104,24 @@ class Parts:
             self._known.add(block.channel_id)
         self.current.add(block)
 
+    def add_last(self, writer: PartWriter, block: EncodedBlock) -> None:
+        """Lay a block into a part that has been taken out; raises OSError."""
+        writer.add_channel(block.channel_id, self.channels.specs[block.channel_id])
+        writer.add(block)
+
     def release(self) -> PartWriter | None:
         """Take the current part out, its counts kept; the caller finishes it."""
         writer, self.current = self.current, None
         if writer is not None:
             self.written.update(writer.written)
             self.lost.update(writer.lost)
+            self._released_bytes += writer.bytes_written
             self._finished.append((time.monotonic(), writer.path))
         return writer
+
+    def bytes_written(self) -> int:
+        """Size of all parts together."""
+        return self._released_bytes + (self.current.bytes_written if self.current is not None else 0)
 
     def total_written(self, channel_id: int) -> int:
         """Messages of a channel in the log, over all parts."""
@@ -116,19 +144,23 @@ class Parts:
             finally:
                 os.close(fd)
 
-    def _write_sign(self, path: Path) -> None:
+    def _write_sign(self, part: int, path: Path) -> None:
         sign = {
             "session_id": self.info.session_id,
-            "part": self.part,
+            "part": part,
             "path": path.name,
             "pid": os.getpid(),
             "boot_id": self.info.boot_id,
         }
         new = self.directory / (RECORDING_SIGN + ".new")
-        new.write_text(json.dumps(sign) + "\n")
+        with new.open("w") as file:
+            file.write(json.dumps(sign) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
         new.replace(self.directory / RECORDING_SIGN)
         sync_directory(self.directory)
 
     def remove_sign(self) -> None:
-        """Nothing is growing any more."""
-        (self.directory / RECORDING_SIGN).unlink(missing_ok=True)
+        """Nothing is growing any more; where even that cannot be said, nobody reads it either."""
+        with contextlib.suppress(OSError):
+            (self.directory / RECORDING_SIGN).unlink(missing_ok=True)

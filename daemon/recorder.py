@@ -1,7 +1,7 @@
 """The writer thread: takes blocks from the queue, lays them into the current part and accounts for every unit.
 
-For every source, always: units = written + lost_kernel + lost_queue + lost_write. A status message is written after
-all chunks that its counts speak of, so it is true of the file that it stands in, up to the place where it stands.
+A status message is written after all chunks that its counts speak of, so it is true of the file that it stands in, up
+to the place where it stands.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import logging
 import os
 import threading
 import time
-from collections import Counter
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from daemon.block_queue import BlockQueue, QueueItem, SourceCount
-from daemon.channels import ChannelTable, JsonChannel
+from daemon.account import Account, TimeStatus
+from daemon.block_queue import BlockQueue, QueueItem
+from daemon.channels import ChannelTable
 from daemon.events import Events, Severity
 from daemon.host_clock import HostClock
 from daemon.log.encode import EncodedBlock
@@ -29,17 +30,19 @@ log = logging.getLogger("swath")
 
 TAKE_S = 0.02  # pause between two looks at the queue
 STATUS_S = 1.0
+SPLIT_AGAIN_S = 10.0  # after a next part could not be opened
+RESUME_LONGEST_S = 30.0  # between two tries to write again; begins with a status period, doubles
+EVENTS_KEPT = 10_000  # while nothing can be written
 _ROOM_AGAIN = 1.05  # recording resumes with this much more than the reserve
-
-TimeStatus = Callable[[str], "dict[str, object]"]
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Writing(StrEnum):
     """Whether data reaches the disk."""
 
     RECORDING = "recording"
-    RESERVE = "reserve"  # stopped on purpose: the disk is full up to the reserve
-    FAILED = "failed"  # stopped by an error of the disk or directory
+    RESERVE = "reserve"  # stopped on purpose, or by the disk itself: it is full up to the reserve
+    FAILED = "failed"  # stopped by another error of the disk or directory
 
 
 @dataclass(slots=True)
@@ -47,7 +50,8 @@ class WriterHealth:
     """What the watchdog and people want to know, updated each second.
 
     Attributes:
-        status_ns: CLOCK_MONOTONIC when the latest status was written and synced, or the stop was looked at.
+        status_ns: CLOCK_MONOTONIC when the latest status was written and synced, or the stop for want of room was
+            looked at. An error of the disk leaves it standing.
         free_bytes: on the log's file system.
         bytes_per_s: written over the last second.
         reason: why nothing is written, in words.
@@ -58,8 +62,6 @@ class WriterHealth:
     free_bytes: int = 0
     bytes_per_s: float = 0.0
     reason: str = ""
-    write_ms_max: float = 0.0
-    sync_ms_max: float = 0.0
     statuses: dict[str, dict[str, object]] = field(default_factory=dict)
 
 
@@ -93,29 +95,28 @@ class Recorder(threading.Thread):
         self._parts = parts
         self._settings = settings
         self._queue = queue
-        self._channels = channels
         self._events = events
         self._clock = clock
-        self._time_status = time_status
-        self._counts: dict[str, SourceCount] = {}
-        self._unwritten: Counter[int] = Counter()  # messages that came while nothing could be written
-        self._status_channels: dict[str, JsonChannel] = {}
-        self._pending_events: list[EncodedBlock] = []
-        self._synced_s = time.monotonic()
+        self._account = Account(parts, channels, events, clock, time_status)
+        self._events_laid: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # of the current part, newest last
+        self._events_waiting: deque[EncodedBlock] = deque(maxlen=EVENTS_KEPT)  # for a part to come
+        self._synced_s = self._bytes_at_s = time.monotonic()
         self._status_due_s = time.monotonic() + STATUS_S
+        self._split_after_s = self._resume_after_s = 0.0
+        self._resume_wait_s = STATUS_S
         self._bytes_before = 0
-        self._mismatch_told: set[str] = set()
+        self._write_ms_max = self._sync_ms_max = 0.0
 
     # ------------------------------------------------------------------ sources and opening
 
     def add_source(self, source: str) -> None:
         """A source that gets a status; before the thread starts."""
-        self._counts[source] = SourceCount()
-        self._status_channels[source] = JsonChannel(self._channels, "status", f"/status/{source}", "swath.Status")
+        self._account.add_source(source)
 
     def open_first(self) -> None:
         """Open part 0, or stop at the reserve at once; raises OSError when the directory cannot be written."""
-        if self._free_bytes() < self._settings.reserve_bytes:
+        self.health.free_bytes = self._free_bytes() or 0
+        if self.health.free_bytes < self._settings.reserve_bytes:
             self._stop_writing(Writing.RESERVE, self._reserve_text())
             return
         self._parts.open_next(self._clock.now_ns())
@@ -127,23 +128,27 @@ class Recorder(threading.Thread):
         name_thread("writer")
         try:
             while not self.stop.is_set():
-                self._turn()
+                self.turn()
                 time.sleep(TAKE_S)
             self._take()
             self._tell_status()
             self._finish_part()
-            if self.health.state is Writing.RECORDING:
-                self._parts.remove_sign()
+            self._parts.remove_sign()
         except Exception as error:
-            log.critical("writer failed: %s: %s", type(error).__name__, error)
+            text = f"the writer failed: {type(error).__name__}: {error}"
+            log.critical("recorder writer_failed: %s", text)
+            self._stop_writing(Writing.FAILED, text)
             raise
 
-    def _turn(self) -> None:
+    def turn(self) -> None:
+        """Take what is queued, and do what is due."""
         self._take()
-        now_s = time.monotonic()
         self._guard(lambda part: part.close_due(time.monotonic_ns()))
+        now_s = time.monotonic()
         if now_s >= self._status_due_s:
-            self._status_due_s = max(self._status_due_s + STATUS_S, now_s)
+            self._status_due_s += STATUS_S
+            if self._status_due_s <= now_s:  # after a stall: one status, not one for every second of it
+                self._status_due_s = now_s + STATUS_S
             self._each_second()
         elif now_s - self._synced_s >= self._settings.fsync_s:
             self._sync()
@@ -152,14 +157,15 @@ class Recorder(threading.Thread):
             self._split()
 
     def _each_second(self) -> None:
-        if self.health.state is Writing.RECORDING:
-            self._check_room()
-        else:
+        if self.health.state is not Writing.RECORDING:
             self._try_resume()
         self._tell_status()
         self._sync()
+        if self.health.state is Writing.RECORDING:
+            self._look_after_part()
+        if self.health.state is not Writing.FAILED:
+            self.health.status_ns = time.monotonic_ns()
         self._parts.drop_page_cache()
-        self.health.status_ns = time.monotonic_ns()
 
     def _take(self) -> None:
         for item in self._queue.take_all():
@@ -167,15 +173,21 @@ class Recorder(threading.Thread):
 
     def _accept(self, item: QueueItem) -> None:
         if item.block is not None:
-            if self._parts.current is not None:
-                block = item.block
-                self._guard(lambda part: self._parts.add(block))
-            elif item.block.channel_id == self._events.channel_id:
-                self._pending_events = [*self._pending_events[-999:], item.block]
-            else:
-                self._unwritten[item.block.channel_id] += item.block.count
+            self._lay(item.block)
         if item.count is not None:
-            self._counts[item.source] = item.count
+            self._account.counts[item.source] = item.count
+
+    def _lay(self, block: EncodedBlock) -> None:
+        """Into the current part; where there is none, events wait for the next one and units are counted as lost."""
+        is_event = block.channel_id == self._events.channel_id
+        if self._parts.current is not None:
+            if is_event:
+                self._events_laid.append(block)
+            self._guard(lambda part: self._parts.add(block))
+        elif is_event:
+            self._events_waiting.append(block)
+        else:
+            self._account.unwritten[block.channel_id] += block.count
 
     def _guard(self, action: Callable[[PartWriter], None]) -> None:
         """Do something to the current part; an error of the disk stops the writing, never the recorder."""
@@ -187,111 +199,107 @@ class Recorder(threading.Thread):
             action(part)
         except OSError as error:
             self._write_failed(error)
-        self.health.write_ms_max = max(self.health.write_ms_max, (time.monotonic() - started) * 1e3)
+        self._write_ms_max = max(self._write_ms_max, (time.monotonic() - started) * 1e3)
 
     def _sync(self) -> None:
+        self._guard(lambda part: part.flush())
         part = self._parts.current
         if part is None:
             return
         started = time.monotonic()
         try:
-            part.flush()
             part.sync()
         except OSError as error:
             self._write_failed(error)
         self._synced_s = time.monotonic()
-        self.health.sync_ms_max = max(self.health.sync_ms_max, (self._synced_s - started) * 1e3)
-
-    # ------------------------------------------------------------------ accounting
+        self._sync_ms_max = max(self._sync_ms_max, (self._synced_s - started) * 1e3)
 
     def _tell_status(self) -> None:
         """Flush, so that the counts are of written chunks, then write one status a source."""
         self._guard(lambda part: part.flush())
-        statuses = {source: self._status(source) for source in self._counts}
-        self.health.statuses = statuses
-        if self._parts.current is not None:
-            now_ns = self._clock.now_ns()
-            for source, status in statuses.items():
-                block = self._status_channels[source].encode(now_ns, status)
-                self._guard(lambda part, block=block: self._parts.add(block))  # type: ignore[misc]
-            self._guard(lambda part: part.flush())
-        part = self._parts.current
-        written = part.bytes_written if part is not None else 0
-        self.health.bytes_per_s = max(0, written - self._bytes_before) / STATUS_S
-        self._bytes_before = written
-        self.health.write_ms_max = self.health.sync_ms_max = 0.0
-
-    def _status(self, source: str) -> dict[str, object]:
-        count = self._counts[source]
-        channel_ids = [id_ for id_, owner in self._channels.sources.copy().items() if owner == source]
-        written = sum(self._parts.total_written(id_) for id_ in channel_ids)
-        lost_write = sum(self._parts.total_lost(id_) + self._unwritten[id_] for id_ in channel_ids)
-        age = None if count.last_unit_ns is None else round((self._clock.now_ns() - count.last_unit_ns) * 1e-9, 3)
-        self._check_account(source, count, written, lost_write)
-        status: dict[str, object] = {
-            "bytes": count.bytes,
-            "units": count.units,
-            "written": written,
-            "lost_kernel": count.lost_kernel,
-            "lost_queue": count.lost_queue,
-            "lost_write": lost_write,
-            "last_unit_age_s": age,
-            "receive_buffer_bytes": count.receive_buffer_bytes,
-            "queue_high_water": self._queue.pop_high_water() if source == next(iter(self._counts)) else 0,
-            "write_ms_max": round(self.health.write_ms_max, 2),
-            "sync_ms_max": round(self.health.sync_ms_max, 2),
-            "state": count.state,
-            "stamp_ambiguous": count.stamp_ambiguous,
+        common = {
+            "queue_high_water": self._queue.pop_high_water(),
+            "write_ms_max": round(self._write_ms_max, 2),
+            "sync_ms_max": round(self._sync_ms_max, 2),
         }
-        return status | self._time_status(source)
+        self._write_ms_max = self._sync_ms_max = 0.0
+        statuses = self.health.statuses = self._account.statuses(common)
+        if self._parts.current is not None:
+            for block in self._account.encode(statuses):
+                self._lay(block)
+            self._guard(lambda part: part.flush())
+        self._measure_rate()
 
-    def _check_account(self, source: str, count: SourceCount, written: int, lost_write: int) -> None:
-        accounted = written + count.lost_kernel + count.lost_queue + lost_write
-        if count.units != accounted and source not in self._mismatch_told:
-            self._mismatch_told.add(source)
-            text = f"{count.units} units came, {accounted} are accounted for"
-            self._events.post(Severity.CRITICAL, source, "account_mismatch", text)
+    def _measure_rate(self) -> None:
+        now_s, written = time.monotonic(), self._parts.bytes_written()
+        if now_s > self._bytes_at_s:
+            self.health.bytes_per_s = max(0.0, (written - self._bytes_before) / (now_s - self._bytes_at_s))
+        self._bytes_at_s, self._bytes_before = now_s, written
 
     # ------------------------------------------------------------------ disk
 
-    def _free_bytes(self) -> int:
+    def _free_bytes(self) -> int | None:
+        """Free for us on the log's file system; None where the directory cannot be asked."""
         try:
             stat = os.statvfs(self._parts.directory)
         except OSError:
-            return 0
+            return None
         return stat.f_bavail * stat.f_frsize
 
     def _reserve_text(self) -> str:
-        free_mb, reserve_mb = self._free_bytes() / 1e6, self._settings.reserve_bytes / 1e6
+        free_mb, reserve_mb = self.health.free_bytes / 1e6, self._settings.reserve_bytes / 1e6
         return (
             f"{free_mb:.0f} MB free in {self._parts.directory}, reserve is {reserve_mb:.0f} MB: "
             "recording stopped until there is room"
         )
 
-    def _check_room(self) -> None:
-        self.health.free_bytes = self._free_bytes()
-        if self.health.free_bytes < self._settings.reserve_bytes:
+    def _look_after_part(self) -> None:
+        """Is there room, and is the file still where people will look for it?"""
+        if self._parts.has_gone() and time.monotonic() >= self._split_after_s:
+            self._go_on_elsewhere()
+        free_bytes = self._free_bytes()
+        if free_bytes is None or self.health.state is not Writing.RECORDING:
+            return
+        self.health.free_bytes = free_bytes
+        if free_bytes < self._settings.reserve_bytes:
             text = self._reserve_text()
-            block = self._events.make(Severity.CRITICAL, "disk", "disk_reserve", text)
-            self._guard(lambda part: self._parts.add(block))
+            self._lay(self._events.make(Severity.CRITICAL, "disk", "disk_reserve", text))
             self._finish_part()
             self._stop_writing(Writing.RESERVE, text)
+        elif time.monotonic() - self._parts.opened_monotonic_s > 2 * STATUS_S:
+            self._resume_wait_s = STATUS_S
+
+    def _go_on_elsewhere(self) -> None:
+        part = self._parts.current
+        assert part is not None
+        text = f"{part.path} is no longer there, removed or moved; recording goes on in a new part"
+        self._events.post(Severity.CRITICAL, "disk", "log_gone", text)
+        self._split()
+        if self._parts.current is part and part.is_unlinked():
+            self._write_failed(OSError(errno.ENOENT, "the log was removed and no new one can be made"))
 
     def _write_failed(self, error: OSError) -> None:
-        what = "no space left" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        no_room = error.errno in _NO_ROOM
+        what = "no space left" if no_room else (error.strerror or str(error))
         text = f"{what} in {self._parts.directory}: units are being lost and counted"
         self._finish_part()
-        self._stop_writing(Writing.FAILED, text)
+        self._stop_writing(Writing.RESERVE if no_room else Writing.FAILED, text)
         self._events.post(Severity.CRITICAL, "disk", "write_failed", text)
 
     def _stop_writing(self, state: Writing, reason: str) -> None:
         self.health.state = state
         self.health.reason = reason
-        self.health.free_bytes = self._free_bytes()
+        self.health.free_bytes = self._free_bytes() or 0
+        self._resume_after_s = time.monotonic() + self._resume_wait_s
+        self._resume_wait_s = min(2 * self._resume_wait_s, RESUME_LONGEST_S)
+        self._parts.remove_sign()
 
     def _try_resume(self) -> None:
-        self.health.free_bytes = self._free_bytes()
-        if self.health.free_bytes < self._settings.reserve_bytes * _ROOM_AGAIN:
+        free_bytes = self._free_bytes()
+        self.health.free_bytes = free_bytes or 0
+        if free_bytes is not None and free_bytes < self._settings.reserve_bytes * _ROOM_AGAIN:
+            return
+        if time.monotonic() < self._resume_after_s:
             return
         try:
             self._parts.open_next(self._clock.now_ns())
@@ -299,61 +307,69 @@ class Recorder(threading.Thread):
             self.health.reason = f"{error.strerror or error} in {self._parts.directory}: units are being lost"
             return
         self.health.state = Writing.RECORDING
-        lost = sum(self._unwritten.values())
-        self._events.post(Severity.WARNING, "disk", "recording_resumed", f"room again; {lost} units were not written")
-        for block in self._pending_events:
-            self._guard(lambda part, block=block: self._parts.add(block))  # type: ignore[misc]
-        self._pending_events = []
+        lost = self._account.lost_write()
+        waiting, self._events_waiting = self._events_waiting, deque(maxlen=EVENTS_KEPT)
+        self._events_laid.clear()
+        for block in waiting:
+            self._lay(block)
+        text = f"{lost} units of this session were not written"
+        self._events.post(Severity.WARNING, "disk", "recording_resumed", text)
 
     # ------------------------------------------------------------------ parts
 
     def _split_due(self, now_s: float) -> bool:
         part = self._parts.current
-        return part is not None and (
-            part.bytes_written >= self._settings.split_bytes
-            or now_s - self._parts.opened_monotonic_s >= self._settings.split_s
+        return (
+            part is not None
+            and now_s >= self._split_after_s
+            and (
+                part.bytes_written >= self._settings.split_bytes
+                or now_s - self._parts.opened_monotonic_s >= self._settings.split_s
+            )
         )
 
     def _split(self) -> None:
         """Open the next part and write its first chunk before the old one is finished."""
+        self._guard(lambda part: part.flush())
         if self._parts.current is None:
             return
-        self._guard(lambda part: part.flush())
-        next_name = self._parts.next_path().name
-        closing = self._events.make(Severity.INFO, "recorder", "part_closed", next_name)
-        old = self._parts.release()
         try:
-            self._parts.open_next(self._clock.now_ns())
+            old = self._parts.open_next(self._clock.now_ns())
         except OSError as error:
-            self._parts.current = None
-            self._close_old(old, None)
-            self._write_failed(error)
+            self._split_after_s = time.monotonic() + SPLIT_AGAIN_S
+            text = f"the next part cannot be opened ({error.strerror or error}); recording goes on in this one"
+            self._events.post(Severity.CRITICAL, "disk", "split_failed", text)
             return
-        opened = self._events.make(Severity.INFO, "recorder", "part_opened", next_name)
-        self._guard(lambda part: self._parts.add(opened))
+        assert old is not None
+        assert self._parts.current is not None
+        name = self._parts.current.path.name
+        self._events_laid.clear()
+        closed = self._events.make(Severity.INFO, "recorder", "part_closed", name)
+        self._lay(self._events.make(Severity.INFO, "recorder", "part_opened", name))
         self._sync()
-        self._close_old(old, closing)
-
-    def _close_old(self, old: PartWriter | None, closing: EncodedBlock | None) -> None:
-        if old is None:
-            return
-        try:
-            if closing is not None:
-                old.add(closing)
-            old.finish()
-        except OSError as error:
-            text = f"{old.path.name} could not be finished: {error.strerror or error}; swath recover completes it"
-            self._events.post(Severity.ERROR, "recorder", "part_unfinished", text)
+        self._close(old, closed)
 
     def _finish_part(self) -> None:
-        self._guard_release()
-
-    def _guard_release(self) -> None:
+        """Finish the current part; events whose chunk the disk refused wait for the next one."""
         part = self._parts.current
         if part is None:
             return
         try:
             part.flush()
         except OSError as error:
-            log.error("last chunk not written: %s", error.strerror or error)
-        self._close_old(self._parts.release(), None)
+            log.error("recorder last chunk not written: %s", error.strerror or error)
+        self._parts.release()
+        lost_events = part.lost[self._events.channel_id]
+        if lost_events:
+            self._events_waiting.extend(list(self._events_laid)[-lost_events:])
+        self._close(part, None)
+
+    def _close(self, part: PartWriter, last: EncodedBlock | None) -> None:
+        try:
+            if last is not None:
+                self._parts.add_last(part, last)
+            part.finish()
+        except OSError as error:
+            part.close()
+            text = f"{part.path.name} could not be finished: {error.strerror or error}; swath recover completes it"
+            self._events.post(Severity.ERROR, "recorder", "part_unfinished", text)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import socket
 
+SEND_S = 0.5  # a manager that does not read must not stop the loop that watches
+
 
 class ServiceManager:
     """The notify socket of the environment at start; every call is a no-op without one."""
@@ -21,8 +23,9 @@ class ServiceManager:
         """Send fields such as ``READY="1"`` or ``STATUS="recording"``."""
         if not self._address:
             return
-        message = "\n".join(f"{key}={value}" for key, value in fields.items())
+        message = "\n".join(f"{key}={' '.join(value.split())}" for key, value in fields.items())
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
+            sock.settimeout(SEND_S)
             try:
                 sock.sendto(message.encode(), self._address)
             except OSError:

@@ -5,9 +5,10 @@ Nothing here changes what is logged: a later reading of the log does all of it a
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from daemon.events import Events, Severity
@@ -62,18 +63,22 @@ class TimeKeeper:
         """What a GNSS receiver thread calls with the bytes it has just handed over."""
 
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
-            if source in self._failed:
-                return
-            try:
-                records = self._sources[source].parser.feed_batch(ChunkBatch(source, log_time_ns, block.units))
-            except Exception as error:
-                self._failed.add(source)
-                text = f"time parser failed, bytes are recorded all the same: {type(error).__name__}: {error}"
-                self._events.post(Severity.ERROR, source, "time_parser_failed", text)
-                return
-            self._take(self._sources[source], records)
+            time_source = self._sources[source]
+            with self._defects_told(source):
+                self._take(time_source, time_source.parser.feed_batch(ChunkBatch(source, log_time_ns, block.units)))
 
         return feed
+
+    @contextlib.contextmanager
+    def _defects_told(self, source: str) -> Iterator[None]:
+        """A defect in parser or clock is told once a source; it costs a time state, never the recording."""
+        try:
+            yield
+        except Exception as error:
+            if source not in self._failed:
+                self._failed.add(source)
+                text = f"time keeping failed, bytes are recorded all the same: {type(error).__name__}: {error}"
+                self._events.post(Severity.ERROR, source, "time_parser_failed", text)
 
     def _take(self, time_source: _TimeSource, records: list[Record]) -> None:
         messages = [record for record in records if isinstance(record, TimeMessage)]
@@ -92,7 +97,7 @@ class TimeKeeper:
         """What a PPS receiver thread calls with an edge's host time and sequence number."""
 
         def feed(host_ns: int, sequence: int) -> None:
-            with self._lock:
+            with self._defects_told(source), self._lock:
                 self._clocks[source].add_edge(self._timeline.raw_at(host_ns), sequence)
                 self._drain(source, self._clocks[source])
 
@@ -102,7 +107,7 @@ class TimeKeeper:
         """The host's clocks side by side, ten times a second; the wall clock may name a second where it is kept."""
         realtime_ns, monotonic_ns = int(sample["realtime_ns"]), int(sample["monotonic_ns"])
         raw_ns = int(sample["monotonic_raw_ns"])
-        with self._lock:
+        with self._defects_told("clock"), self._lock:
             self._timeline.add(realtime_ns, monotonic_ns, raw_ns)
             for clock in set(self._clocks.values()):
                 clock.set_wall_clock(
@@ -114,11 +119,12 @@ class TimeKeeper:
         clock = self._clocks.get(source)
         if clock is None:
             return {}
-        with self._lock:
+        with self._defects_told(source), self._lock:
             status = clock.status(self._timeline.raw_at(host_ns))
             self._drain(source, clock)
-        sigma_ns = round(status.sigma_ns, 1) if math.isfinite(status.sigma_ns) else None
-        return {"time_state": status.state.name, "time_sigma_ns": sigma_ns}
+            sigma_ns = round(status.sigma_ns, 1) if math.isfinite(status.sigma_ns) else None
+            return {"time_state": status.state.name, "time_sigma_ns": sigma_ns}
+        return {"time_state": "NO_TIME", "time_sigma_ns": None}
 
     def _drain(self, source: str, clock: PpsClock) -> None:
         for event in clock.drain_events():

@@ -5,6 +5,7 @@ Every chunk begins with the schemas and channels that it uses, so that it can be
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import struct
@@ -91,8 +92,20 @@ class PartWriter:
             os.fsync(self._fd)
             _sync_directory(path.parent)
         except OSError:
-            os.close(self._fd)
+            self.abandon()
             raise
+
+    def stands_at(self, path: Path) -> bool:
+        """Whether a path names this very file."""
+        try:
+            there, mine = os.stat(path), os.fstat(self._fd)
+        except OSError:
+            return False
+        return (there.st_dev, there.st_ino) == (mine.st_dev, mine.st_ino)
+
+    def is_unlinked(self) -> bool:
+        """Whether no directory names this file any more: what is written to it is gone with the process."""
+        return self._fd < 0 or os.fstat(self._fd).st_nlink == 0
 
     # ------------------------------------------------------------------ what stands outside chunks
 
@@ -175,6 +188,13 @@ class PartWriter:
         finally:
             self.close()
 
+    def abandon(self) -> None:
+        """Close and remove a file that holds no message yet, so that its name can be used again."""
+        with contextlib.suppress(OSError):
+            if self.stands_at(self.path):
+                self.path.unlink()
+        self.close()
+
     def close(self) -> None:
         """Close without an end; a second call does nothing."""
         if self._fd >= 0:
@@ -247,9 +267,9 @@ class PartWriter:
     # ------------------------------------------------------------------ the end
 
     def _write_end(self) -> None:
+        """In one piece: a file has its whole end or, where the disk refuses, none of it."""
         data_end = record_bytes(records.DataEnd(data_section_crc=0))
-        self._write([data_end])
-        summary_start = self.bytes_written
+        summary_start = self.bytes_written + len(data_end)
         sections = self._summary.sections(self._specs)
         body = b"".join(record for _, group in sections for record in group)
         offsets, position = b"", summary_start
@@ -259,10 +279,9 @@ class PartWriter:
                 offset = records.SummaryOffset(group_opcode=opcode, group_start=position, group_length=length)
                 offsets += record_bytes(offset)
             position += length
-        offset_start = summary_start + len(body)
-        footer_head = struct.pack("<BQQQ", _OP_FOOTER, 20, summary_start, offset_start)
+        footer_head = struct.pack("<BQQQ", _OP_FOOTER, 20, summary_start, summary_start + len(body))
         crc = zlib.crc32(body + offsets + footer_head)
-        self._write([body, offsets, footer_head, struct.pack("<I", crc), MAGIC])
+        self._write([data_end, body, offsets, footer_head, struct.pack("<I", crc), MAGIC])
 
     def _write(self, pieces: Sequence[Any]) -> int:
         """Write all pieces at the end of the file; returns where they begin."""

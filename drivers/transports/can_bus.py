@@ -142,7 +142,11 @@ class PythonCanTransport(DescriptorTransport):
             events = 0
         refused = self.counters.refused
         while len(messages) < MAX_FRAMES:
-            message = self._read(0.0)
+            try:
+                message = self._read(0.0)
+            except TransportError as error:
+                self._fail_after(messages, error)
+                break
             if message is None:
                 break
             messages.append(message)

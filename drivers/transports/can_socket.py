@@ -124,7 +124,8 @@ class SocketCanTransport(DescriptorTransport):
             try:
                 count = self._reader.read(self._sock.fileno())
             except OSError as error:
-                raise TransportError(self._why(error)) from error
+                self._fail_after(blocks, TransportError(self._why(error)))
+                break
             blocks += self._reader.blocks(count)
             if count < self._reader.slots:
                 break

@@ -7,6 +7,7 @@ import select
 import threading
 import time
 from abc import abstractmethod
+from collections.abc import Sized
 
 from drivers.transports.base import Transport, TransportCounters, TransportError, UnitBlock
 
@@ -67,6 +68,7 @@ class DescriptorTransport(Transport):
         self._sending = threading.Lock()
         self._counting = threading.Lock()
         self._gate: Gate | None = None
+        self._held: TransportError | None = None
 
     @abstractmethod
     def _open_device(self) -> int: ...
@@ -89,12 +91,22 @@ class DescriptorTransport(Transport):
             if self._gate is not None:
                 raise TransportError(f"{self.name}: is open already")
             self.counters = TransportCounters()
+            self._held = None
             self._gate = Gate(self._open_device())
 
     def receive(self, timeout_s: float) -> list[UnitBlock]:
         """See `Transport.receive`; returns at once, with nothing, when another thread closes."""
         with self._reading:
+            held, self._held = self._held, None
+            if held is not None:
+                raise held
             return self._receive(self._opened(), timeout_s)
+
+    def _fail_after(self, units: Sized, error: TransportError) -> None:
+        """Raise an error met while reading; after units that were read before it, with the next `receive` only."""
+        if not units:
+            raise error
+        self._held = error
 
     def send(self, data: bytes) -> None:
         """See `Transport.send`."""

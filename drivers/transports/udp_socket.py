@@ -134,7 +134,8 @@ class UdpTransport(DescriptorTransport):
             try:
                 count = self._reader.read(self._sock.fileno())
             except OSError as error:
-                raise TransportError(f"{self.name}: reading failed: {error.strerror}") from error
+                self._fail_after(blocks, TransportError(f"{self.name}: reading failed: {error.strerror}"))
+                break
             more = self._reader.blocks(count)
             blocks += more
             size += sum(block.units.size for block in more)
