@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import select
 import signal
@@ -79,7 +80,15 @@ class NotifySocket:
 class Recorder:
     """``swath run`` on a configuration, as a service manager starts it."""
 
-    def __init__(self, folder: Path, config: str, *, watchdog_s: float | None = None, prefix: list[str] | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        config: str,
+        *,
+        watchdog_s: float | None = None,
+        prefix: list[str] | None = None,
+        module: tuple[str, ...] = ("daemon.cli.main", "run"),
+    ):
         folder.mkdir(parents=True, exist_ok=True)
         self.config = folder / "swath.toml"
         self.config.write_text(config)
@@ -90,7 +99,7 @@ class Recorder:
         self.stderr_path = folder / "stderr.txt"
         with self.stderr_path.open("ab") as stderr:
             self.process = subprocess.Popen(
-                [*(prefix or []), sys.executable, "-m", "daemon.cli.main", "run", str(self.config)],
+                [*(prefix or []), sys.executable, "-m", *module, str(self.config)],
                 stderr=stderr,
                 stdout=subprocess.DEVNULL,
                 env=environment,
@@ -132,6 +141,27 @@ class Recorder:
         """SIGTERM; its exit status."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout_s)
+
+    def thread(self, name: str) -> int:
+        """Kernel id of a thread by the name it gave itself."""
+        for task in Path(f"/proc/{self.process.pid}/task").iterdir():
+            if (task / "comm").read_text().strip() == name:
+                return int(task.name)
+        raise AssertionError(f"no thread {name}")
+
+    @contextlib.contextmanager
+    def stopped_thread(self, name: str) -> Iterator[None]:
+        """One thread stands still, as before a disk that does not answer; the others go on."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        attach, detach, wait_all = 16, 17, 0x40000000
+        thread = self.thread(name)
+        if libc.ptrace(attach, thread, None, None) != 0:
+            raise AssertionError(f"ptrace: {os.strerror(ctypes.get_errno())}")
+        try:
+            os.waitpid(thread, wait_all)
+            yield
+        finally:
+            libc.ptrace(detach, thread, None, None)
 
     def kill(self) -> None:
         """SIGKILL, as a power cut would."""

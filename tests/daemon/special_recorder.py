@@ -1,0 +1,40 @@
+"""``swath run`` with a small queue, or with a defect built in: python -m tests.daemon.special_recorder KIND CONFIG."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from pathlib import Path
+from typing import NoReturn
+
+from daemon.account import Account
+from daemon.acquire import UnitReceiver
+from daemon.config import load_config
+from daemon.run import QUEUE_BYTES, record
+
+SMALL_QUEUE_BYTES = 300_000
+_started_s = time.monotonic()
+
+
+def _defect(*unused: object) -> NoReturn:
+    raise RuntimeError("a defect")
+
+
+def main(kind: str, config: Path) -> int:
+    """Record; the defect shows once the recorder has been READY for a while."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if kind == "broken-writer":
+        whole = Account.statuses
+
+        def statuses(self: Account, common: dict[str, object]) -> dict[str, dict[str, object]]:
+            return whole(self, common) if time.monotonic() < _started_s + 3.0 else _defect()
+
+        Account.statuses = statuses  # type: ignore[method-assign, assignment]
+    elif kind == "broken-receiver":
+        UnitReceiver._stamp = _defect  # type: ignore[method-assign, assignment]
+    return int(record(load_config(config), queue_bytes=SMALL_QUEUE_BYTES if kind == "small-queue" else QUEUE_BYTES))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], Path(sys.argv[2])))
