@@ -1,0 +1,300 @@
+"""The recorder's pieces one by one, on real files and sockets, without its threads."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.acquire import Shared
+from daemon.acquire_pps import PpsReceiver
+from daemon.block_queue import BlockQueue, QueueItem, SourceCount
+from daemon.channels import ChannelTable
+from daemon.events import Events, Severity
+from daemon.health import sentence, stuck_threads
+from daemon.host_clock import HostClock
+from daemon.log.encode import EncodedBlock, encode_block
+from daemon.log.format import ChannelSpec, SessionInfo
+from daemon.log.writer import PartWriter
+from daemon.parts import Attachment, Parts
+from daemon.recorder import Recorder, RecorderSettings, WriterHealth, Writing
+from daemon.sd_notify import ServiceManager
+from drivers.session import Session
+from drivers.transports.base import PpsSource, RawEdge
+from tests.daemon.log_check import official_counts, read_log
+
+SOURCE = "gnss/rover"
+SPEC = ChannelSpec("/gnss/rover/raw", "x-swath-serial", {"protocol": "nmea"})
+
+
+def block_of(channel_id: int, count: int, length: int = 100) -> EncodedBlock:
+    return encode_block(channel_id, 0, np.arange(count, dtype=np.int64), np.zeros((count, length), np.uint8))
+
+
+# --- the queue ------------------------------------------------------------------------------------------------------
+
+
+def test_queue_is_bounded_for_data_and_open_for_events_and_accounts() -> None:
+    block = block_of(1, 10)
+    queue = BlockQueue(int(2.5 * len(block.data)))
+    assert [queue.put(QueueItem(SOURCE, block)) for _ in range(4)] == [True, True, False, False]
+    assert queue.put(QueueItem(SOURCE, count=SourceCount(units=40)))
+    assert queue.put(QueueItem("events", block), always=True)
+    assert [item.source for item in queue.take_all()] == [SOURCE, SOURCE, SOURCE, "events"]
+    assert queue.pop_high_water() == 3 * len(block.data)
+    assert queue.pop_high_water() == 0
+    assert queue.put(QueueItem(SOURCE, block))
+
+
+# --- parts and the writer -------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Bench:
+    """A recorder that is turned by hand, and what it works with."""
+
+    logs: Path
+    queue: BlockQueue
+    events: Events
+    parts: Parts
+    recorder: Recorder
+    channel_id: int
+    units: int = 0
+
+    def receive(self, count: int) -> None:
+        self.units += count
+        self.queue.put(QueueItem(SOURCE, block_of(self.channel_id, count), SourceCount(units=self.units)))
+
+    def turn(self, *, second: bool = False) -> None:
+        if second:
+            self.recorder._status_due_s = 0.0
+        self.recorder.turn()
+
+    def end(self) -> None:
+        self.recorder.stop.set()
+        self.recorder.run()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
+    events = Events(clock, queue, channels)
+    info = SessionInfo("unit", "swath", "host", "boot", clock.realtime_ns, clock.monotonic_ns)
+    parts = Parts(tmp_path / "logs", info, channels, [Attachment("config.toml", "application/toml", b"# x\n")], "auto")
+    settings = RecorderSettings(1 << 30, 1800.0, 1.0, 0)
+    recorder = Recorder(parts, settings, queue, channels, events, clock, lambda source: {})
+    recorder.add_source(SOURCE)
+    made = Bench(parts.directory, queue, events, parts, recorder, channels.add(SOURCE, SPEC))
+    recorder.open_first()
+    yield made
+    if parts.current is not None:
+        parts.current.close()
+
+
+def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench) -> None:
+    sign = bench.logs / "recording.json"
+    sign.unlink()
+    (sign / "in the way").mkdir(parents=True)
+    bench.receive(5)
+    bench.recorder.new_part.set()
+    bench.turn()
+    assert [path.name for path in bench.logs.glob("*.mcap")] == ["unit_0.mcap"]
+    assert bench.recorder.health.state is Writing.RECORDING
+    assert bench.events.recent[-1].code == "split_failed"
+    (sign / "in the way").rmdir()
+    sign.rmdir()
+    bench.receive(5)
+    bench.recorder.new_part.set()
+    bench.turn()
+    bench.receive(5)
+    bench.end()
+    assert sorted(path.name for path in bench.logs.iterdir()) == ["unit_0.mcap", "unit_1.mcap"]
+    content = read_log(bench.logs)
+    assert len(content.units[SOURCE]) == 15
+    assert [official_counts(bench.logs / f"unit_{part}.mcap")["/gnss/rover/raw"] for part in (0, 1)] == [10, 5]
+
+
+def test_a_name_that_is_taken_is_never_written_to(bench: Bench) -> None:
+    (bench.logs / "unit_1.mcap").write_bytes(b"somebody's")
+    bench.recorder.new_part.set()
+    bench.turn()
+    bench.end()
+    assert (bench.logs / "unit_1.mcap").read_bytes() == b"somebody's"
+    assert read_log(bench.logs / "unit_0.mcap").events("part_closed")[0]["text"] == "unit_2.mcap"
+    assert official_counts(bench.logs / "unit_2.mcap")["/events"] == 1
+
+
+def test_a_part_without_any_event_still_ends_with_part_closed(bench: Bench) -> None:
+    bench.receive(3)
+    bench.recorder.new_part.set()
+    bench.turn()
+    bench.end()
+    assert [value["code"] for _, value in read_log(bench.logs / "unit_0.mcap").messages["/events"]] == ["part_closed"]
+
+
+def test_refused_chunk_is_counted_and_its_events_come_into_the_next_part(bench: Bench) -> None:
+    bench.receive(10)
+    bench.turn(second=True)
+    bench.events.post(Severity.WARNING, SOURCE, "silent", "told while the disk fails")
+    bench.receive(100)
+    part = bench.parts.current
+    assert part is not None
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (part.bytes_written + 10, limits[1]))
+    try:
+        bench.turn(second=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    health = bench.recorder.health
+    assert health.state is Writing.FAILED
+    assert os.strerror(errno.EFBIG) in health.reason
+    assert not (bench.logs / "recording.json").exists()
+    status_ns = health.status_ns
+    bench.receive(20)
+    bench.turn(second=True)
+    assert health.status_ns == status_ns  # an error of the disk does not feed the watchdog
+    assert health.statuses[SOURCE]["lost_write"] == 120
+    bench.recorder._resume_after_s = 0.0
+    bench.turn(second=True)
+    bench.receive(7)
+    bench.turn(second=True)
+    bench.end()
+    content = read_log(bench.logs)
+    assert len(content.units[SOURCE]) == 17
+    status = content.messages["/status/gnss/rover"][-1][1]
+    assert (status["units"], status["written"], status["lost_write"]) == (137, 17, 120)
+    codes = [value["code"] for _, value in content.messages["/events"]]
+    assert codes == ["silent", "part_unfinished", "write_failed", "recording_resumed"]
+
+
+def test_one_status_after_a_stall_and_its_maxima_are_those_since_the_one_before(bench: Bench) -> None:
+    bench.recorder._status_due_s = time.monotonic() - 30.0
+    bench.receive(5)
+    bench.turn()
+    bench.turn()
+    bench.recorder._write_ms_max = 77.0
+    bench.recorder._sync_ms_max = 88.0
+    bench.turn(second=True)
+    bench.end()
+    statuses = [value for _, value in read_log(bench.logs).messages["/status/gnss/rover"]]
+    assert len(statuses) == 3  # after the stall, the next, the last
+    assert (statuses[1]["write_ms_max"], statuses[1]["sync_ms_max"]) == (77.0, 88.0)
+    assert statuses[2]["write_ms_max"] < 77.0
+    assert statuses[0]["queue_high_water"] > 500 > statuses[1]["queue_high_water"]
+
+
+def test_a_part_is_abandoned_only_where_it_stands(tmp_path: Path) -> None:
+    info = SessionInfo("unit", "swath", "host", "boot", 1, 1)
+    writer = PartWriter(tmp_path / "a.mcap", info, 0)
+    (tmp_path / "a.mcap").rename(tmp_path / "b.mcap")
+    (tmp_path / "a.mcap").write_text("another's")
+    assert not writer.stands_at(tmp_path / "a.mcap")
+    writer.abandon()
+    assert (tmp_path / "a.mcap").read_text() == "another's"
+    assert (tmp_path / "b.mcap").exists()
+
+
+# --- PPS ------------------------------------------------------------------------------------------------------------
+
+
+class ScriptedPps(PpsSource):
+    """Edges with the sequence numbers given, all at once."""
+
+    def __init__(self, sequences: list[int]) -> None:
+        self._sequences = sequences
+
+    def open(self) -> None:
+        """Nothing to open."""
+
+    def receive(self, timeout_s: float) -> list[RawEdge]:
+        """All edges, once."""
+        sequences, self._sequences = self._sequences, []
+        return [RawEdge(time.time_ns(), sequence, "assert") for sequence in sequences]
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.mark.parametrize(("overwrites", "lost"), [(True, 4), (False, 0)])
+def test_edges_overwritten_in_the_kernel_are_units_lost(overwrites: bool, lost: int) -> None:
+    clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
+    shared = Shared(clock, queue, channels, Events(clock, queue, channels))
+    openings = [ScriptedPps([7, 8, 11, 12, 15]), ScriptedPps([2, 3])]
+    session = Session(lambda: openings.pop(0))
+    seen: list[int] = []
+    receiver = PpsReceiver("main", session, shared, lambda _, sequence: seen.append(sequence), overwrites=overwrites)
+    receiver.receive_once()
+    receiver.receive_once()
+    session._release()
+    session._open()  # the device was away: what it counted meanwhile was not ours to lose
+    receiver.receive_once()
+    receiver.finish()
+    assert seen == [7, 8, 11, 12, 15, 2, 3]
+    last = [item.count for item in queue.take_all() if item.count is not None][-1]
+    assert (last.units, last.lost_kernel) == (7 + lost, lost)
+
+
+# --- what people and the service manager are told -------------------------------------------------------------------
+
+
+def health_of(**states: dict[str, object]) -> WriterHealth:
+    whole = {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0, "state": "receiving", "last_unit_age_s": 0.1}
+    statuses = {name.replace("_", "/"): whole | state for name, state in states.items()}
+    return WriterHealth(free_bytes=100_000_000_000, bytes_per_s=10_000_000.0, statuses=statuses)
+
+
+def test_sentence_says_what_an_operator_must_know() -> None:
+    assert sentence("s", 2, health_of(gnss_rover={}, scanner_left={})) == (
+        "recording s part 2: all 2 sources are coming in; 100.0 GB free (2 h 46 min)"
+    )
+    text = sentence(
+        "s",
+        0,
+        health_of(
+            gnss_rover={"state": "silent", "last_unit_age_s": 12.4, "time_state": "HOLDOVER"},
+            scanner_left={"lost_kernel": 3, "lost_queue": 4},
+            imu_main={"state": "absent", "last_unit_age_s": None},
+        ),
+    )
+    assert "gnss/rover silent for 12 s, time HOLDOVER; scanner/left 7 units lost; imu/main absent" in text
+    stopped = WriterHealth(state=Writing.RESERVE, reason="3 MB free")
+    assert sentence("s", 0, stopped) == "NOT RECORDING: 3 MB free"
+    assert "begins" in sentence("s", 0, WriterHealth())
+
+
+def test_a_writer_without_a_recent_status_is_stuck() -> None:
+    now_ns = 100_000_000_000
+    assert stuck_threads([], WriterHealth(status_ns=now_ns - 2_900_000_000), now_ns) == []
+    assert stuck_threads([], WriterHealth(status_ns=now_ns - 3_100_000_000), now_ns) == ["writer"]
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_service_manager_is_told_on_a_path_and_on_an_abstract_socket(tmp_path: Path, abstract: bool) -> None:
+    name = f"@swath-{os.getpid()}" if abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name[1:] if abstract else name)
+        service = ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000"})
+        service.notify(READY="1", STATUS="two\nlines")
+        assert manager.recv(1000) == b"READY=1\nSTATUS=two lines"
+        assert service.watchdog_s == 2.0
+        while True:  # a manager that does not read must not stop the recorder
+            started = time.monotonic()
+            service.notify(WATCHDOG="1")
+            if time.monotonic() - started > 0.2:
+                break
+    service.notify(WATCHDOG="1")  # and one that has gone is no reason to stop
+
+
+def test_watchdog_of_another_process_is_not_ours() -> None:
+    environment = {"WATCHDOG_USEC": "2000000", "WATCHDOG_PID": "1"}
+    assert ServiceManager(environment).watchdog_s is None
+    assert ServiceManager({}).watchdog_s is None
+    ServiceManager({}).notify(READY="1")
