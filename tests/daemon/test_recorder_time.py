@@ -1,0 +1,115 @@
+"""Time while recording: a real NovAtel recording and its edges, fed through the wiring that the configuration makes."""
+
+from __future__ import annotations
+
+from heapq import merge
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.config import load_config
+from daemon.events import Event
+from daemon.host_clock import ClockDiscipline
+from daemon.run import Assembly, assemble
+from daemon.wire_player import TimedUnit
+from demo.captures import gnss_units, pps_units
+from drivers.transports.base import UnitBlock
+from georef.timescales import SECOND_NS, PpsClock
+from tests.daemon.rig import session_table
+
+SECONDS = 40
+UNDISCIPLINED = ClockDiscipline(0.0, 0x40, 16.0)
+
+
+def assembled(folder: Path, gnss: str = "", pps: str = "") -> Assembly:
+    folder.mkdir()
+    config = folder / "swath.toml"
+    config.write_text(
+        session_table(folder / "logs")
+        + f'[gnss.rover]\ntransport = "serial:{folder}/rover"\nprotocol = "novatel"\npps = "main"\n{gnss}\n'
+        + f'[pps.main]\nsource = "fixed:{folder}/pps"\n{pps}\n'
+    )
+    return assemble(load_config(config))
+
+
+def play(assembly: Assembly) -> tuple[list[str], int]:
+    """Feed the recording; the state of the PPS at each edge, and the last edge's host time."""
+    keeper, start_ns = assembly.timekeeper, assembly.clock.now_ns()
+    units_seen, edge_seen = keeper.units_seen("gnss/rover"), keeper.edge_seen("pps/main")
+    states: list[str] = []
+    edge_ns = 0
+    for unit in merge(played(), pps_units(SECONDS), key=lambda unit: unit.time_ns):
+        host_ns = start_ns + unit.time_ns
+        monotonic_ns = host_ns - assembly.clock.offset_ns
+        sample = {"realtime_ns": host_ns, "monotonic_ns": monotonic_ns, "monotonic_raw_ns": monotonic_ns}
+        if unit.source == "pps/main":
+            edge_ns = host_ns
+            keeper.clock_sample(sample, UNDISCIPLINED)
+            edge_seen(host_ns, len(states) + 1)
+            states.append(str(keeper.status("pps/main", host_ns)["time_state"]))
+        else:
+            block = UnitBlock(np.frombuffer(unit.data, np.uint8)[np.newaxis, :])
+            units_seen(np.array([host_ns], dtype=np.int64), block)
+    return states, edge_ns
+
+
+def played() -> list[TimedUnit]:
+    return list(takewhile(lambda unit: unit.time_ns < SECONDS * SECOND_NS, gnss_units()))
+
+
+def gps_of(assembly: Assembly, host_ns: int) -> int:
+    """GPS time of a host time, nanoseconds."""
+    clock: PpsClock = assembly.timekeeper._clocks["pps/main"]
+    raw_ns = assembly.timekeeper._timeline.raw_at(host_ns)
+    return int(clock.gps_from_host(np.array([raw_ns], dtype=np.int64))[0][0])
+
+
+def test_recording_and_its_edges_are_locked(tmp_path: Path) -> None:
+    assembly = assembled(tmp_path / "plain")
+    states, edge_ns = play(assembly)
+    assert states[0] != "LOCKED"
+    assert set(states[20:]) == {"LOCKED"}
+    status = assembly.timekeeper.status("gnss/rover", edge_ns)
+    assert status["time_state"] == "LOCKED"
+    assert status["time_sigma_ns"] is not None
+    assert assembly.timekeeper.status("scanner/left", edge_ns) == {}
+    whole_s = gps_of(assembly, edge_ns) / SECOND_NS
+    assert abs(whole_s - round(whole_s)) < 1e-6
+
+
+def test_delay_and_named_edge_of_the_configuration_are_honoured(tmp_path: Path) -> None:
+    seconds = {}
+    for name, keys in {
+        "plain": {},
+        "late": {"pps": "delay_ns = 250000"},
+        "next": {"gnss": 'names_edge = "next"'},
+    }.items():
+        assembly = assembled(tmp_path / name, **keys)
+        _, edge_ns = play(assembly)
+        seconds[name] = gps_of(assembly, edge_ns) / SECOND_NS
+    # an edge stamped late lies before its stamp; messages that name the next edge give this one the second before
+    assert abs(seconds["late"] - seconds["plain"] - 250e-6) < 2e-6
+    assert abs(seconds["next"] - seconds["plain"] + 1.0) < 2e-6
+
+
+@pytest.mark.parametrize("broken", ["parser", "clock"])
+def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(tmp_path: Path, broken: str) -> None:
+    assembly = assembled(tmp_path / "x")
+    keeper = assembly.timekeeper
+
+    def defect(*unused: object, **also: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    if broken == "parser":
+        keeper._sources["gnss/rover"].parser.feed_batch = defect  # type: ignore[method-assign, assignment]
+    else:
+        for method in ("add_edge", "status", "set_wall_clock"):
+            setattr(keeper._clocks["pps/main"], method, defect)
+    play(assembly)
+    told = [event for event in assembly.shared.events.recent if event.code == "time_parser_failed"]
+    assert {event.source for event in told} == ({"gnss/rover"} if broken == "parser" else {"clock", "pps/main"})
+    assert len(told) == len({event.source for event in told})
+    assert isinstance(told[0], Event)
+    assert keeper.status("pps/main", assembly.clock.now_ns())["time_state"] == "NO_TIME"
