@@ -10,6 +10,7 @@ import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,22 @@ class EncodedBlock:
     data: memoryview
 
 
+@lru_cache(maxsize=1024)
+def _layout(length: int) -> np.dtype[np.void]:
+    """A message record with ``length`` bytes of data."""
+    return np.dtype(
+        [
+            ("opcode", "u1"),
+            ("length", "<u8"),
+            ("channel", "<u2"),
+            ("sequence", "<u4"),
+            ("log_time", "<u8"),
+            ("publish_time", "<u8"),
+            ("data", "u1", (length,)),
+        ]
+    )
+
+
 def encode_block(
     channel_id: int,
     first_sequence: int,
@@ -55,17 +72,7 @@ def encode_block(
         publish_time_ns: (n,); the log time where None.
     """
     count, length = units.shape
-    layout = np.dtype(
-        [
-            ("opcode", "u1"),
-            ("length", "<u8"),
-            ("channel", "<u2"),
-            ("sequence", "<u4"),
-            ("log_time", "<u8"),
-            ("publish_time", "<u8"),
-            ("data", "u1", (length,)),
-        ]
-    )
+    layout = _layout(length)
     rows = np.empty(count, layout)
     rows["opcode"] = _OP_MESSAGE
     rows["length"] = MESSAGE_HEADER_BYTES - 9 + length
