@@ -57,17 +57,23 @@ class PtyOutput(Output):
         path.unlink(missing_ok=True)
         path.symlink_to(os.ttyname(self._slave))
         self._path = path
+        self._patience_s = _PATIENCE_S
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
-        """Write all bytes, waiting for a slow reader for a while."""
+        """Write all bytes, waiting for a slow reader for a while; one that let us wait in vain is not waited for again.
+
+        (Else a port that nobody reads would delay every other source by its patience at each unit.)
+        """
         view = memoryview(data)
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + self._patience_s
         while view:
             try:
                 view = view[os.write(self._master, view) :]
             except BlockingIOError:
                 if not select.select([], [self._master], [], max(0.0, deadline - time.monotonic()))[1]:
+                    self._patience_s = 0.0
                     return False
+        self._patience_s = _PATIENCE_S
         return True
 
     def close(self) -> None:
@@ -166,12 +172,14 @@ class PlayReport:
     Attributes:
         units, bytes: sent.
         refused: units that nobody took in time.
+        passed_over: units of sources without an output.
         latest_s: how late the latest unit was.
     """
 
     units: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
+    passed_over: Counter[str] = field(default_factory=Counter)
     latest_s: float = 0.0
 
 
@@ -201,6 +209,7 @@ def play(
     told_s = 0.0
     for unit in units:
         if unit.source not in outputs:
+            report.passed_over[unit.source] += 1
             continue
         first_ns = unit.time_ns if first_ns is None else first_ns
         due_s = (unit.time_ns - first_ns) * 1e-9 / pace

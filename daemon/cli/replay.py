@@ -20,6 +20,7 @@ def command(
 
     from daemon.config import load_config
     from daemon.errors import ExitCode, UserError
+    from daemon.log.format import LogError
     from daemon.log.reader import open_logs
     from daemon.replay import close_outputs, open_outputs, timed_units
     from daemon.wire_player import PlayReport, play
@@ -27,7 +28,10 @@ def command(
     if pace <= 0:
         raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
-    sessions = open_logs(logs)
+    try:
+        sessions = open_logs(logs)
+    except LogError as error:
+        raise UserError(str(error), exit_code=ExitCode.IO) from error
     console = Console(stderr=True)
     stop: list[int] = []
     for signum in (signal.SIGINT, signal.SIGTERM):
@@ -38,13 +42,15 @@ def command(
         raise UserError(str(error), exit_code=ExitCode.IO) from error
     try:
         for session in sessions:
+            if stop:
+                break
             columns = (
                 TextColumn("{task.description}"),
                 BarColumn(),
                 TimeElapsedColumn(),
                 TextColumn("{task.fields[told]}"),
             )
-            with Progress(*columns, console=console, transient=True) as bar:
+            with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
                 task = bar.add_task(session.session_id, total=None, told="")
 
                 def tell(seconds: float, report: PlayReport) -> None:
@@ -52,7 +58,12 @@ def command(
 
                 units = timed_units(session, with_pps=pace == 1.0)
                 report = play(units, outputs, pace=pace, progress=tell, stopped=lambda: bool(stop))
+            for source in sorted(report.passed_over):
+                console.print(f"{source}: in the log, not in {wire}; not played")
             for source in sorted(outputs):
+                if not report.units[source] and not report.refused[source]:
+                    console.print(f"{source}: nothing in {session.session_id} was played to it")
+                    continue
                 refused = f", {report.refused[source]} refused by a reader" if report.refused[source] else ""
                 console.print(f"{source}: {report.units[source]} units, {report.bytes[source]} bytes{refused}")
     finally:
