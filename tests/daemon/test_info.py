@@ -1,0 +1,97 @@
+"""``swath info``: its numbers are those of the wire, and what is wrong with a log is named."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import time
+import tty
+from pathlib import Path
+
+import pytest
+
+from drivers.core.parser import DeviceSettings
+from drivers.core.registry import find_driver
+from georef.records import ChunkBatch
+from tests.daemon.rig import Recorder, session_table
+from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_log import INFO, write_part
+
+CAPTURE = ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz"
+ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'
+
+
+def test_numbers_of_a_recording_are_those_of_a_direct_parse(tmp_path: Path) -> None:
+    import numpy as np
+
+    data = gzip.decompress(CAPTURE.read_bytes())[:200_000]
+    link, logs = tmp_path / "rover", tmp_path / "logs"
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link.symlink_to(os.ttyname(slave))
+    with Recorder(tmp_path, session_table(logs) + ROVER.format(path=link)) as recorder:
+        recorder.wait_said("gnss/rover device_opened")
+        for at in range(0, len(data), 2000):
+            os.write(master, data[at : at + 2000])
+        time.sleep(1.3)
+        assert recorder.stop() == 0, recorder.stderr()
+    os.close(master)
+    os.close(slave)
+    result = swath("info", "--json", str(logs))
+    assert result.returncode == 0, result.stdout + result.stderr
+    (session,) = json.loads(result.stdout)["sessions"]
+    rover = session["sources"]["gnss/rover"]
+    parser = find_driver("gnss", "novatel").make_parser(DeviceSettings("gnss/rover", {}, {}))
+    unit = np.frombuffer(data, np.uint8).reshape(1, -1)
+    parser.feed_batch(ChunkBatch("gnss/rover", np.array([1], np.int64), unit))
+    parser.close()
+    assert rover["bytes"] == len(data)
+    assert rover["decoded"]["messages"] == dict(parser.counters.messages)
+    assert sum(rover["decoded"]["messages"].values()) > 100
+    quick = json.loads(swath("info", "--quick", "--json", str(logs)).stdout)["sessions"][0]
+    assert "decoded" not in quick["sources"]["gnss/rover"]
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_a_missing_part_is_named_and_lines_fit(tmp_path: Path, columns: int) -> None:
+    for part in (0, 2):
+        write_part(tmp_path / f"{INFO.session_id}_{part}.mcap", part=part)
+    result = swath("info", str(tmp_path), COLUMNS=str(columns))
+    assert result.returncode == 1, result.stderr
+    assert "part 1 is missing" in result.stdout
+    assert "2,400" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= columns
+
+
+def test_damage_is_told_with_its_place(tmp_path: Path) -> None:
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    write_part(path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert "damage:" in swath("info", str(path)).stdout
+    result = swath("info", "--json", str(path))
+    assert result.returncode == 4
+    (damage,) = json.loads(result.stdout)["sessions"][0]["damage"]
+    assert damage["file"] == path.name
+    assert damage["offset"] <= len(data) // 2 < damage["offset"] + damage["length"]
+
+
+def test_the_same_log_twice_counts_once(tmp_path: Path) -> None:
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    write_part(path)
+    (session,) = json.loads(swath("info", "--json", str(path), str(tmp_path)).stdout)["sessions"]
+    assert session["sources"]["scanner/left"]["units"] == 1200
+
+
+@pytest.mark.parametrize("command", ["info", "replay"])
+def test_no_log_is_one_line(tmp_path: Path, command: str) -> None:
+    (tmp_path / "text.mcap").write_text("no log")
+    (tmp_path / "wire.toml").write_text(session_table(tmp_path))
+    wire = ["--wire", str(tmp_path / "wire.toml")] if command == "replay" else []
+    for name in ("text.mcap", "absent.mcap"):
+        result = swath(command, str(tmp_path / name), *wire)
+        assert result.returncode == 3, result
+        assert name in result.stderr
+        assert result.stderr.count("\n") == 1
