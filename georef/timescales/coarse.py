@@ -10,6 +10,9 @@ MEMORY_S = 60
 TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their second
 COARSE_SIGMA_NS = 300_000_000.0
 AMBIGUOUS_SIGMA_NS = 1e9
+RATE_SPAN_NS = 10 * SECOND_NS  # messages of so long must advance with the host's clock
+RATE_SPREAD_NS = 2 * SECOND_NS  # delays differ by less than this, stalls included
+RATE_MESSAGES = 4
 STEADY_READINGS = 3
 STEADY_SPAN_NS = 3 * SECOND_NS
 WALL_STEP_NS = 50_000_000  # a change of wall − host beyond this (and 500 ppm) starts the wall clock's probation anew
@@ -35,9 +38,15 @@ class CoarseClock:
         """All seconds named so far were off by this (the leap count was)."""
         self._offsets = deque(((host, offset + seconds * SECOND_NS) for host, offset in self._offsets), maxlen=256)
 
+    def runs_at_another_rate(self) -> bool:
+        """The last 10 s' messages drift from the host by more than delays can, the outermost on either side aside."""
+        newest_ns = self._offsets[-1][0]
+        recent = sorted(offset for host_ns, offset in self._offsets if newest_ns - host_ns <= RATE_SPAN_NS)
+        return len(recent) >= RATE_MESSAGES and recent[-2] - recent[1] > RATE_SPREAD_NS
+
     def offset_ns(self) -> int | None:
         """GPS − host: of those near the median the least delayed, less a typical delay."""
-        if not self._offsets:
+        if not self._offsets or self.runs_at_another_rate():
             return None
         ordered = sorted(offset for _, offset in self._offsets)
         median = ordered[len(ordered) // 2]

@@ -1,0 +1,25 @@
+"""Messages that run faster or slower than the host, as those of a log played at another pace, give no time."""
+
+from __future__ import annotations
+
+import pytest
+
+from georef.timescales.coarse import CoarseClock
+
+SECOND_NS = 1_000_000_000
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 4.0])
+def test_another_rate_gives_no_time(rate: float) -> None:
+    clock = CoarseClock()
+    for second in range(12):
+        clock.add(round(second * SECOND_NS / rate), (1000 + second) * SECOND_NS)
+    assert clock.offset_ns() is None
+
+
+def test_one_outlier_does_not_take_the_time_away() -> None:
+    clock = CoarseClock()
+    for second in range(12):
+        wrong = 50 * SECOND_NS if second == 6 else 0
+        clock.add(second * SECOND_NS, (1000 + second) * SECOND_NS + wrong)
+    assert clock.offset_ns() == 1000 * SECOND_NS + 250_000_000
