@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+import array
+import fcntl
 import os
 import select
 import socket
 import stat
+import termios
 import time
 import tty
 from abc import ABC, abstractmethod
@@ -40,6 +43,10 @@ class Output(ABC):
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
         """Send one unit; False when nobody took it."""
 
+    def has_reader(self) -> bool:
+        """Whether somebody has opened the other end; True where nobody can know (UDP, CAN)."""
+        return True
+
     @abstractmethod
     def close(self) -> None:
         """Close and remove what was created."""
@@ -51,13 +58,21 @@ class PtyOutput(Output):
     def __init__(self, path: Path) -> None:
         if path.exists() and not path.is_symlink():
             raise TransportError(f"{path}: is there already and is no link; give a path that may be made")
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        self._port = os.ttyname(slave)
+        os.close(slave)  # so that the master tells whether a reader is there
         os.set_blocking(self._master, False)
         path.unlink(missing_ok=True)
-        path.symlink_to(os.ttyname(self._slave))
+        path.symlink_to(self._port)
         self._path = path
         self._patience_s = _PATIENCE_S
+
+    def has_reader(self) -> bool:
+        """Whether the port is open at the other end."""
+        poll = select.poll()
+        poll.register(self._master, 0)
+        return not any(event & select.POLLHUP for _, event in poll.poll(0))
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
         """Write all bytes, waiting for a slow reader for a while; one that let us wait in vain is not waited for again.
@@ -77,10 +92,22 @@ class PtyOutput(Output):
         return True
 
     def close(self) -> None:
-        """Remove the link and hang up."""
+        """Let a reader take the last bytes, which hanging up would throw away; remove the link, hang up."""
+        if self.has_reader():
+            self._drain()
         self._path.unlink(missing_ok=True)
         os.close(self._master)
-        os.close(self._slave)
+
+    def _drain(self) -> None:
+        port = os.open(self._port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+        deadline = time.monotonic() + self._patience_s
+        waiting = array.array("i", [1])
+        try:
+            while waiting[0] and time.monotonic() < deadline:
+                fcntl.ioctl(port, termios.FIONREAD, waiting)
+                time.sleep(0.01)
+        finally:
+            os.close(port)
 
 
 class UdpOutput(Output):
@@ -136,21 +163,37 @@ class PpsOutput(Output):
         elif not stat.S_ISFIFO(path.stat().st_mode):
             raise TransportError(f"{path}: is there already and is no FIFO; remove it or give another path")
         self._path = path
-        self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+        self._fd = -1
         self._sequence = 0
+
+    def has_reader(self) -> bool:
+        """Whether somebody reads the FIFO; opens it then."""
+        if self._fd < 0:
+            try:
+                self._fd = os.open(self._path, os.O_WRONLY | os.O_NONBLOCK)
+            except OSError:
+                return False
+        return True
 
     def send(self, data: bytes, due_realtime_ns: int) -> bool:
         """Write the edge that is due now; its data are not used."""
         self._sequence += 1
+        if not self.has_reader():
+            return False
         try:
             os.write(self._fd, f"{due_realtime_ns} {self._sequence}\n".encode())
         except BlockingIOError:
+            return False
+        except BrokenPipeError:
+            os.close(self._fd)
+            self._fd = -1
             return False
         return True
 
     def close(self) -> None:
         """Close and remove the FIFO."""
-        os.close(self._fd)
+        if self._fd >= 0:
+            os.close(self._fd)
         self._path.unlink(missing_ok=True)
 
 
@@ -163,6 +206,16 @@ def open_output(spec: TransportSpec) -> Output:
     if spec.kind == "serial":
         return PtyOutput(Path(spec.address))
     return UdpOutput(spec) if spec.kind == "udp" else CanOutput(spec)
+
+
+def wait_for_readers(outputs: Mapping[str, Output], seconds: float, stopped: Callable[[], bool]) -> list[str]:
+    """Wait until every port and FIFO has a reader; the sources of those that have none after ``seconds``."""
+    deadline = time.monotonic() + seconds
+    while missing := [source for source, output in outputs.items() if not output.has_reader()]:
+        if time.monotonic() >= deadline or stopped():
+            return missing
+        time.sleep(0.05)
+    return []
 
 
 @dataclass(slots=True)

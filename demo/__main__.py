@@ -78,6 +78,10 @@ class Hashed(Output):
             self.bytes += len(data)
         return sent
 
+    def has_reader(self) -> bool:
+        """As the output itself."""
+        return self._output.has_reader()
+
     def close(self) -> None:
         """Close."""
         self._output.close()

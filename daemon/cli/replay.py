@@ -13,6 +13,7 @@ def command(
     logs: Annotated[list[Path], typer.Argument(help="Logs, or a directory of them.", metavar="LOG…")],
     wire: Annotated[Path, typer.Option(help="Configuration that names the ports, buses and FIFOs to play to.")],
     pace: Annotated[float, typer.Option(help="Times as fast as recorded; other than 1 no PPS is written.")] = 1.0,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for a reader at every port and FIFO.", min=0)] = 10.0,
 ) -> None:
     """Play a log's bytes back to ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
     from rich.console import Console
@@ -23,7 +24,7 @@ def command(
     from daemon.log.format import LogError
     from daemon.log.reader import open_logs
     from daemon.replay import close_outputs, open_outputs, timed_units
-    from daemon.wire_player import PlayReport, play
+    from daemon.wire_player import PlayReport, play, wait_for_readers
 
     if pace <= 0:
         raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
@@ -41,6 +42,8 @@ def command(
     except OSError as error:
         raise UserError(str(error), exit_code=ExitCode.IO) from error
     try:
+        for source in wait_for_readers(outputs, wait, lambda: bool(stop)):
+            console.print(f"{source}: nobody has opened it; playing all the same")
         for session in sessions:
             if stop:
                 break

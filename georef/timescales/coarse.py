@@ -10,7 +10,8 @@ MEMORY_S = 60
 TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their second
 COARSE_SIGMA_NS = 300_000_000.0
 AMBIGUOUS_SIGMA_NS = 1e9
-RATE_SPAN_NS = 10 * SECOND_NS  # messages of so long must advance with the host's clock
+RATE_SPAN_NS = 20 * SECOND_NS  # messages of so long must advance with the host's clock
+SETTLED_SPAN_NS = 5 * SECOND_NS  # before so long nobody can tell at which rate they advance
 RATE_SPREAD_NS = 2 * SECOND_NS  # delays differ by less than this, stalls included
 RATE_MESSAGES = 4
 STEADY_READINGS = 3
@@ -38,8 +39,16 @@ class CoarseClock:
         """All seconds named so far were off by this (the leap count was)."""
         self._offsets = deque(((host, offset + seconds * SECOND_NS) for host, offset in self._offsets), maxlen=256)
 
+    def settled(self) -> bool:
+        """Messages have come for long enough to be believed, and advance with the host's clock."""
+        if not self._offsets or self._offsets[-1][0] - self._offsets[0][0] < SETTLED_SPAN_NS:
+            return False
+        return not self.runs_at_another_rate()
+
     def runs_at_another_rate(self) -> bool:
-        """The last 10 s' messages drift from the host by more than delays can, the outermost on either side aside."""
+        """The last 20 s' messages drift from the host by more than delays can, the outermost on either side aside."""
+        if not self._offsets:
+            return False
         newest_ns = self._offsets[-1][0]
         recent = sorted(offset for host_ns, offset in self._offsets if newest_ns - host_ns <= RATE_SPAN_NS)
         return len(recent) >= RATE_MESSAGES and recent[-2] - recent[1] > RATE_SPREAD_NS

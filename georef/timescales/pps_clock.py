@@ -338,10 +338,11 @@ class PpsClock:
         ambiguous = self._train is not None and self._train.doubtful
         sigma = AMBIGUOUS_SIGMA_NS if ambiguous else COARSE_SIGMA_NS
         wall = self._wall.utc_offset_ns(host_ns)
-        offset, last = self._coarse.offset_ns(), self._coarse.last_host_ns
+        last = self._coarse.last_host_ns
+        offset = self._coarse.offset_ns() if self._coarse.settled() else None
         if last is not None and offset is not None and host_ns - last <= COARSE_FOR_NS:
             return TimeState.COARSE, offset, sigma
-        if wall is not None:
+        if wall is not None and not self._coarse.runs_at_another_rate():
             leap = self.leaps.on("", utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)[0])
             self._leap = self._leap or leap
             return TimeState.COARSE, gps_ns_from_unix(wall, leap.seconds), max(self._wall.sigma_ns, sigma)

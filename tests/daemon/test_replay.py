@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -17,11 +19,11 @@ from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_tab
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
-SECONDS = 4
+SECONDS = 18
 
 
 def record_first(folder: Path) -> LogContent:
-    """A log of two parts' worth of wires: datagrams, sentences and edges of a few seconds."""
+    """A log of two parts: datagrams, sentences and edges of some seconds."""
     port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
     folder.mkdir()
     os.mkfifo(fifo)
@@ -33,58 +35,94 @@ def record_first(folder: Path) -> LogContent:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         recorder.wait_said("device_opened", times=3)
+        start = time.time_ns() + 200_000_000
         with one_processor():
             for second in range(SECONDS):
-                edges.write(f"{time.time_ns()} {second + 1}\n")
+                due = start + second * 1_000_000_000
+                time.sleep(max(0.0, (due - time.time_ns()) * 1e-9))
+                edges.write(f"{due} {second + 1}\n")
                 edges.flush()
-                pty.write(nmea_zda(second))
+                time.sleep(0.2)
+                pty.write(nmea_zda(40_000 + second))
                 for _ in range(50):
                     sender.sendto(os.urandom(400), ("127.0.0.1", port))
-                time.sleep(0.5)
+                if second == SECONDS // 2:
+                    recorder.process.send_signal(signal.SIGHUP)
         time.sleep(0.5)
         assert recorder.stop() == 0, recorder.stderr()
     pty.unplug()
+    assert len(list((folder / "logs").glob("*.mcap"))) == 2
     return read_log(folder / "logs")
 
 
-@pytest.mark.parametrize("pace", ["1", "2"])
-def test_a_second_recorder_gets_the_same_bytes(tmp_path: Path, pace: str) -> None:
-    first = record_first(tmp_path / "first")
-    port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
-    config = session_table(tmp_path / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LogContent]:
+    folder = tmp_path_factory.mktemp("replay") / "first"
+    return folder / "logs", record_first(folder)
+
+
+def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogContent, str]:
+    """Play logs to a second recorder that was there first; what it recorded, and what replay said."""
+    port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
+    config = session_table(folder / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
     config += (
         f'[scanner.right]\ntransport = "udp:127.0.0.1:{free_udp_port()}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
     )
-    with Recorder(tmp_path / "second", config) as recorder:
-        wires = str(recorder.config)
+    with Recorder(folder, config) as recorder:
         recorder.wait_said("scanner/left device_opened")
-        command = [sys.executable, "-m", "daemon.cli.main", "replay", "--pace", pace, "--wire", wires]
-        # the recorder looks again for ports that were absent: the log's own start must not be over by then
-        os.mkfifo(fifo)
-        pty = PtyOutput(link)
-        recorder.wait_said("gnss/rover device_opened")
-        recorder.wait_said("pps/main device_opened")
-        pty.close()
-        recorder.wait_said("gnss/rover device_lost")
+        command = [sys.executable, "-m", "daemon.cli.main", "replay", "--pace", pace, "--wire", str(recorder.config)]
         played = subprocess.run(
-            [*command, str(tmp_path / "first/logs")], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+            [*command, "--wait", "30", str(logs)], cwd=ROOT, capture_output=True, text=True, timeout=90, check=False
         )
         assert played.returncode == 0, played.stderr
-        time.sleep(0.5)
+        time.sleep(1.2)
         assert recorder.stop() == 0, recorder.stderr()
-    second = read_log(tmp_path / "logs")
-    datagrams = [[data for _, data in log.units["scanner/left"]] for log in (first, second)]
+    return read_log(folder / "logs"), played.stderr
+
+
+def same_bytes(one: LogContent, other: LogContent) -> None:
+    assert other.data("gnss/rover") == one.data("gnss/rover")
+    datagrams = [[data for _, data in log.units["scanner/left"]] for log in (one, other)]
     assert datagrams[0] == datagrams[1]
-    edges = [value["edge_time_ns"] for _, value in second.messages["/pps/main"]]
-    assert len(edges) == (SECONDS if pace == "1" else 0)
-    before = [value["edge_time_ns"] for _, value in first.messages["/pps/main"]]
-    for (old, new), (old_next, new_next) in zip(
-        list(zip(before, edges, strict=False))[:-1], list(zip(before, edges, strict=False))[1:], strict=True
-    ):
-        assert abs((new_next - new) - (old_next - old)) < 50_000  # a stamp is slewed with the wall clock, no more
-    assert "scanner/right: nothing in" in played.stderr
-    states = {value["time_state"] for _, value in second.messages["/status/pps/main"]}
-    assert "LOCKED" not in states
+
+
+def time_states(content: LogContent) -> list[str]:
+    return [value["time_state"] for _, value in content.messages["/status/pps/main"]]
+
+
+def test_a_second_recorder_gets_the_same_bytes_edges_and_seconds(
+    tmp_path: Path, first: tuple[Path, LogContent]
+) -> None:
+    logs, before = first
+    after, said = replay_into_a_recorder(tmp_path, logs, "1")
+    same_bytes(before, after)
+    edges = [[value["edge_time_ns"] for _, value in log.messages["/pps/main"]] for log in (before, after)]
+    assert len(edges[1]) == SECONDS
+    steps = [[late - early for early, late in pairwise(times)] for times in edges]
+    # a stamp follows the wall clock, which may be slewed by 500 ppm; the writer's own rounding is a nanosecond
+    assert all(abs(new - old) < 1_000_000 for old, new in zip(*steps, strict=True)), steps
+    assert time_states(before)[-1] == time_states(after)[-1] == "LOCKED"
+    known = [log.events("second_known") for log in (before, after)]
+    assert [[event["text"] for event in events] for events in known] == [["by gnss/rover ZDA"]] * 2
+    # the sentence that names a second comes as long after its edge as it did
+    delays = [arrival_after_edge(log) for log in (before, after)]
+    assert all(abs(new - old) < 0.1 for old, new in zip(*delays, strict=True)), delays
+    assert "scanner/right: nothing in" in said
+
+
+def arrival_after_edge(content: LogContent) -> list[float]:
+    """Seconds from each edge to the first sentence behind it."""
+    arrivals = [time_ns for time_ns, _ in content.units["gnss/rover"]]
+    edges = [value["edge_time_ns"] for _, value in content.messages["/pps/main"]]
+    return [min(arrival - edge for arrival in arrivals if arrival > edge) * 1e-9 for edge in edges]
+
+
+def test_at_another_pace_there_are_no_edges_and_no_time(tmp_path: Path, first: tuple[Path, LogContent]) -> None:
+    logs, before = first
+    after, _ = replay_into_a_recorder(tmp_path, logs, "2")
+    same_bytes(before, after)
+    assert after.messages["/pps/main"] == []
+    assert set(time_states(after)) == {"NO_TIME"}
 
 
 def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> None:
