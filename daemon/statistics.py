@@ -65,6 +65,7 @@ class SourceNumbers:
     status: dict[str, Any] | None = None
     time_states: Counter[str] = field(default_factory=Counter)
     account_errors: int = 0
+    miscounted: int = 0
     parser: Parser | None = None
     records: Counter[str] = field(default_factory=Counter)
 
@@ -77,16 +78,16 @@ class SourceNumbers:
         self.intervals.add(times_ns)
 
     def add_status(self, status: dict[str, Any]) -> None:
-        """A status: its equation must hold, and ``written`` be what has been read before it."""
+        """A status: its equation must hold, and ``written`` be what has been read before it, unless some is missing."""
         self.status = status
         units, written, *lost = (int(status.get(key, 0)) for key in _ACCOUNT)
-        if units != written + sum(lost) or written != self.units:
-            self.account_errors += 1
+        self.account_errors += units != written + sum(lost)
+        self.miscounted += written != self.units
         if "time_state" in status:
             self.time_states[str(status["time_state"])] += 1
 
-    def plain(self) -> dict[str, Any]:
-        """For ``--json``."""
+    def plain(self, *, complete: bool) -> dict[str, Any]:
+        """For ``--json``; of a complete log every status must agree with the units read before it."""
         first, last = self.first_ns, self.last_ns
         duration_s = (last - first) * 1e-9 if first is not None and last is not None else 0.0
         status = self.status or {}
@@ -98,7 +99,7 @@ class SourceNumbers:
             "longest_gap_at_ns": self.intervals.longest_at_ns or None,
             "gaps": self.intervals.gaps(),
             "lost": {key: int(status.get(key, 0)) for key in _ACCOUNT[2:]},
-            "account_errors": self.account_errors,
+            "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
         }
         if self.time_states:
@@ -144,6 +145,7 @@ def session_statistics(
     for numbers in sources.values():
         if numbers.parser is not None:
             numbers.records.update(type(record).__name__ for record in numbers.parser.close())
+    complete = not session.missing_parts and not session.damage
     return {
         "session_id": session.session_id,
         "software": session.info.software,
@@ -155,7 +157,7 @@ def session_statistics(
         "parts": [part.path.name for part in session.parts],
         "missing_parts": session.missing_parts,
         "attachments": sorted(attachments),
-        "sources": {source: numbers.plain() for source, numbers in sorted(sources.items())},
+        "sources": {source: numbers.plain(complete=complete) for source, numbers in sorted(sources.items())},
         "events": dict(Counter(str(event["severity"]) for event in events)),
         "last_events": [event for event in events if event["severity"] != "info"][-10:],
         "damage": [
@@ -188,6 +190,7 @@ def _take(
                 numbers.records[type(record).__name__] += 1 if rows is None else len(rows)
     elif topic.startswith("/status/"):
         numbers = sources.setdefault(topic.removeprefix("/status/"), SourceNumbers())
-        numbers.add_status(json.loads(batch.units[-1].tobytes()))
+        for row in batch.units:
+            numbers.add_status(json.loads(row.tobytes()))
     elif topic == "/events":
         events += [json.loads(row.tobytes()) for row in batch.units]

@@ -152,8 +152,13 @@ def _copy_chunk(
     schemas: dict[int, str],
     report: RecoveryReport,
 ) -> None:
+    try:
+        batches = list(chunk_batches(found.body, channels, schemas))
+    except LogError as error:
+        report.damage.append(Damage(found.offset, found.length, str(error)))
+        return
     report.chunks += 1
-    for batch in chunk_batches(found.body, channels, schemas):
+    for batch in batches:
         report.messages[batch.channel.topic] += len(batch.units)
         if writer is not None:
             writer.add_channel(batch.channel_id, batch.channel)

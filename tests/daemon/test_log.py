@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -308,6 +309,30 @@ def test_files_that_are_no_logs_are_refused_in_a_line(tmp_path: Path) -> None:
         open_logs([tmp_path / "nothing"])
     with pytest.raises(LogError, match="no logs"):
         open_logs([empty])
+
+
+def test_a_strangers_chunk_with_a_malformed_channel_costs_that_chunk_only(
+    tmp_path: Path, whole: tuple[Path, Content]
+) -> None:
+    records = struct.pack("<BQ", 4, 3) + b"abc"  # a channel record is longer; the chunk's CRC is right
+    chunk = (
+        struct.pack("<QQQII", 0, 0, len(records), zlib.crc32(records), 0) + struct.pack("<Q", len(records)) + records
+    )
+    data = whole[0].read_bytes()
+    first_chunk = next(
+        found.offset
+        for found in scan(io.BytesIO(data), len(data))
+        if not isinstance(found, Damage) and found.opcode == 6
+    )
+    path = tmp_path / "stranger.mcap"
+    path.write_bytes(data[:first_chunk] + struct.pack("<BQ", 6, len(chunk)) + chunk + data[first_chunk:])
+    (session,) = open_logs([path])
+    assert read_all(session) == whole[1]
+    assert [entry.damage.offset for entry in session.damage] == [first_chunk]
+    report = recover(path)
+    assert [entry.offset for entry in report.damage] == [first_chunk]
+    assert report.recovered is not None
+    assert official(report.recovered) == whole[1]
 
 
 # ------------------------------------------------------------------ parts

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -123,6 +125,19 @@ def test_at_another_pace_there_are_no_edges_and_no_time(tmp_path: Path, first: t
     same_bytes(before, after)
     assert after.messages["/pps/main"] == []
     assert set(time_states(after)) == {"NO_TIME"}
+
+
+def test_info_of_a_session_whose_first_part_is_missing_names_it_and_blames_no_count(
+    tmp_path: Path, first: tuple[Path, LogContent]
+) -> None:
+    second = sorted(first[0].glob("*.mcap"))[1]
+    shutil.copy(second, tmp_path / second.name)
+    command = [sys.executable, "-m", "daemon.cli.main", "info", "--json", str(tmp_path)]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert told.returncode == 1, told.stderr
+    (session,) = json.loads(told.stdout)["sessions"]
+    assert session["missing_parts"] == [0]
+    assert {source["account_errors"] for source in session["sources"].values()} == {0}
 
 
 def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> None:
