@@ -1,7 +1,8 @@
 """Reads an MCAP file record by record, whole or cut off, trusting nothing: lengths are bounded, every CRC is checked.
 
 One pass, forward, a chunk in memory at a time. What is wrong is given as `Damage` and the reading goes on at the next
-place where a record can begin.
+chunk that is whole. Records outside chunks have no CRC, so each must be what its opcode says: a damaged one that were
+believed would lead past good chunks without a word.
 """
 
 from __future__ import annotations
@@ -26,10 +27,16 @@ MAX_CHUNK_BYTES = 256 << 20
 MAX_RECORD_BYTES = 256 << 20
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
+_COMPRESSION_NAME_MAX_BYTES = 32
+_CHUNK_HEAD_MAX_BYTES = _CHUNK_HEAD.size + _COMPRESSION_NAME_MAX_BYTES + 8  # and the length of the records
+_MESSAGE_FIXED_BYTES = 22  # channel, sequence, log time, publish time
 
 OP_HEADER, OP_FOOTER, OP_SCHEMA, OP_CHANNEL, OP_MESSAGE = 1, 2, 3, 4, 5
-OP_CHUNK, OP_MESSAGE_INDEX, OP_ATTACHMENT, OP_METADATA, OP_DATA_END = 6, 7, 9, 12, 15
+OP_CHUNK, OP_MESSAGE_INDEX, OP_ATTACHMENT, OP_STATISTICS, OP_METADATA, OP_DATA_END = 6, 7, 9, 11, 12, 15
 _OPCODES = frozenset(range(1, 16))
+# From 0x80 on opcodes are anybody's and passed over. One that is a bit away from the specification's is rather damage.
+_FIRST_PRIVATE_OPCODE = 0x90
+_FOOTER_BYTES = 20
 _CONTENT: dict[int, type[records.McapRecord]] = {
     OP_HEADER: records.Header,
     OP_SCHEMA: records.Schema,
@@ -74,40 +81,100 @@ class Damage:
     messages: int | None = None
 
 
-def scan(file: BinaryIO, size: int) -> Iterator[Record | Damage]:
-    """All records of the data section, in order, and every damage; ends at the data's end, the footer or the cut.
+def scan(file: BinaryIO, size: int, *, chunks: bool = True) -> Iterator[Record | Damage]:
+    """All records of the data section, in order, and every damage; ends at the data's end or the cut.
+
+    Args:
+        file: seekable.
+        size: read no further.
+        chunks: False passes over chunks without reading them.
 
     Raises:
         LogError: it is no MCAP file.
     """
+    held: Damage | None = None
+    for found in _scan(file, size, chunks=chunks):
+        if isinstance(found, Damage):
+            if held is not None and (held.offset + held.length, held.what) == (found.offset, found.what):
+                found = _joined(held, found)
+            elif held is not None:
+                yield held
+            held = found
+        else:
+            if held is not None:
+                yield held
+                held = None
+            yield found
+    if held is not None:
+        yield held
+
+
+def _scan(file: BinaryIO, size: int, *, chunks: bool) -> Iterator[Record | Damage]:
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         raise LogError("is no MCAP file")
     offset = len(MAGIC)
-    lost_from: int | None = None
     while offset < size:
-        found = _read_record(file, offset, size)
-        if isinstance(found, Record):
-            if lost_from is not None:
-                yield Damage(lost_from, offset - lost_from, "unreadable bytes")
-                lost_from = None
-            yield found
-            if found.opcode in (OP_DATA_END, OP_FOOTER):
-                return
-            offset += found.length
-        elif found.length:
-            yield found
-            offset += found.length
-        else:
-            lost_from = offset if lost_from is None else lost_from
+        found = _read_record(file, offset, size, chunks=chunks)
+        if isinstance(found, Damage) and not found.length:
             resumed = _resync(file, offset + 1, size)
             if resumed is None:
                 cut = _is_cut(file, offset, size)
                 what = "the file ends within a record" if cut else "unreadable bytes up to the end"
-                yield Damage(lost_from, size - lost_from, what)
+                yield Damage(offset, size - offset, what)
                 return
+            yield Damage(offset, resumed - offset, "unreadable bytes")
+            offset = resumed
+            continue
+        if not isinstance(found, Record) or chunks or found.opcode != OP_CHUNK:
+            yield found
+        offset += found.length
+        if isinstance(found, Record) and found.opcode == OP_DATA_END:
+            if _end_is_whole(file, offset, size):
+                return
+            resumed = _resync(file, offset, size)
+            if resumed is None:
+                yield Damage(offset, size - offset, "index and footer are missing, cut off or wrong")
+                return
+            yield Damage(offset, resumed - offset, "unreadable bytes")
             offset = resumed
     yield Damage(size, 0, "the file has no end: its index and footer were never written")
+
+
+def _joined(one: Damage, other: Damage) -> Damage:
+    known = one.messages is not None and other.messages is not None
+    messages = (one.messages or 0) + (other.messages or 0) if known else None
+    return Damage(one.offset, one.length + other.length, one.what, messages)
+
+
+def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
+    """The records between the data's end, at ``offset``, and the footer, of a file whose end `scan` found whole."""
+    while offset + _HEAD.size <= size:
+        file.seek(offset)
+        opcode, length = _HEAD.unpack(file.read(_HEAD.size))
+        if opcode == OP_FOOTER or length > MAX_RECORD_BYTES or offset + _HEAD.size + length > size:
+            return
+        yield Record(opcode, offset, _HEAD.size + length, file.read(length))
+        offset += _HEAD.size + length
+
+
+def _end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
+    """Whether a summary that its CRC confirms, the footer and the magic stand from here to the end of the file."""
+    footer_at = size - len(MAGIC) - _FOOTER_BYTES - _HEAD.size
+    if footer_at < offset:
+        return False
+    file.seek(footer_at)
+    tail = file.read(size - footer_at)
+    if tail[: _HEAD.size] != _HEAD.pack(OP_FOOTER, _FOOTER_BYTES) or not tail.endswith(MAGIC):
+        return False
+    summary_start, _, expected = struct.unpack_from("<QQI", tail, _HEAD.size)
+    if summary_start != (offset if footer_at > offset else 0):
+        return False
+    crc = 0
+    file.seek(offset)
+    for at in range(offset, footer_at, _RESYNC_STEP):
+        crc = zlib.crc32(file.read(min(_RESYNC_STEP, footer_at - at)), crc)
+    return bool(expected == 0 or zlib.crc32(tail[: _HEAD.size + _FOOTER_BYTES - 4], crc) == expected)
 
 
 def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
@@ -121,7 +188,7 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
     return opcode in _OPCODES and length <= MAX_RECORD_BYTES and beyond
 
 
-def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
+def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True) -> Record | Damage:
     """The record at an offset; `Damage` of length 0 where none can begin there."""
     file.seek(offset)
     head = file.read(_HEAD.size)
@@ -130,28 +197,63 @@ def _read_record(file: BinaryIO, offset: int, size: int) -> Record | Damage:
         return nothing
     opcode, length = _HEAD.unpack(head)
     total = _HEAD.size + length
-    if opcode not in _OPCODES or length > MAX_RECORD_BYTES or offset + total > size:
+    if opcode == 0 or length > MAX_RECORD_BYTES or offset + total > size:
         return nothing
+    if opcode not in _OPCODES:
+        if not _may_begin(file, offset + total, size):
+            return nothing
+        private = opcode >= _FIRST_PRIVATE_OPCODE
+        return Record(opcode, offset, total, b"") if private else Damage(offset, total, "record of an unknown kind")
     if opcode != OP_CHUNK:
-        return _outside_chunks(opcode, offset, total, file.read(length))
-    body = file.read(length)
-    if len(body) < _CHUNK_HEAD.size or not _plausible_chunk(body):
+        return _outside_chunks(file, opcode, offset, total, size)
+    start = file.read(min(length, _CHUNK_HEAD_MAX_BYTES))
+    if not _plausible_chunk(start, length):
         return nothing
+    if not chunks and _may_begin(file, offset + total, size):
+        return Record(opcode, offset, total, b"")
+    file.seek(offset + _HEAD.size)
     try:
-        return Record(opcode, offset, total, unpack_chunk(body))
+        return Record(opcode, offset, total, unpack_chunk(file.read(length)))
     except LogError as error:
         return Damage(offset, total, str(error), _indexed_messages(file, offset + total, size))
 
 
-def _outside_chunks(opcode: int, offset: int, total: int, body: bytes) -> Record | Damage:
+def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
+    """Whether the head of a record of the specification stands here, or the file ends."""
+    file.seek(offset)
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return offset + len(head) == size
+    opcode, length = _HEAD.unpack(head)
+    return opcode in _OPCODES and length <= MAX_RECORD_BYTES
+
+
+def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: int) -> Record | Damage:
     """A record that has no CRC of its own (but an attachment's): its content must be what its opcode says."""
+    nothing = Damage(offset, 0, "")
+    length = total - _HEAD.size
+    if opcode not in _CONTENT:
+        body = file.read(min(length, 6))
+        if opcode == OP_MESSAGE_INDEX:
+            entries = int.from_bytes(body[2:6], "little")
+            return Record(opcode, offset, total, b"") if entries == length - 6 and not entries % 16 else nothing
+        if opcode == OP_DATA_END:
+            return Record(opcode, offset, total, body) if length == 4 else nothing
+        if opcode == OP_MESSAGE and length >= _MESSAGE_FIXED_BYTES and _may_begin(file, offset + total, size):
+            return Damage(offset, total, "messages outside a chunk, which no CRC covers", 1)
+        return nothing  # what else there is stands behind the data's end
+    body = file.read(length)
     if opcode == OP_ATTACHMENT and not _attachment_is_whole(body):
-        return Damage(offset, total, "attachment with a wrong CRC")
+        whole_frame = _may_begin(file, offset + total, size)
+        return Damage(offset, total, "attachment with a wrong CRC") if whole_frame else nothing
     try:
-        if opcode in _CONTENT:
-            parse_record(_CONTENT[opcode], body)
+        stream = ReadDataStream(io.BytesIO(body))
+        _parse(_CONTENT[opcode], stream)
     except LogError as error:
-        return Damage(offset, total, str(error))
+        return Damage(offset, total, str(error)) if _may_begin(file, offset + total, size) else nothing
+    # a later version may have appended fields, which are passed over
+    if stream.count != length and not _may_begin(file, offset + total, size):
+        return nothing
     return Record(opcode, offset, total, body)
 
 
@@ -161,19 +263,27 @@ def parse_record(kind: type[RecordT], body: bytes) -> RecordT:
     Raises:
         LogError: it is not what its opcode says.
     """
+    return _parse(kind, ReadDataStream(io.BytesIO(body)))
+
+
+def _parse(kind: type[RecordT], stream: ReadDataStream) -> RecordT:
     try:
-        parsed: RecordT = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
+        parsed: RecordT = kind.read(stream)  # type: ignore[attr-defined]
     except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
         raise LogError(f"{kind.__name__} record that cannot be read: {error}") from error
     return parsed
 
 
-def _plausible_chunk(body: bytes) -> bool:
-    name_length: int = _CHUNK_HEAD.unpack_from(body)[4]
-    at = _CHUNK_HEAD.size + name_length
-    if name_length > 32 or len(body) < at + 8:
+def _plausible_chunk(start: bytes, length: int) -> bool:
+    """Whether a chunk of a length, in full, begins so: its lengths agree with each other."""
+    if len(start) < _CHUNK_HEAD.size + 8:
         return False
-    return int(struct.unpack_from("<Q", body, at)[0]) == len(body) - at - 8
+    size, name_length = _CHUNK_HEAD.unpack_from(start)[2], _CHUNK_HEAD.unpack_from(start)[4]
+    at = _CHUNK_HEAD.size + name_length
+    if name_length > _COMPRESSION_NAME_MAX_BYTES or len(start) < at + 8:
+        return False
+    stored = int(struct.unpack_from("<Q", start, at)[0])
+    return bool(stored == length - at - 8 and (name_length > 0 or stored == size))
 
 
 def unpack_chunk(body: bytes) -> bytes:
@@ -190,8 +300,8 @@ def unpack_chunk(body: bytes) -> bytes:
     records = _decompress(name, stored, size)
     if len(records) != size:
         raise LogError(f"chunk holds {len(records)} bytes instead of {size}")
-    if crc and zlib.crc32(records) != crc:
-        raise LogError("chunk with a wrong CRC")
+    if zlib.crc32(records) != crc:
+        raise LogError("chunk with a wrong CRC" if crc else "chunk without a CRC")
     return records
 
 
