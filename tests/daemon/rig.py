@@ -151,17 +151,35 @@ class Recorder:
 
     @contextlib.contextmanager
     def stopped_thread(self, name: str) -> Iterator[None]:
-        """One thread stands still, as before a disk that does not answer; the others go on."""
+        """One thread stands still, as before a disk that does not answer; the others go on.
+
+        Where it was stopped it may hold the interpreter's lock, and everything would stand still: then it is let go
+        and stopped again elsewhere.
+        """
         libc = ctypes.CDLL(None, use_errno=True)
         attach, detach, wait_all = 16, 17, 0x40000000
         thread = self.thread(name)
-        if libc.ptrace(attach, thread, None, None) != 0:
-            raise AssertionError(f"ptrace: {os.strerror(ctypes.get_errno())}")
-        try:
+        for _ in range(20):
+            if libc.ptrace(attach, thread, None, None) != 0:
+                raise AssertionError(f"ptrace: {os.strerror(ctypes.get_errno())}")
             os.waitpid(thread, wait_all)
+            if self._others_go_on():
+                break
+            libc.ptrace(detach, thread, None, None)
+            time.sleep(0.003)
+        else:
+            raise AssertionError(f"the others never went on without {name}")
+        try:
             yield
         finally:
             libc.ptrace(detach, thread, None, None)
+
+    def _others_go_on(self) -> bool:
+        """Whether the main thread, which looks at its clocks ten times a second, still does."""
+        status = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/status")
+        before = status.read_text()
+        time.sleep(0.5)
+        return before.split("voluntary_ctxt_switches")[1] != status.read_text().split("voluntary_ctxt_switches")[1]
 
     def kill(self) -> None:
         """SIGKILL, as a power cut would."""
