@@ -35,11 +35,11 @@ async def repair_left_open(
     directory: Path, reserve_bytes: int, is_current: Callable[[Path], bool], events: Events
 ) -> None:
     """Repair what a crash left open; waits while there is no room, ends when nothing is left to do."""
-    given_up: set[Path] = set()
+    tried: set[Path] = set()
     told_room = False
     while True:
         candidates = await asyncio.to_thread(unfinished_logs, directory)
-        waiting = [path for path in candidates if path not in given_up and not is_current(path)]
+        waiting = [path for path in candidates if path not in tried and not is_current(path)]
         if not waiting:
             return
         path = waiting[0]
@@ -50,11 +50,11 @@ async def repair_left_open(
                 events.post(Severity.WARNING, "recorder", "repair_waits", text)
             await asyncio.sleep(_LOOK_AGAIN_S)
             continue
-        if not await _repair(path, reserve_bytes, events):
-            given_up.add(path)
+        await _repair(path, reserve_bytes, events)
+        tried.add(path)
 
 
-async def _repair(path: Path, reserve_bytes: int, events: Events) -> bool:
+async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:
     """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
     # a child inherits the recorder's real-time priority: it must be idle before its interpreter even starts
     command = ["chrt", "--idle", "0"] if shutil.which("chrt") else []
@@ -75,8 +75,7 @@ async def _repair(path: Path, reserve_bytes: int, events: Events) -> bool:
     if process.returncode in (0, 4):
         text = f"{path.name}, left open by a crash, was repaired beside it"
         events.post(Severity.INFO, "recorder", "log_repaired", text)
-        return True
+        return
     lines = errors.decode(errors="replace").strip().splitlines()
     text = f"{path.name} could not be repaired: {lines[-1] if lines else f'exit status {process.returncode}'}"
     events.post(Severity.WARNING, "recorder", "repair_failed", text)
-    return False

@@ -80,7 +80,7 @@ class SourceNumbers:
     def add_status(self, status: dict[str, Any]) -> None:
         """A status: its equation must hold, and ``written`` be what has been read before it, unless some is missing."""
         self.status = status
-        units, written, *lost = (int(status.get(key, 0)) for key in _ACCOUNT)
+        units, written, *lost = (_count(status, key) for key in _ACCOUNT)
         self.account_errors += units != written + sum(lost)
         self.miscounted += written != self.units
         if "time_state" in status:
@@ -98,7 +98,7 @@ class SourceNumbers:
             "longest_gap_s": round(self.intervals.longest_ns * 1e-9, 6),
             "longest_gap_at_ns": self.intervals.longest_at_ns or None,
             "gaps": self.intervals.gaps(),
-            "lost": {key: int(status.get(key, 0)) for key in _ACCOUNT[2:]},
+            "lost": {key: _count(status, key) for key in _ACCOUNT[2:]},
             "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
         }
@@ -156,10 +156,11 @@ def session_statistics(
         "bytes": sum(part.path.stat().st_size for part in session.parts),
         "parts": [part.path.name for part in session.parts],
         "missing_parts": session.missing_parts,
+        "growing": None if session.growing is None else session.growing.name,
         "attachments": sorted(attachments),
         "sources": {source: numbers.plain(complete=complete) for source, numbers in sorted(sources.items())},
-        "events": dict(Counter(str(event["severity"]) for event in events)),
-        "last_events": [event for event in events if event["severity"] != "info"][-10:],
+        "events": dict(Counter(str(event.get("severity")) for event in events)),
+        "last_events": [event for event in events if event.get("severity") != "info"][-10:],
         "damage": [
             {
                 "file": entry.path.name,
@@ -190,7 +191,25 @@ def _take(
                 numbers.records[type(record).__name__] += 1 if rows is None else len(rows)
     elif topic.startswith("/status/"):
         numbers = sources.setdefault(topic.removeprefix("/status/"), SourceNumbers())
-        for row in batch.units:
-            numbers.add_status(json.loads(row.tobytes()))
+        for value in _objects(batch):
+            numbers.add_status(value)
     elif topic == "/events":
-        events += [json.loads(row.tobytes()) for row in batch.units]
+        events += _objects(batch)
+
+
+def _objects(batch: LogBatch) -> list[dict[str, Any]]:
+    """JSON messages; a stranger's that are no objects are left out."""
+    values = []
+    for row in batch.units:
+        try:
+            value = json.loads(row.tobytes())
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(value, dict):
+            values.append(value)
+    return values
+
+
+def _count(status: dict[str, Any], key: str) -> int:
+    value = status.get(key)
+    return value if isinstance(value, int) else 0

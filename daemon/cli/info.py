@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,22 +30,32 @@ def command(
     from daemon.log.reader import open_logs
     from daemon.statistics import session_statistics
 
+    passed_over: list[str] = []
     try:
-        sessions = open_logs(logs)
+        sessions = open_logs(logs, passed_over)
         with Console(stderr=True).status("reading"):
             found = [session_statistics(session, decode=not quick) for session in sessions]
     except LogError as error:
         raise UserError(str(error), ExitCode.IO) from error
     if as_json:
-        print(json.dumps({"sessions": found}, indent=2))
+        print(json.dumps({"sessions": found, "passed_over": passed_over}, indent=2))
     else:
         console = Console()
         for numbers in found:
             _print_session(console, numbers)
-    if any(numbers["damage"] for numbers in found):
+        for line in passed_over:
+            console.print(f"[red]passed over: {_plain(line)}[/]", highlight=False)
+    if passed_over or any(numbers["damage"] for numbers in found):
         raise typer.Exit(int(ExitCode.DAMAGE))
     if any(numbers["missing_parts"] or _unaccounted(numbers) for numbers in found):
         raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _plain(text: object) -> str:
+    """Whatever a log holds, in a line, and no markup to the console."""
+    from rich.markup import escape
+
+    return escape(one_line(str(text)))
 
 
 def _unaccounted(numbers: dict[str, Any]) -> int:
@@ -56,9 +66,14 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     from rich.table import Table
 
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
-    console.print(f"[bold]{numbers['session_id']}[/]  {start:%Y-%m-%d %H:%M:%S} UTC, {numbers['duration_s']:.1f} s")
+    console.print(
+        f"[bold]{_plain(numbers['session_id'])}[/]  {start:%Y-%m-%d %H:%M:%S} UTC, {numbers['duration_s']:.1f} s"
+    )
     parts = f"{len(numbers['parts'])} part{'s' if len(numbers['parts']) != 1 else ''}, {numbers['bytes'] / 1e6:.1f} MB"
-    console.print(f"{parts}, {numbers['software']} on {numbers['host']} ({numbers['origin']})")
+    origin = _plain(f"{numbers['software']} on {numbers['host']} ({numbers['origin']})")
+    console.print(f"{parts}, {origin}")
+    if numbers["growing"] is not None:
+        console.print(f"{_plain(numbers['growing'])} is being recorded; so far", highlight=False)
     for number in numbers["missing_parts"]:
         console.print(f"[red]part {number} is missing[/]")
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -69,20 +84,21 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     console.print(table)
     for source, values in numbers["sources"].items():
         if "decoded" in values:
-            console.print(f"{source}: {_decoded(values['decoded'])}", highlight=False)
+            console.print(f"{_plain(source)}: {_plain(_decoded(values['decoded']))}", highlight=False)
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
     else:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
     for event in numbers["last_events"]:
-        console.print(f"  {event['severity']}: {event['source']} {event['code']}: {event['text']}", highlight=False)
+        severity, origin, code, text = (_plain(event.get(key, "?")) for key in ("severity", "source", "code", "text"))
+        console.print(f"  {severity}: {origin} {code}: {text}", highlight=False)
     for damage in numbers["damage"]:
         messages = "" if damage["messages"] is None else f", {damage['messages']} messages"
         text = f"{damage['file']} at byte {damage['offset']}: {damage['length']} bytes, {damage['what']}{messages}"
-        console.print(f"[red]damage: {text}[/]", highlight=False)
+        console.print(f"[red]damage: {_plain(text)}[/]", highlight=False)
     for note in numbers["notes"]:
-        console.print(f"note: {note}", highlight=False)
+        console.print(f"note: {_plain(note)}", highlight=False)
 
 
 def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
@@ -90,7 +106,7 @@ def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
     losses = f"{lost['lost_kernel']}/{lost['lost_queue']}/{lost['lost_write']}"
     rate = "" if values["rate_hz"] is None else f"{values['rate_hz']:,.1f}"
     return (
-        source,
+        _plain(source),
         f"{values['units']:,}",
         f"{values['bytes'] / 1e6:,.2f}",
         rate,
@@ -106,7 +122,8 @@ def _time(values: dict[str, Any]) -> str:
     if state is None:
         return ""
     sigma = values["time_sigma_ns"]
-    return f"{state} ±{sigma / 1e3:.1f}µs" if sigma is not None and sigma < 1e6 else str(state)
+    told = f" ±{sigma / 1e3:.1f}µs" if isinstance(sigma, (int, float)) and sigma < 1e6 else ""
+    return _plain(state) + told
 
 
 def _decoded(decoded: dict[str, Any]) -> str:

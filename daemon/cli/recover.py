@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
     from daemon.log.recover import RecoveryReport
@@ -31,42 +31,56 @@ def command(
 ) -> None:
     """Check every CRC, save what is whole into LOG.recovered.mcap, say exactly what was lost.
 
-    The log itself is never touched. Exit code 4 when damage was found.
+    The log itself is never touched. Of a directory, logs that are being recorded and those already recovered are left
+    alone. Exit code 4 when damage was found, 3 when a log could not be recovered; the others are all the same.
     """
     from daemon.log.format import LogError
-    from daemon.log.reader import RECOVERED
     from daemon.log.recover import recover
 
     if background:
         _at_idle_priority()
     reports = []
-    for path in _files(logs, RECOVERED):
+    refused: list[str] = []
+    for path in _files(logs, output):
         try:
-            reports.append(recover(path, output, keep_free_bytes=round(keep_free_mb * 1e6)))
+            report = recover(path, output, keep_free_bytes=round(keep_free_mb * 1e6))
         except LogError as error:
-            raise UserError(str(error), ExitCode.IO) from error
+            refused.append(str(error))
         except OSError as error:
-            raise UserError(f"{path}: {error.strerror or error}", ExitCode.IO) from error
+            refused.append(f"{path}: {error.strerror or error}")
+        else:
+            reports.append(report)
+            if not as_json:
+                _print_report(report)
     if as_json:
-        print(json.dumps({"logs": [report.plain() for report in reports]}, indent=2))
-    else:
-        for report in reports:
-            _print_report(report)
+        print(json.dumps({"logs": [report.plain() for report in reports], "refused": refused}, indent=2))
+    elif not reports and not refused:
+        print("nothing to recover: all are being recorded, or have been recovered before")
+    if refused:
+        raise UserError("\n".join(map(one_line, refused)), ExitCode.IO)
     if not all(report.whole for report in reports):
         raise typer.Exit(int(ExitCode.DAMAGE))
 
 
-def _files(paths: list[Path], recovered: str) -> list[Path]:
+def _files(paths: list[Path], output: Path | None) -> list[Path]:
+    """The files named, and those of directories that may need it."""
+    from daemon.log.claim import is_being_written
+    from daemon.log.reader import RECOVERED
+
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            files += sorted(file for file in path.glob("*.mcap") if not file.name.endswith(recovered))
+            found = sorted(path.glob("*.mcap"))
+            if not found:
+                raise UserError(f"{path}: no logs (*.mcap) there", ExitCode.IO)
+            for file in found:
+                copy = (output or path) / (file.name.removesuffix(".mcap") + RECOVERED)
+                if not (file.name.endswith(RECOVERED) or copy.exists() or is_being_written(file)):
+                    files.append(file)
         elif path.is_file():
             files.append(path)
         else:
             raise UserError(f"{path}: no such file or directory", ExitCode.IO)
-    if not files:
-        raise UserError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there", ExitCode.IO)
     return files
 
 
@@ -75,7 +89,8 @@ def _print_report(report: RecoveryReport) -> None:
     if report.whole:
         print(f"{report.path}: whole, {report.chunks} chunks, {count} messages; nothing to do")
         return
-    print(f"{report.path}: {report.chunks} good chunks, {count} messages saved in {report.recovered}")
+    lost = "" if report.messages_lost is None else f", {report.messages_lost} lost"
+    print(f"{report.path}: {report.chunks} good chunks, {count} messages saved in {report.recovered}{lost}")
     for item in report.damage:
         messages = "" if item.messages is None else f", {item.messages} messages lost"
         print(f"  at byte {item.offset}: {item.length} bytes, {item.what}{messages}")

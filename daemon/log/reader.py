@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from mcap import records
 
+from daemon.log.claim import is_being_written
 from daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, ChunkClass, LogError, SessionInfo
 from daemon.log.scan import (
     OP_ATTACHMENT,
@@ -78,11 +80,18 @@ class Part:
 
 @dataclass(slots=True)
 class Session:
-    """One recording: its parts, and what was found wrong while reading them."""
+    """One recording: its parts, and what was found while reading them.
+
+    Attributes:
+        damage: what could not be read.
+        growing: the part that was being written meanwhile; that it has no end yet is no damage.
+    """
 
     info: SessionInfo
     parts: list[Part]
     damage: list[PartDamage] = field(default_factory=list)
+    growing: Path | None = None
+    _noted: set[PartDamage] = field(default_factory=set, repr=False)
 
     @property
     def session_id(self) -> str:
@@ -107,7 +116,7 @@ class Session:
         """
         held: list[LogBatch] = []
         for chunk in self._chunks(topics):
-            chunk = [batch for batch in chunk if len(batch.log_time_ns)]
+            chunk = [run for batch in chunk for run in _in_order(batch)]
             held += chunk
             newest_ns = min((int(batch.log_time_ns.min()) for batch in chunk), default=None)
             if newest_ns is not None:
@@ -119,7 +128,7 @@ class Session:
         """Attachments by name, of the first part that has each."""
         found: dict[str, bytes] = {}
         for part in self.parts:
-            for record in self._records(part):
+            for record in self._records(part, chunks=False):
                 if record.opcode == OP_ATTACHMENT:
                     attachment = parse_record(records.Attachment, record.body)
                     found.setdefault(attachment.name, attachment.data)
@@ -131,39 +140,58 @@ class Session:
             schemas: dict[int, str] = {}
             for record in self._records(part):
                 if record.opcode == OP_CHUNK:
+                    orphans: Counter[int] = Counter()
                     try:
-                        yield list(chunk_batches(record.body, channels, schemas, topics))
+                        yield list(chunk_batches(record.body, channels, schemas, topics, orphans))
                     except LogError as error:
                         self._note(part, Damage(record.offset, record.length, str(error)))
+                    if orphans:
+                        self._note(part, orphan_damage(record, orphans))
                 elif record.opcode == OP_CHANNEL:
                     _take_channel(record.body, channels, schemas)
                 elif record.opcode == OP_SCHEMA:
                     _take_schema(record.body, schemas)
 
-    def _records(self, part: Part) -> Iterator[Record]:
+    def _records(self, part: Part, *, chunks: bool = True) -> Iterator[Record]:
+        growing = is_being_written(part.path)
         with part.path.open("rb") as file:
             size = part.path.stat().st_size
-            for found in scan(file, size):
+            for found in scan(file, size, chunks=chunks):
                 if isinstance(found, Record):
                     yield found
+                elif growing and found.offset + found.length == size:
+                    self.growing = part.path
                 else:
                     self._note(part, found)
 
     def _note(self, part: Part, damage: Damage) -> None:
         entry = PartDamage(part.path, damage)
-        if entry not in self.damage:
+        if entry not in self._noted:
+            self._noted.add(entry)
             self.damage.append(entry)
 
 
-def open_logs(paths: Sequence[Path | str]) -> list[Session]:
+def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None) -> list[Session]:
     """Sessions of logs and of directories of them, in order of time.
+
+    Args:
+        paths: files and directories.
+        passed_over: takes a line for each file of a directory that is no log, as a crash at a part's very beginning
+            leaves one; where None, such a file is an error like one that was named.
 
     Raises:
         LogError: a file is no log, or there is none.
     """
     by_session: dict[str, list[Part]] = {}
+    named = {Path(path) for path in paths}
     for path in _files([Path(path) for path in paths]):
-        part = read_part_head(path)
+        try:
+            part = read_part_head(path)
+        except LogError as error:
+            if passed_over is None or path in named:
+                raise
+            passed_over.append(str(error))
+            continue
         by_session.setdefault(part.info.session_id, []).append(part)
     if not by_session:
         raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there")
@@ -227,22 +255,40 @@ def read_part_head(path: Path) -> Part:
 
 
 def chunk_batches(
-    data: bytes, channels: dict[int, ChannelSpec], schemas: dict[int, str], topics: TopicFilter | None = None
+    data: bytes,
+    channels: dict[int, ChannelSpec],
+    schemas: dict[int, str],
+    topics: TopicFilter | None = None,
+    orphans: Counter[int] | None = None,
 ) -> Iterator[LogBatch]:
-    """Messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way."""
+    """Messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way.
+
+    Args:
+        data: the chunk's records.
+        channels, schemas: known so far, by id.
+        topics: which are wanted.
+        orphans: counts messages of channels that no record has described; without it they are an error.
+
+    Raises:
+        LogError: a record is malformed.
+    """
     at, size = 0, len(data)
     array = np.frombuffer(data, np.uint8)
     while at + _HEAD.size <= size:
         opcode, length = _HEAD.unpack_from(data, at)
         end = at + _HEAD.size + length
         if end > size:
-            return
+            raise LogError("chunk in which a record reaches beyond its end")
         if opcode == OP_MESSAGE and length >= _MESSAGE_HEAD - _HEAD.size:
             stride = end - at
             count = _run_length(array, at, stride)
             channel_id = int.from_bytes(data[at + 9 : at + 11], "little")
             spec = channels.get(channel_id)
-            if spec is not None and (topics is None or topics(spec.topic)):
+            if spec is None:
+                if orphans is None:
+                    raise LogError(f"chunk with messages of channel {channel_id}, whose record is lost")
+                orphans[channel_id] += count
+            elif topics is None or topics(spec.topic):
                 yield _batch(spec, channel_id, array[at : at + count * stride].reshape(count, stride))
             end = at + count * stride
         elif opcode == OP_CHANNEL:
@@ -250,6 +296,12 @@ def chunk_batches(
         elif opcode == OP_SCHEMA:
             _take_schema(data[at + _HEAD.size : end], schemas)
         at = end
+
+
+def orphan_damage(chunk: Record, orphans: Counter[int]) -> Damage:
+    """What is lost of a good chunk where the record of a channel was lost with another chunk."""
+    which = ", ".join(map(str, sorted(orphans)))
+    return Damage(chunk.offset, chunk.length, f"messages of channel {which}, whose record is lost", orphans.total())
 
 
 def _run_length(array: ByteRows, at: int, stride: int) -> int:
@@ -284,6 +336,13 @@ def _take_schema(body: bytes, schemas: dict[int, str]) -> None:
 
 
 # ---------------------------------------------------------------------- merging by time
+
+
+def _in_order(batch: LogBatch) -> Iterator[LogBatch]:
+    """A batch split where its times step back: stamps of one socket come from several processors."""
+    steps_back = np.flatnonzero(np.diff(batch.log_time_ns) < 0) + 1
+    for first, last in pairwise([0, *steps_back.tolist(), len(batch.log_time_ns)]):
+        yield _slice(batch, first, last)
 
 
 def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], list[LogBatch]]:

@@ -11,22 +11,27 @@ import shutil
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 from mcap import records
 
+from daemon.log.claim import is_being_written
 from daemon.log.encode import encode_raw
 from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
-from daemon.log.reader import RECOVERED, chunk_batches, read_part_head
+from daemon.log.reader import RECOVERED, chunk_batches, orphan_damage, read_part_head
 from daemon.log.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
     OP_CHUNK,
+    OP_DATA_END,
     OP_METADATA,
     OP_SCHEMA,
+    OP_STATISTICS,
     Damage,
     Record,
     parse_record,
     scan,
+    summary_records,
 )
 from daemon.log.writer import PartWriter
 
@@ -40,7 +45,7 @@ class RecoveryReport:
         recovered: the copy; None where the log was whole and nothing was written.
         chunks: good ones. messages: in them, by topic.
         damage: every stretch that could not be read.
-        duplicate_of: the copy was there already.
+        messages_lost: in all, where the statistics at the end of the original are whole; None: unknown.
     """
 
     path: Path
@@ -48,6 +53,7 @@ class RecoveryReport:
     chunks: int = 0
     messages: Counter[str] = field(default_factory=Counter)
     damage: list[Damage] = field(default_factory=list)
+    messages_lost: int | None = None
 
     @property
     def whole(self) -> bool:
@@ -68,6 +74,7 @@ class RecoveryReport:
             "chunks": self.chunks,
             "messages": dict(self.messages),
             "lost_bytes": self.lost_bytes,
+            "messages_lost": self.messages_lost,
             "damage": [
                 {"offset": item.offset, "length": item.length, "what": item.what, "messages": item.messages}
                 for item in self.damage
@@ -93,11 +100,13 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
         keep_free_bytes: the copy is given up when less would stay free.
 
     Raises:
-        LogError: it is no log, the copy is there already, or there is no room for it.
+        LogError: it is no log, it is being recorded, the copy is there already, or there is no room for it.
         OSError: the copy cannot be written.
     """
     folder = path.parent if destination is None else destination
     target = folder / (path.name.removesuffix(".mcap") + RECOVERED)
+    if is_being_written(path):
+        raise LogError(f"{path}: is being recorded; there is nothing to recover yet")
     report = examine(path)
     if report.whole:
         return report
@@ -126,23 +135,38 @@ def _pass(path: Path, copy: Path | None) -> RecoveryReport:
     writer = None if copy is None else PartWriter(copy, head.info, head.number, compression="auto")
     channels: dict[int, ChannelSpec] = {}
     schemas: dict[int, str] = {}
+    end: Record | None = None
     try:
         with path.open("rb") as file:
-            for found in scan(file, path.stat().st_size):
+            size = path.stat().st_size
+            for found in scan(file, size):
                 if isinstance(found, Damage):
                     report.damage.append(found)
+                    end = None
                 elif found.opcode == OP_CHUNK:
                     _copy_chunk(found, writer, channels, schemas, report)
                 elif found.opcode in (OP_CHANNEL, OP_SCHEMA):
                     list(chunk_batches(_as_chunk(found), channels, schemas))
+                elif found.opcode == OP_DATA_END:
+                    end = found
                 elif writer is not None:
                     _copy_outside(found, writer)
+            said = None if end is None else _messages_said(file, end, size)
+            report.messages_lost = None if said is None else said - report.messages.total()
         if writer is not None:
             writer.finish()
     finally:
         if writer is not None:
             writer.close()
     return report
+
+
+def _messages_said(file: BinaryIO, end: Record, size: int) -> int | None:
+    """How many messages the statistics of a file whose end is whole speak of; None where it has none."""
+    for found in summary_records(file, end.offset + end.length, size):
+        if found.opcode == OP_STATISTICS:
+            return parse_record(records.Statistics, found.body).message_count
+    return None
 
 
 def _copy_chunk(
@@ -152,11 +176,14 @@ def _copy_chunk(
     schemas: dict[int, str],
     report: RecoveryReport,
 ) -> None:
+    orphans: Counter[int] = Counter()
     try:
-        batches = list(chunk_batches(found.body, channels, schemas))
+        batches = list(chunk_batches(found.body, channels, schemas, orphans=orphans))
     except LogError as error:
         report.damage.append(Damage(found.offset, found.length, str(error)))
         return
+    if orphans:
+        report.damage.append(orphan_damage(found, orphans))
     report.chunks += 1
     for batch in batches:
         report.messages[batch.channel.topic] += len(batch.units)

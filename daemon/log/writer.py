@@ -21,6 +21,7 @@ import lz4.frame
 import zstandard
 from mcap import records
 
+from daemon.log.claim import claim
 from daemon.log.encode import EncodedBlock, message_index
 from daemon.log.format import (
     CHUNK_BYTES,
@@ -86,6 +87,7 @@ class PartWriter:
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
         self._summary = Summary()
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
+        claim(self._fd)
         try:
             self._write([MAGIC, record_bytes(records.Header(profile=PROFILE, library=LIBRARY))])
             self.add_metadata(SESSION_METADATA, session.to_metadata(part))
@@ -145,6 +147,8 @@ class PartWriter:
         Raises:
             LogWriteError: the chunk could not be written; its messages are counted in ``lost``.
         """
+        if not block.count:
+            return
         spec = self._specs[block.channel_id]
         chunk = self._chunks.get(spec.chunk_class)
         if chunk is None:
@@ -180,11 +184,16 @@ class PartWriter:
         os.fdatasync(self._fd)
 
     def finish(self) -> None:
-        """Write index and footer, make them durable, close; raises `LogWriteError`. The file is closed either way."""
+        """Write index and footer, make them durable, close; raises `LogWriteError`. The file is closed either way.
+
+        Where the disk refuses the last chunks, the end may still find room: the file is whole without them.
+        """
         try:
-            self.flush()
-            self._write_end()
-            os.fsync(self._fd)
+            try:
+                self.flush()
+            finally:
+                self._write_end()
+                os.fsync(self._fd)
         finally:
             self.close()
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from daemon.log.claim import is_being_written
 from daemon.log.reader import open_logs
 from daemon.log.recover import recover
 from tests.daemon.log_check import official_counts
@@ -123,6 +124,7 @@ def opened_devices(logs: Path) -> int:
 def check_what_is_left(logs: Path, sent: Sent, killed: float) -> None:
     """The unrepaired file has every unit sent until half a second before the kill; the recovered one the same."""
     (path,) = logs.glob("*.mcap")
+    wait_until(lambda: not is_being_written(path), "the killed recorder to be gone")
     found = numbers_in(path)
     for stream, times in sent.times.items():
         expected = [n for n, at in enumerate(times) if at < killed - LOSS_S]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import resource
 import struct
 from pathlib import Path
 
@@ -10,13 +12,28 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 from small_mcap import get_summary, read_message
 
-from daemon.log.format import LogError
+from daemon.log.encode import encode_block, encode_json
+from daemon.log.format import ChannelSpec, LogError
 from daemon.log.reader import open_logs
 from daemon.log.recover import examine, recover
 from daemon.log.scan import Damage, Record, scan, unpack_chunk
-from tests.daemon.test_log import Content, doctor, official, read_all, write_part
+from daemon.log.writer import LogWriteError, PartWriter
+from tests.daemon.test_cli import swath
+from tests.daemon.test_log import (
+    EVENTS,
+    INFO,
+    ROVER,
+    SCANNER,
+    START_NS,
+    Content,
+    doctor,
+    official,
+    read_all,
+    write_part,
+)
 
 CHUNK, INDEX, DATA_END = 6, 7, 15
 
@@ -210,3 +227,164 @@ def test_finished_and_recovered_files_for_every_reader(tmp_path: Path, compressi
     assert summary.statistics is not None
     assert summary.statistics.message_count == sum(map(len, expected.values()))
     assert examine(report.recovered).whole
+
+
+# ------------------------------------------------------------------ what stands in a directory
+
+
+def test_what_was_lost_is_known_to_the_message_where_the_end_is_whole(tmp_path: Path, data: bytes) -> None:
+    content = bytearray(data)
+    content[700_000:765_536] = bytes(65_536)
+    path = tmp_path / "middle.mcap"
+    path.write_bytes(bytes(content))
+    report = recover(path)
+    assert report.messages_lost == 1266 - sum(report.messages.values())
+    assert 0 < report.messages_lost < 500
+    path.write_bytes(data[:1_000_000])
+    assert examine(path).messages_lost is None
+
+
+def test_a_log_that_is_being_recorded_is_read_without_blame_and_not_recovered(tmp_path: Path) -> None:
+    """A copy of what is there so far would stand for the log when it is finished."""
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    units = np.zeros((20, 1206), np.uint8)
+    writer.add(encode_block(1, 0, START_NS + np.arange(20, dtype=np.int64), units))
+    writer.flush()
+    (session,) = open_logs([tmp_path])
+    assert len(read_all(session)[SCANNER.topic]) == 20
+    assert (session.damage, session.growing) == ([], path)
+    with pytest.raises(LogError, match="is being recorded"):
+        recover(path)
+    told = swath("info", "--json", str(tmp_path))
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["sessions"][0]["growing"] == path.name
+    assert "is being recorded" in swath("info", str(tmp_path)).stdout
+    told = swath("recover", str(tmp_path))
+    assert (told.returncode, "nothing to recover" in told.stdout) == (0, True)
+    writer.close()
+    (session,) = open_logs([tmp_path])
+    read_all(session)
+    assert len(session.damage) == 1
+    assert recover(path).recovered is not None
+
+
+def test_a_part_that_a_crash_left_empty_hinders_no_other(tmp_path: Path) -> None:
+    good, cut = tmp_path / "a.mcap", tmp_path / "c.mcap"
+    write_part(good)
+    write_part(cut, part=1, finish=False)
+    (tmp_path / "b.mcap").write_bytes(b"")
+    told = swath("info", "--json", str(tmp_path))
+    assert told.returncode == 4
+    found = json.loads(told.stdout)
+    assert found["sessions"][0]["sources"]["scanner/left"]["units"] == 2400
+    (line,) = found["passed_over"]
+    assert "b.mcap" in line
+    told = swath("recover", str(tmp_path))
+    assert told.returncode == 3
+    assert told.stderr.count("\n") == 1
+    assert "b.mcap" in told.stderr
+    assert cut.with_suffix(".recovered.mcap").exists()
+    assert not good.with_suffix(".recovered.mcap").exists()
+    with pytest.raises(LogError, match=r"b\.mcap"):
+        open_logs([tmp_path])
+
+
+def test_what_a_strangers_log_says_is_not_believed_and_is_no_markup(tmp_path: Path) -> None:
+    """JSON that is none, numbers that are none, console markup and control characters."""
+    path = tmp_path / "stranger.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, EVENTS)
+    writer.add_channel(2, ChannelSpec("/status/gnss/rover", "json", {}, "swath.Status"))
+    event = {"severity": "warning", "source": "x", "code": "[/nothing]", "text": "a\x1b[31mb [bold]c[/] \n d"}
+    writer.add(encode_json(1, 0, START_NS, event))
+    writer.add(encode_json(1, 1, START_NS, {"text": "only"}))
+    for number, text in enumerate((b"{", b"[1]", b"\xff", b"[" * 100_000)):
+        unit = np.frombuffer(text, np.uint8).reshape(1, -1)
+        writer.add(encode_block(1, 2 + number, np.array([START_NS], np.int64), unit))
+        writer.add(encode_block(2, number, np.array([START_NS], np.int64), unit))
+    writer.add(encode_json(2, 9, START_NS, {"units": "many", "written": None, "time_state": 5, "time_sigma_ns": "x"}))
+    writer.finish()
+    told = swath("info", str(path))
+    assert told.returncode == 0, told.stderr
+    assert "[/nothing]" in told.stdout
+    assert "[bold]c[/]" in told.stdout
+    assert "\x1b[31mb" not in told.stdout
+    assert examine(path).whole
+
+
+def test_messages_whose_channel_was_lost_are_told(tmp_path: Path) -> None:
+    """In a log of another writer the channel's record stands once, in the first chunk that uses it."""
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=CompressionType.NONE)
+        writer.start(profile="swath", library="other")
+        writer.add_metadata("swath.session", INFO.to_metadata(0))
+        channel = writer.register_channel("/gnss/rover/raw", "x-swath-serial", 0)
+        for number in range(100):
+            writer.add_message(channel, START_NS + number, b"%0100d" % number, START_NS + number)
+        writer.finish()
+    (session,) = open_logs([path])
+    assert len(read_all(session)["/gnss/rover/raw"]) == 100
+    assert session.damage == []
+    content = bytearray(path.read_bytes())
+    chunks = [one for one in records_of(bytes(content)) if one.opcode == CHUNK]
+    content[chunks[0].offset + 100] ^= 1
+    path.write_bytes(bytes(content))
+    (session,) = open_logs([path])
+    assert read_all(session) == {}
+    assert sum(entry.damage.messages or 0 for entry in session.damage) == 100
+    assert examine(path).messages_lost == 100
+
+
+def test_stamps_that_step_back_within_a_batch_are_merged_in_order(tmp_path: Path) -> None:
+    path = tmp_path / "steps.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    writer.add_channel(2, ROVER)
+    rng = np.random.default_rng(5)
+    for number in range(20):
+        times = START_NS + number * 50_000_000 + rng.integers(0, 60_000_000, 50)
+        writer.add(encode_block(1, number * 50, times, np.zeros((50, 30), np.uint8)))
+        writer.add(encode_block(2, number, times[:1], np.zeros((1, 9), np.uint8)))
+        writer.flush()
+    writer.finish()
+    (session,) = open_logs([path])
+    times = np.concatenate([batch.log_time_ns for batch in session.batches_by_time()])
+    assert len(times) == 1020
+    assert (np.diff(times) >= 0).all()
+
+
+def test_where_the_last_chunk_finds_no_room_the_end_still_may(tmp_path: Path) -> None:
+    path = tmp_path / "full.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    units = np.zeros((400, 1206), np.uint8)
+    times = START_NS + np.arange(400, dtype=np.int64)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, hard))
+        writer.add(encode_block(1, 0, times, units))
+        writer.flush()
+        writer.add(encode_block(1, 400, times, units))
+        with pytest.raises(LogWriteError):
+            writer.finish()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (writer.written[1], writer.lost[1]) == (400, 400)
+    assert examine(path).whole
+    assert len(official(path)[SCANNER.topic]) == 400
+
+
+def test_units_without_bytes_and_blocks_without_units(tmp_path: Path) -> None:
+    """A datagram may be empty."""
+    path = tmp_path / "empty.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    none = np.array([], np.int64)
+    writer.add(encode_block(1, 0, none, np.zeros((0, 5), np.uint8)))
+    writer.add(encode_block(1, 0, START_NS + np.arange(3, dtype=np.int64), np.zeros((3, 0), np.uint8)))
+    writer.finish()
+    (session,) = open_logs([path])
+    assert read_all(session) == official(path) == {SCANNER.topic: [(START_NS + n, b"") for n in range(3)]}
