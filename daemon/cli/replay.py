@@ -20,7 +20,7 @@ def command(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from daemon.config import load_config
-    from daemon.errors import ExitCode, UserError
+    from daemon.errors import ExitCode, UserError, one_line
     from daemon.log.format import LogError
     from daemon.log.reader import open_logs
     from daemon.replay import close_outputs, open_outputs, timed_units
@@ -29,11 +29,14 @@ def command(
     if pace <= 0:
         raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
+    console = Console(stderr=True)
+    left_out: list[str] = []
     try:
-        sessions = open_logs(logs)
+        sessions = open_logs(logs, left_out)
     except LogError as error:
         raise UserError(str(error), exit_code=ExitCode.IO) from error
-    console = Console(stderr=True)
+    for line in left_out:
+        console.print(f"passed over: {one_line(line)}", markup=False, highlight=False)
     stop: list[int] = []
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, lambda number, frame: stop.append(number))

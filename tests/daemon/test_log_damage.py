@@ -6,6 +6,8 @@ import io
 import json
 import resource
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,8 @@ from daemon.log.reader import open_logs
 from daemon.log.recover import examine, recover
 from daemon.log.scan import Damage, Record, scan, unpack_chunk
 from daemon.log.writer import LogWriteError, PartWriter
-from tests.daemon.test_cli import swath
+from tests.daemon.rig import session_table
+from tests.daemon.test_cli import ROOT, swath
 from tests.daemon.test_log import (
     EVENTS,
     INFO,
@@ -287,6 +290,11 @@ def test_a_part_that_a_crash_left_empty_hinders_no_other(tmp_path: Path) -> None
     assert "b.mcap" in told.stderr
     assert cut.with_suffix(".recovered.mcap").exists()
     assert not good.with_suffix(".recovered.mcap").exists()
+    wire = tmp_path / "wire.toml"
+    wire.write_text(session_table(tmp_path))
+    told = swath("replay", str(tmp_path), "--wire", str(wire))
+    assert told.returncode == 0, told.stderr
+    assert "passed over" in told.stderr
     with pytest.raises(LogError, match=r"b\.mcap"):
         open_logs([tmp_path])
 
@@ -388,3 +396,34 @@ def test_units_without_bytes_and_blocks_without_units(tmp_path: Path) -> None:
     writer.finish()
     (session,) = open_logs([path])
     assert read_all(session) == official(path) == {SCANNER.topic: [(START_NS + n, b"") for n in range(3)]}
+
+
+PEAK = """
+import resource, sys
+from pathlib import Path
+from daemon.log.reader import open_logs
+from daemon.log.recover import recover
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+path = Path(sys.argv[1])
+count = sum(len(batch.units) for session in open_logs([path]) for batch in session.batches_by_time())
+saved = recover(path).messages.total()
+print(count, saved, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+def test_a_log_of_any_length_is_read_and_recovered_in_little_memory(tmp_path: Path) -> None:
+    """A second is held to merge by time, here 24 MB, and a chunk or two."""
+    path = tmp_path / "long.mcap"
+    writer = PartWriter(path, INFO, 0)
+    writer.add_channel(1, SCANNER)
+    units = np.random.default_rng(0).integers(0, 256, (200, 1206), dtype=np.uint8)
+    for number in range(500):
+        times = START_NS + (number * 200 + np.arange(200, dtype=np.int64)) * 50_000
+        writer.add(encode_block(1, number * 200, times, units))
+    writer.flush()
+    writer.close()
+    assert path.stat().st_size > 120e6
+    done = subprocess.run([sys.executable, "-c", PEAK, str(path)], capture_output=True, text=True, cwd=ROOT, check=True)
+    count, saved, peak_kb = map(int, done.stdout.split())
+    assert count == saved == 100_000
+    assert peak_kb < 60_000
