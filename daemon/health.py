@@ -57,7 +57,8 @@ def _trouble(item: tuple[str, Mapping[str, object]]) -> str:
     lost = sum(int(str(status[key])) for key in ("lost_kernel", "lost_queue", "lost_write"))
     words = []
     if status["state"] == "silent":
-        words.append(f"silent for {status['last_unit_age_s'] or 0:.0f} s")
+        age_s = status["last_unit_age_s"]
+        words.append("no data yet" if age_s is None else f"silent for {age_s:.0f} s")
     elif status["state"] != "receiving":
         words.append(str(status["state"]))
     if lost:

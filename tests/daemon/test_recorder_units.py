@@ -262,9 +262,11 @@ def test_sentence_says_what_an_operator_must_know() -> None:
             gnss_rover={"state": "silent", "last_unit_age_s": 12.4, "time_state": "HOLDOVER"},
             scanner_left={"lost_kernel": 3, "lost_queue": 4},
             imu_main={"state": "absent", "last_unit_age_s": None},
+            imu_spare={"state": "silent", "last_unit_age_s": None},
         ),
     )
     assert "gnss/rover silent for 12 s, time HOLDOVER; scanner/left 7 units lost; imu/main absent" in text
+    assert "imu/spare no data yet" in text
     stopped = WriterHealth(state=Writing.RESERVE, reason="3 MB free")
     assert sentence("s", 0, stopped) == "NOT RECORDING: 3 MB free"
     assert "begins" in sentence("s", 0, WriterHealth())
