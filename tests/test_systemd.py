@@ -75,6 +75,16 @@ def test_the_repairing_child_may_become_idle_and_the_clock_may_be_read() -> None
     assert set(last) >= {"adjtimex", "ioprio_set", "setpriority", "sched_setscheduler"}
 
 
+def test_drivers_of_the_allowed_devices_are_loaded_before_the_devices_are_named() -> None:
+    """systemd.resource-control(5): a class that /proc/devices does not know at the start is left out of the policy."""
+    module_of = {"char-ttyUSB": "usbserial", "char-ttyACM": "cdc_acm", "char-pps": "pps_core"}
+    built_in = {"char-ttyS", "char-ttyAMA"}
+    allowed = {value.split()[0] for value in unit_values("DeviceAllow")}
+    needed = {f"modprobe@{module_of[name]}.service" for name in allowed - built_in}
+    for key in ("Wants", "After"):
+        assert needed <= {unit for value in unit_values(key) for unit in value.split()}, key
+
+
 def test_users_are_created(tmp_path: Path) -> None:
     (tmp_path / "etc").mkdir()
     found = run_tool("systemd-sysusers", f"--root={tmp_path}", SYSTEMD / "sysusers/swath.conf")
