@@ -109,6 +109,7 @@ class Receiver(threading.Thread, ABC):
         self.stamps = StampConverter(shared.clock)
         self._accounted_ns = 0
         self._told_state = SessionState.CLOSED
+        self._told_error = ""
         self._told_silent = False
         self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
         self._refused_ns: int | None = None  # CLOCK_MONOTONIC when the queue last had no room
@@ -176,10 +177,13 @@ class Receiver(threading.Thread, ABC):
             self.shared.queue.put(QueueItem(self.source, count=self.account.snapshot()))
 
     def tell_state(self, state: SessionState, last_error: str) -> None:
-        """Report opening, loss, silence and return as events, each once."""
+        """Report opening, loss, its reason when that changes, silence and return as events, each once."""
         if state is not self._told_state:
             self._tell_change(state, last_error)
             self._told_state = state
+        elif state is SessionState.WAITING and last_error != self._told_error:
+            self.shared.events.post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
+        self._told_error = last_error
         self.account.state = self._state_word(state)
 
     def _tell_change(self, state: SessionState, last_error: str) -> None:
