@@ -70,7 +70,8 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         f"[bold]{_plain(numbers['session_id'])}[/]  {start:%Y-%m-%d %H:%M:%S} UTC, {numbers['duration_s']:.1f} s"
     )
     parts = f"{len(numbers['parts'])} part{'s' if len(numbers['parts']) != 1 else ''}, {numbers['bytes'] / 1e6:.1f} MB"
-    origin = _plain(f"{numbers['software']} on {numbers['host']} ({numbers['origin']})")
+    imported = f" ({numbers['origin']})" if numbers["origin"] != "recording" else ""
+    origin = _plain(f"{numbers['software']} on {numbers['host']}{imported}")
     console.print(f"{parts}, {origin}")
     if numbers["growing"] is not None:
         console.print(f"{_plain(numbers['growing'])} is being recorded; so far", highlight=False)
@@ -78,7 +79,10 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         console.print(f"[red]part {number} is missing[/]")
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("source", "units", "MB", "per s", "gaps", "longest", "lost k/q/w", "time"):
-        table.add_column(column, justify="left" if column in ("source", "time") else "right", no_wrap=True)
+        if column in ("source", "time"):  # words may go on below; a number that lost its end would be another number
+            table.add_column(column, overflow="fold", min_width=len("HOLDOVER"))
+        else:
+            table.add_column(column, justify="right", no_wrap=True)
     for source, values in numbers["sources"].items():
         table.add_row(*_row(source, values))
     console.print(table)
