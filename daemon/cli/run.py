@@ -31,7 +31,7 @@ def _log_to_stderr() -> None:
 
 
 def command(
-    config: Annotated[Path, typer.Argument(help="Configuration, for example /etc/swath/swath.toml.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
     seconds: Annotated[float | None, typer.Option(help="Stop after so many seconds.", min=0.0)] = None,
 ) -> None:
     """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP starts a new part."""

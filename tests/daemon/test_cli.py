@@ -104,6 +104,7 @@ class TestErrors:
         [
             (["fly"], "swath: No such command 'fly'; see `swath --help`"),
             (["check"], "swath: Missing argument 'CONFIG'; see `swath check --help`"),
+            (["run"], "swath: Missing argument 'CONFIG'; see `swath run --help`"),
             (["devices", "--jsn"], "swath: No such option: --jsn"),
             (["check", "x.toml", "--seconds", "soon"], "swath: Invalid value for '--seconds'"),
             (["check", "nowhere.toml"], "swath: nowhere.toml: No such file or directory; give the path"),
