@@ -64,7 +64,7 @@ class PpsConfig(Section):
 class GnssConfig(Section):
     """``[gnss.<name>]``: a receiver."""
 
-    transport: Text = Field(description="serial:…, udp:… or can:…")
+    transport: Text = Field(description="serial:… or udp:…")
     protocol: Text = Field(description="nmea, ubx, novatel, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this receiver")
     names_edge: Literal["auto", "previous", "next"] = Field(
