@@ -75,6 +75,27 @@ def test_sim_is_forbidden_every_module_of_georef_but_the_shared_ones() -> None:
     assert forbidden == (modules - SHARED_OF_GEOREF) | {"calib"}
 
 
+def georef_modules_imported(path: Path) -> set[str]:
+    """What a file imports of georef, as ``georef.<module>``."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module == "georef":
+            found |= {f"georef.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+    return {".".join(name.split(".")[:2]) for name in found if name.split(".")[0] == "georef"}
+
+
+def test_drivers_and_the_shared_modules_use_of_georef_only_what_is_shared() -> None:
+    shared = [ROOT / "georef/__init__.py", ROOT / "georef/records.py", *(ROOT / "georef/timescales").rglob("*.py")]
+    files = [*(ROOT / "drivers").rglob("*.py"), *shared]
+    others = {path.name: georef_modules_imported(path) - SHARED_OF_GEOREF for path in files}
+    assert {name: modules for name, modules in others.items() if modules} == {}
+    assert georef_modules_imported(ROOT / "drivers/gnss/nmea.py")
+
+
 def test_files_and_checkout_stay_small() -> None:
     sizes = {path: path.stat().st_size for path in tracked()}
     assert [str(path) for path, size in sizes.items() if size > LARGEST_FILE_BYTES] == []
