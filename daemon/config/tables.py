@@ -115,6 +115,9 @@ class ImuConfig(Section):
     imu_type: Text | None = Field(
         None, description="novatel: the IMU as INSCONFIG names it (HG1900_CA50), where its stream does not say it"
     )
+    source_address: int | None = Field(
+        None, ge=0, le=253, description="nmea2000: the device to listen to; absent: the first that sends each PGN"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
     rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
     tick_hz: float = Field(

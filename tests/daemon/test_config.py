@@ -66,6 +66,7 @@ class TestWholeFile:
         table = tomllib.loads(AIRCRAFT.read_text())
         assert set(_absent_keys(Tables, table, "")) == {  # each excludes something that stands there
             "imu.*.imu_type",
+            "imu.*.source_address",
             "scanner.*.geometry.facets",
             "scanner.*.geometry.file",
             "scanner.*.gimbal.stages.source",
