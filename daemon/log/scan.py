@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, TypeVar
 
 import lz4.frame
 import zstandard
+from isal.isal_zlib import crc32
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -173,8 +173,8 @@ def _end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
     crc = 0
     file.seek(offset)
     for at in range(offset, footer_at, _RESYNC_STEP):
-        crc = zlib.crc32(file.read(min(_RESYNC_STEP, footer_at - at)), crc)
-    return bool(expected == 0 or zlib.crc32(tail[: _HEAD.size + _FOOTER_BYTES - 4], crc) == expected)
+        crc = crc32(file.read(min(_RESYNC_STEP, footer_at - at)), crc)
+    return bool(expected == 0 or crc32(tail[: _HEAD.size + _FOOTER_BYTES - 4], crc) == expected)
 
 
 def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
@@ -300,7 +300,7 @@ def unpack_chunk(body: bytes) -> bytes:
     records = _decompress(name, stored, size)
     if len(records) != size:
         raise LogError(f"chunk holds {len(records)} bytes instead of {size}")
-    if zlib.crc32(records) != crc:
+    if crc32(records) != crc:
         raise LogError("chunk with a wrong CRC" if crc else "chunk without a CRC")
     return records
 
@@ -323,7 +323,7 @@ def _decompress(name: bytes, stored: bytes, size: int) -> bytes:
 
 def _attachment_is_whole(body: bytes) -> bool:
     crc = int.from_bytes(body[-4:], "little")
-    return crc == 0 or zlib.crc32(body[:-4]) == crc
+    return crc == 0 or crc32(body[:-4]) == crc
 
 
 def _indexed_messages(file: BinaryIO, offset: int, size: int) -> int | None:

@@ -10,7 +10,6 @@ import errno
 import os
 import struct
 import time
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from typing import Any
 
 import lz4.frame
 import zstandard
+from isal.isal_zlib import crc32
 from mcap import records
 
 from daemon.log.claim import claim
@@ -235,7 +235,7 @@ class PartWriter:
     def _lay_out(self, chunk_class: ChunkClass, chunk: _OpenChunk) -> ChunkPieces:
         crc = 0
         for piece in chunk.pieces:
-            crc = zlib.crc32(piece, crc)
+            crc = crc32(piece, crc)
         name, body = self._compress(chunk_class, chunk.pieces)
         stored = sum(len(piece) for piece in body)
         times = [block.log_time_ns for blocks in chunk.blocks.values() for _, block in blocks]
@@ -289,7 +289,7 @@ class PartWriter:
                 offsets += record_bytes(offset)
             position += length
         footer_head = struct.pack("<BQQQ", _OP_FOOTER, 20, summary_start, summary_start + len(body))
-        crc = zlib.crc32(body + offsets + footer_head)
+        crc = crc32(body + offsets + footer_head)
         self._write([data_end, body, offsets, footer_head, struct.pack("<I", crc), MAGIC])
 
     def _write(self, pieces: Sequence[Any]) -> int:

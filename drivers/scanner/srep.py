@@ -8,12 +8,12 @@ u64 counter fits.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
@@ -149,7 +149,7 @@ class SrepParser(PacketParser):
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
         for row in np.flatnonzero(verify).tolist():
             unit = units[row]
-            if zlib.crc32(unit[: -CRC.size]) != CRC.unpack(unit[-CRC.size :])[0]:
+            if crc32(unit[: -CRC.size]) != CRC.unpack(unit[-CRC.size :])[0]:
                 good[row] = False
                 self.counters.bad_checksums += 1
         self.counters.bytes_framed += length * int(good.sum())
