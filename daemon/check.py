@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from daemon.config import Config, DeviceEntry
-from daemon.identify import Heard, describe_time, identify
+from daemon.identify import Heard, describe_time, not_understood
 from drivers.core.registry import find_driver
 from drivers.session import Session
 from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
@@ -285,13 +285,9 @@ def _answer_problems(reading: Reading) -> list[str]:
     """What is wrong with what came."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
-    if not good or not heard.counts:
-        other = identify(entry, reading.kept, than=good)
-        if other is not None:
-            return [f"answers as {other}, configured as {entry.protocol}"]
-    if not good:
-        hint = "; is the baud rate right?" if entry.transport.kind == "serial" else ""
-        return [f"nothing of it is {entry.protocol} nor any other {entry.kind} protocol known{hint}"]
+    other = not_understood(entry, heard, good, reading.kept)
+    if other is not None:
+        return [other]
     found: list[str] = []
     if not heard.counts:
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))

@@ -98,6 +98,26 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     return best
 
 
+def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch]) -> str | None:
+    """What a device is instead of what it was configured as, or that nothing of it is known; None: it is understood.
+
+    Args:
+        entry: the device as configured.
+        heard: what the configured parser made of its bytes.
+        messages: how many the configured parser found in them.
+        kept: the bytes, or the first of them.
+    """
+    if messages and heard.counts:
+        return None
+    other = identify(entry, kept, than=messages)
+    if other is not None:
+        return f"answers as {other}, configured as {entry.protocol}"
+    if messages:
+        return None
+    hint = "; is the baud rate right?" if entry.transport.kind == "serial" else ""
+    return f"nothing of it is {entry.protocol} nor any other {entry.kind} protocol known{hint}"
+
+
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
     """Settings of a device of which only the protocol is known; what frames need no value of ours is stood in for."""
     transport = entry.transport.text

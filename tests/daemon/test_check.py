@@ -7,10 +7,8 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import xor
@@ -29,6 +27,7 @@ from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
 from georef.records import TimeScale, TimeTag
 from tests.daemon.rig import free_udp_port
+from tests.daemon.wires import pty, repeating, udp_sender
 
 ROOT = Path(__file__).parents[2]
 CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
@@ -60,59 +59,6 @@ def srep_datagram(sequence: int, pps_count: int = 3) -> bytes:
     )
     ticks = np.arange(10) * 50
     return encode_datagram(header, ticks, np.arange(10) * 100, np.full((10, 1), 9_000_000))
-
-
-@contextmanager
-def repeating(job: Callable[[int], None], period_s: float = 0.05) -> Iterator[None]:
-    """Call a job again and again in a thread of its own."""
-    stop = threading.Event()
-
-    def run() -> None:
-        number = 0
-        while not stop.wait(period_s):
-            job(number)
-            number += 1
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-
-
-@contextmanager
-def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
-    """A serial device that sends something again and again; its path."""
-    main, secondary = os.openpty()
-    tty.setraw(secondary)
-    os.set_blocking(main, False)
-
-    def write(number: int) -> None:
-        if send is not None:
-            try:
-                os.write(main, send(number))
-            except BlockingIOError:
-                pass
-
-    try:
-        with repeating(write):
-            yield os.ttyname(secondary)
-    finally:
-        os.close(main)
-        os.close(secondary)
-
-
-@contextmanager
-def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
-    """Datagrams to a port of this computer."""
-    with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
-        yield
-
-
-def _send(sender: socket, port: int, data: bytes) -> None:
-    sender.sendto(data, ("127.0.0.1", port))
 
 
 @contextmanager
