@@ -105,7 +105,7 @@ def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
     if entry.kind == "gnss":
         table = GnssConfig(transport=transport, protocol=protocol)
     elif entry.kind == "imu":
-        table = ImuConfig(transport=transport, protocol=protocol)
+        table = ImuConfig(transport=transport, protocol=protocol, tick_hz=1_000_000.0)
     else:
         table = ScannerConfig(transport=transport, protocol=protocol, mirror_factor=1.0, installation=IDENTITY)
     return DeviceSettings(entry.source, table.model_dump())

@@ -364,7 +364,7 @@ def test_a_signal_of_all_pages_beside_signals_of_two_is_refused() -> None:
             {"signals": {**without(), "specific_force": ["TEMP.celsius"] * 3}},
             'has unit "degC"; specific_force needs m/s2',
         ),
-        ({"tick_hz": None}, "tick_hz: needed with signals.sample_ticks"),
+        ({"tick_hz": 0}, "tick_hz: got 0, want counts per second, above 0"),
         ({"group": "middle"}, 'group: got "middle", want "last" or "first"'),
         ({"sample": "increment"}, "rate_hz: needed with sample"),
     ],
@@ -406,7 +406,7 @@ def test_a_makers_own_dbc_with_the_counter_first() -> None:
         "sample_ticks": f"{prefix}INFO.TIME_STAMP",
         "temperature": f"{prefix}INFO.TEMPERATURE",
     }
-    dbc = (Path(__file__).parents[2] / "fixtures/dbc/sbgCan.dbc").read_bytes()
+    dbc = (Path(__file__).parents[2] / "fixtures/sbg-ellipse/sbgCan.dbc").read_bytes()
     config = {"dbc": "sbgCan.dbc", "signals": signals, "group": "first", "tick_hz": 1_000_000}
     parser = DbcParser(DeviceSettings("imu/main", config, {"dbc": dbc}))
     frames = [
