@@ -1,6 +1,6 @@
 """Xsens (Movella) MTi over serial: Xbus messages of type MTData2, whatever their items, order and number formats.
 
-Sources: MTi user manual MT0605P (4.9, 4.12, 5.3) and MTi family reference manual MT1600P (4.3) of the maker; names,
+Sources: the maker's MTi user manual MT0605P (4.9, 4.12, 5.3) and MTi family reference manual MT1600P (4.3); names,
 identifiers and number formats as in github.com/einride/xsens-go, whose decoding of two recordings the tests compare.
 
 - Acceleration and RateOfTurn are means over the interval between two samples (the device integrates and divides
@@ -40,7 +40,7 @@ from georef.records import (
 PREAMBLE = b"\xfa\xff"  # a device alone on its line is bus identifier FF
 ITEM_HEADER = struct.Struct(">HB")  # identifier, length (MT0605P 5.3)
 TYPE_BITS = 0xF8F0  # of an identifier: group and type
-FORMAT_BITS = 0x0003  # number format; bits 2 and 3 turn orientations and velocities, nothing that is read here
+FORMAT_BITS = 0x0003  # number format; bits 2 and 3 are for orientations only (MT0101P, revision W)
 TICK_HZ = 10_000
 COUNTER_BITS = 16
 TICK_BITS = 32

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -341,6 +342,30 @@ class TestCan:
         assert report.problems == []
         assert report.records["ImuSamples"] > 100
         assert report.bytes == 16 * report.units
+
+    @pytest.mark.parametrize(("tick_hz", "rate"), [(1_000_000, None), (10_000, 100.0), (100_000_000, 0.01)])
+    def test_a_counter_read_in_the_wrong_unit_is_said(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
+        """An MTi whose SampleTime is in microseconds; the maker's documents say two units."""
+        port = free_udp_port()
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
+
+            def send(_: int) -> None:
+                ticks = (time.monotonic_ns() // 1000 % 2**32).to_bytes(4, "big")
+                for identifier, data in ((0x005, ticks), (0x032, bytes(6)), (0x034, bytes(6))):
+                    bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+            with repeating(send, 0.02):
+                transport = f"can:udp_multicast:{GROUP}?port={port}"
+                table = f'transport = "{transport}"\nprotocol = "xsens-mti"\ntick_hz = {tick_hz}\n'
+                report = check(f"[imu.main]\n{table}", tmp_path)["imu/main"]
+        assert report.records["ImuSamples"] > 10
+        if rate is None:
+            assert report.problems == []
+        else:
+            [problem] = report.problems
+            said = re.fullmatch(r"its counter runs (\S+) times as fast as time: is tick_hz right\?", problem)
+            assert said
+            assert float(said[1]) == pytest.approx(rate, rel=0.1)
 
     def test_answers_as_something_else(self, port: int, tmp_path: Path) -> None:
         (tmp_path / "imu.dbc").write_bytes((ROOT / "fixtures/config/imu.dbc").read_bytes())
