@@ -29,6 +29,7 @@ from drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
 from georef.records import (
     IMU_DTYPE,
     Chunk,
+    ChunkBatch,
     ImuSamples,
     NamesEdge,
     Record,
@@ -217,6 +218,13 @@ class XbusParser(StreamParser):
     def feed(self, chunk: Chunk) -> list[Record]:
         """Take one read."""
         return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Take consecutive reads; the samples of all of them are one array."""
+        frames: list[Frame] = []
+        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
+            frames += self._framer.feed(unit.tobytes(), host_time_ns)
+        return self._decode_all(frames)
 
     def close(self) -> list[Record]:
         """Release what was held back."""

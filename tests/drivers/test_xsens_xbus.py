@@ -17,8 +17,16 @@ from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import find_driver
 from drivers.imu import xsens_xbus as xbus
 from drivers.imu.xsens_xbus import XbusParser, make_time_parser
-from georef.records import Chunk, NamesEdge, Record, TimeMessage
-from tests.drivers.harness import check_damage, check_garbage, check_stream, feed_pieces
+from georef.records import Chunk, ChunkBatch, NamesEdge, Record, TimeMessage
+from tests.drivers.harness import (
+    STREAM_HOST_NS,
+    check_damage,
+    check_garbage,
+    check_stream,
+    feed_pieces,
+    outcome,
+    run_stream,
+)
 from tests.drivers.imu_dbc import imu_rows
 from tests.drivers.recordings import FIXTURES
 
@@ -148,6 +156,16 @@ def test_each_second_gives_one_time_message(name: str) -> None:
 def test_recordings_however_they_are_cut(name: str) -> None:
     outcome = check_stream(make, recording(name))
     assert len(outcome.rows["ImuSamples"]) == 96
+
+
+@pytest.mark.parametrize("size", [1, 64, 143, 1024])
+def test_a_batch_of_reads_is_what_its_reads_are(size: int) -> None:
+    data = recording("1_output")[: len(recording("1_output")) // size * size]
+    units = np.frombuffer(data, np.uint8).reshape(-1, size)
+    parser = make()
+    host_ns = np.full(len(units), STREAM_HOST_NS, np.int64)
+    records = [*parser.feed_batch(ChunkBatch("imu/main", host_ns, units)), *parser.close()]
+    assert outcome(records, parser) == run_stream(make, (unit.tobytes() for unit in units))
 
 
 def test_damaged_recordings() -> None:
