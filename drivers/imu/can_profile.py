@@ -54,4 +54,5 @@ def _can_ids(config: Mapping[str, Any], defaults: Mapping[str, int]) -> dict[str
     try:
         return {name: frame_id(number, extended=extended) for name, number in numbers.items()}
     except ValueError as error:
-        raise DriverSettingsError(f"ids: {error}; 29 bits need extended_ids = true") from error
+        hint = "want 0 to 0x1FFFFFFF" if extended else "want 0 to 0x7FF; 29 bits need extended_ids = true"
+        raise DriverSettingsError(f"ids: {error}; {hint}") from error

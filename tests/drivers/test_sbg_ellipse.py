@@ -168,9 +168,9 @@ def test_pps_on_a_sync_in_latches_the_counter(event: str) -> None:
     [
         ({"ids": {"GYRO": 1}}, "ids.GYRO is unknown; there are: IMU_ACCEL, IMU_GYRO, IMU_INFO"),
         ({"ids": {"IMU_GYRO": 0x120}}, "ids: IMU_GYRO and IMU_INFO are both 0x120; give each its own"),
-        ({"ids": {"IMU_GYRO": 0x800}}, "0x800 does not fit 11 bits; 29 bits need extended_ids = true"),
+        ({"ids": {"IMU_GYRO": 0x800}}, "0x800 does not fit 11 bits; want 0 to 0x7FF; 29 bits need extended_ids = true"),
         ({"ids": {"IMU_GYRO": -1}}, "does not fit 11 bits"),
-        ({"ids": {"IMU_GYRO": 1 << 29}, "extended_ids": True}, "does not fit 29 bits"),
+        ({"ids": {"IMU_GYRO": 1 << 29}, "extended_ids": True}, "does not fit 29 bits; want 0 to 0x1FFFFFFF$"),
         ({"sample": "increment"}, 'sample: got "increment"'),
         ({"pps_event": "F"}, "no message SBG_ECAN_MSG_EVENT_INFO_F in sbg-ellipse.dbc"),
     ],
