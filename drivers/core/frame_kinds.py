@@ -1,4 +1,4 @@
-"""The frames that GNSS receivers lay into a serial stream, as a table: sync, length and its bound, checksum, name."""
+"""The frames that receivers and inertial units lay into a stream: sync, length and its bound, checksum, name."""
 
 from __future__ import annotations
 
@@ -163,6 +163,38 @@ def novatel_name(frame: bytes) -> str:
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
+# --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
+
+XBUS_MAX_DATA_BYTES = 2048  # of a message with an extended length
+XBUS_EXTENDED = 0xFF  # length byte: the length follows in two bytes, high one first
+XBUS_MTDATA2 = 0x36
+XBUS_NAMES = {0x32: "MTData", XBUS_MTDATA2: "MTData2", 0x3E: "WakeUp", 0x42: "Error"}  # what a device says by itself
+XBUS_IDENTIFIERS = bytes(sorted({*XBUS_NAMES, *range(1, 256, 2)}))  # its answers are the odd ones
+
+
+def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
+    """Preamble, bus and message identifier, length, data and checksum."""
+    if len(buffer) - start < 4:
+        return UNDECIDED
+    length = buffer[start + 3]
+    if length != XBUS_EXTENDED:
+        return length + 5
+    if len(buffer) - start < 6:
+        return UNDECIDED
+    length = buffer[start + 4] << 8 | buffer[start + 5]
+    return length + 7 if length <= XBUS_MAX_DATA_BYTES else OVER_BOUND
+
+
+def intact_xbus(frame: bytes) -> bool:
+    """All bytes but the preamble, checksum included, add up to 0 modulo 256."""
+    return sum(frame[1:]) & 0xFF == 0
+
+
+def xbus_name(frame: bytes) -> str:
+    """``MTData2``; ``XBUS-31`` where the table has no name."""
+    return XBUS_NAMES.get(frame[2]) or f"XBUS-{frame[2]:02X}"
+
+
 NMEA = FrameKind("nmea", (b"$!", bytes(range(0x41, 0x5B))), NMEA_MAX_BYTES, measure_nmea, intact_nmea, nmea_name)
 UBX = FrameKind(
     "ubx",
@@ -195,6 +227,15 @@ NOVATEL_SHORT = FrameKind(
     measure_novatel_short,
     lambda frame: crc32_novatel(frame) == 0,
     novatel_name,
+)
+
+XBUS = FrameKind(
+    "xbus",
+    (b"\xfa", b"\xff", XBUS_IDENTIFIERS),
+    XBUS_MAX_DATA_BYTES + 7,
+    measure_xbus,
+    intact_xbus,
+    xbus_name,
 )
 
 GNSS_KINDS = (NMEA, UBX, RTCM3)  # on one port of a u-blox or of most others

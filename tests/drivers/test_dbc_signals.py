@@ -16,7 +16,8 @@ from drivers.core.parser import DriverSettingsError
 from drivers.imu.dbc_signals import find_signal, load_database, signal_layout
 from tests.drivers.imu_dbc import IMU_DBC
 
-DBC_FILES = sorted((Path(__file__).parents[2] / "fixtures/dbc").glob("*.dbc"))
+FIXTURES = Path(__file__).parents[2] / "fixtures"
+DBC_FILES = [*sorted((FIXTURES / "dbc").glob("*.dbc")), FIXTURES / "sbg-ellipse/sbgCan.dbc"]
 CANMOD_DBC = Path(__file__).parents[2] / "drivers/imu/canmod-gps.dbc"
 
 
