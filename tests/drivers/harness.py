@@ -241,6 +241,8 @@ def damage_strategy(size: int) -> st.SearchStrategy[list[Damage]]:
             b"\xd3\x03\xff",
             b"\xaaD\x12\x1c",
             b"\xaaD\x13",
+            b"$@",
+            b"$@\x00\x00\xa7\x0f\x00\x08",
         ]
     )
     garbage = st.one_of(st.just(b""), syncs, st.binary(max_size=40))
@@ -293,7 +295,15 @@ def check_damage(make: Factory, data: bytes, *, examples: int = 60, window: int 
 def check_garbage(make: Factory, *, examples: int = 60) -> None:
     """Random bytes, with frame beginnings among them: never raises, accounts for every byte."""
     starts = st.sampled_from(
-        [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
+        [
+            b"$GPGGA,",
+            b"\xb5b\x01\x07\x5c\x00",
+            b"\xd3\x00\x13",
+            b"\xaaD\x12\x1c",
+            b"\xaaD\x13",
+            b"*00\r\n",
+            b"$@\x00\x00\xa7\x0f\x60\x00",
+        ]
     )
     pieces = st.lists(st.one_of(st.binary(max_size=200), starts), max_size=20)
 
