@@ -81,6 +81,7 @@ class SbfParser(StreamParser):
         self._framer = Framer(FRAME_KINDS, self.counters)
         self._floor_week = week_of(read_date_floor(settings))
         self._wanted = wanted
+        self._gathers_fixes = wanted is None or GnssFix in wanted
         self._clock = ReceiverClock(self.counters)
         self._imu = ImuPairs(self.counters)
         self._fixes: EpochGatherer[FixPart] = EpochGatherer(self.counters)
@@ -219,7 +220,7 @@ class SbfParser(StreamParser):
         return self._give_fixes(self._fixes.end()) if stamp.epoch == self._fixes.key else []
 
     def _add_fix(self, stamp: Stamp, block: sbf.PvtGeodetic | sbf.PosCovGeodetic | sbf.VelCovGeodetic) -> Items:
-        if self._is_timeless(stamp):
+        if not self._gathers_fixes or self._is_timeless(stamp):
             return []
         return self._give_fixes(self._fixes.add(stamp.epoch, stamp.name, (stamp, block)))
 
