@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 
-from drivers.core.checksums import crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from drivers.core.framing import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
 
 # --- NMEA 0183: $ttsss,field,…*hh CR LF -----------------------------------------------------------------------------
@@ -195,6 +195,36 @@ def xbus_name(frame: bytes) -> str:
     return XBUS_NAMES.get(frame[2]) or f"XBUS-{frame[2]:02X}"
 
 
+# --- Septentrio SBF: $@, CRC-16, block id, length, block (PolaRx5TR reference guide, 4.1.1) ---------------------------
+
+# The length field reaches 64 KiB; RTKLIB, which decodes the longest blocks (measurements), takes 16 KiB (MAXRAWLEN).
+SBF_MAX_BYTES = 16 * 1024
+SBF_HEADER_BYTES = 8
+SBF_HEADER = struct.Struct("<2xHHH")  # CRC, id and revision, length
+SBF_CRC_START = 4  # the CRC covers everything from the id on
+SBF_NUMBER_BITS = 0x1FFF  # of the id; the three above are the revision
+
+
+def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
+    """The length field, which counts the whole block; always a multiple of 4."""
+    if len(buffer) - start < SBF_HEADER_BYTES:
+        return UNDECIDED
+    length: int = SBF_HEADER.unpack_from(buffer, start)[2]
+    if length % 4 or length < SBF_HEADER_BYTES:
+        return FALSE_SYNC
+    return length if length <= SBF_MAX_BYTES else OVER_BOUND
+
+
+def intact_sbf(frame: bytes) -> bool:
+    """The CRC in the header against that of the rest."""
+    return bool(SBF_HEADER.unpack_from(frame)[0] == crc16_ccitt(memoryview(frame)[SBF_CRC_START:]))
+
+
+def sbf_name(frame: bytes) -> str:
+    """``SBF-4007``: the block's number; `drivers.gnss.sbf` knows the names."""
+    return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
+
+
 NMEA = FrameKind("nmea", (b"$!", bytes(range(0x41, 0x5B))), NMEA_MAX_BYTES, measure_nmea, intact_nmea, nmea_name)
 UBX = FrameKind(
     "ubx",
@@ -237,6 +267,9 @@ XBUS = FrameKind(
     intact_xbus,
     xbus_name,
 )
+
+
+SBF = FrameKind("sbf", (b"$", b"@"), SBF_MAX_BYTES, measure_sbf, intact_sbf, sbf_name)
 
 GNSS_KINDS = (NMEA, UBX, RTCM3)  # on one port of a u-blox or of most others
 NOVATEL_KINDS = (NOVATEL, NOVATEL_SHORT, NMEA, RTCM3)

@@ -213,6 +213,11 @@ class TestSomethingElse:
             ("novatel", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
             ("novatel", "nmea/nmea-rtk.log.gz", "nmea"),
             ("ubx", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+            ("novatel", "sbf/sbfdata.log.gz", "sbf"),
+            ("nmea", "sbf/sbfdata.log.gz", "sbf"),
+            ("ubx", "sbf/pygpsdata_x5status.log.gz", "sbf"),
+            ("sbf", "nmea/polarx2.log.gz", "nmea"),
+            ("sbf", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
         ],
     )
     def test_a_real_recording_of_another_receiver_is_named(

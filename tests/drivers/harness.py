@@ -242,6 +242,8 @@ def damage_strategy(size: int, starts: Sequence[bytes] = ()) -> st.SearchStrateg
             b"\xaaD\x12\x1c",
             b"\xaaD\x13",
             *starts,
+            b"$@",
+            b"$@\x00\x00\xa7\x0f\x00\x08",
         ]
     )
     garbage = st.one_of(st.just(b""), syncs, st.binary(max_size=40))
@@ -296,6 +298,7 @@ def check_damage(
 def check_garbage(make: Factory, *, examples: int = 60, starts: Sequence[bytes] = ()) -> None:
     """Random bytes, with frame beginnings among them: never raises, accounts for every byte."""
     common = [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
+    common.append(b"$@\x00\x00\xa7\x0f\x60\x00")
     pieces = st.lists(st.one_of(st.binary(max_size=200), st.sampled_from([*common, *starts])), max_size=20)
 
     @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
