@@ -15,7 +15,7 @@ from drivers.transports.base import UnitBlock
 from georef.records import ChunkBatch, Int64Array
 
 JUDGED_BYTES = 64 * 1024  # several messages of every protocol
-JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then
+JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then, and the start of the recording is over
 
 
 class FirstUnits:
@@ -47,7 +47,7 @@ class FirstUnits:
         """What there is to judge, once; None while too little has come, and ever after."""
         with self._lock:
             waited = self._first_s is not None and time.monotonic() - self._first_s >= JUDGED_AFTER_S
-            if not self._kept or not (self._closed or waited):
+            if not self._kept or not waited:
                 return None
             self._closed = True
             kept, self._kept = self._kept, []
