@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.core.parser import DeviceSettings, Driver, PacketParser
 from drivers.scanner.sequence import BoolArray, SampleThinner
 from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.stamps import StampTracker
 from drivers.scanner.velodyne_heads import VLP16, FloatArray, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
 from georef.records import (
@@ -84,8 +85,9 @@ class VelodyneParser(PacketParser):
     """Decodes data and position packets of one head.
 
     Counts ``bad_length``, ``bad_block_flag``, ``bad_azimuth``, ``bad_return_mode``, ``wrong_product`` (another model
-    answers), ``cadence_gap`` (packets missing by the stamps), ``stamp_jump`` (the head's clock was set),
-    ``duplicate``, and the position packets' ``bad_nmea`` and ``nmea_second_mismatch``.
+    answers), ``cadence_gap`` (packets missing by the stamps), ``out_of_order`` (late, counted as missing before),
+    ``stamp_jump`` (the head's clock was set), ``duplicate``, and the position packets' ``bad_nmea`` and
+    ``nmea_second_mismatch``.
 
     Args:
         settings: no key is needed.
@@ -98,7 +100,7 @@ class VelodyneParser(PacketParser):
         self._head = head
         self._position = PositionReader(self.counters)
         self._thinner = SampleThinner() if clock_only else None
-        self._last_stamp_us: int | None = None
+        self._stamps = StampTracker(self.counters.errors, HOUR_US, MAX_SILENCE_US)
         self._packets = 0
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
@@ -154,29 +156,9 @@ class VelodyneParser(PacketParser):
             self.counters.bytes_skipped += count * length
 
     def _follow(self, packets: StructArray) -> BoolArray:
-        """Look for missing packets between the stamps; (n,) False for a packet that repeats the one before."""
-        stamps = packets["stamp_us"].astype(np.int64)
-        if not len(stamps):
-            return np.zeros(0, dtype=np.bool_)
-        before = np.concatenate([[stamps[0] - 1 if self._last_stamp_us is None else self._last_stamp_us], stamps[:-1]])
-        first = self._last_stamp_us is None
-        self._last_stamp_us = int(stamps[-1])
-        step_us = (stamps - before) % HOUR_US
-        nominal_us = np.where(packets["mode"] == MODE_DUAL, BLOCKS // 2, BLOCKS) * self._head.block_ns / 1000
-        missing = np.rint(step_us / nominal_us).astype(np.int64) - 1
-        jumped = step_us > MAX_SILENCE_US
-        lost = (missing > 0) & ~jumped
-        if first:
-            jumped[0] = lost[0] = False
-        for code, count in (
-            ("stamp_jump", int(jumped.sum())),
-            ("cadence_gap", int(missing[lost].sum())),
-            ("duplicate", int((step_us == 0).sum())),
-        ):
-            if count:
-                self.counters.errors[code] += count
-        fresh: BoolArray = step_us != 0
-        return fresh
+        """Look for missing packets between the stamps; (n,) False for a packet that has come before."""
+        blocks = np.where(packets["mode"] == MODE_DUAL, BLOCKS // 2, BLOCKS)
+        return self._stamps.follow(packets["stamp_us"].astype(np.int64), blocks * self._head.block_ns / 1000)
 
     def _returns(self, host_time_ns: Int64Array, packets: StructArray) -> StructArray:
         """Returns of all packets in order, in blocks of one return mode."""
