@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import socket
 import subprocess
 import time
@@ -104,6 +105,66 @@ def test_stops_when_full_and_resumes_when_there_is_room(small_disk: Path, reserv
     if said == "disk_reserve":
         assert content.events("disk_reserve")
         assert all(path.read_bytes().endswith(b"\x89MCAP0\r\n") for path in logs.glob("*.mcap"))
+
+
+@pytest.fixture
+def failing_disk(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
+    """An ext4 of its own, and the file by which one tells it that it is broken: it then goes read-only at once."""
+    if os.geteuid() != 0:
+        pytest.fail("this test mounts a file system: run it as root")
+    image, folder = tmp_path / "image", tmp_path / "disk"
+    folder.mkdir()
+    with image.open("wb") as file:
+        file.truncate(64 << 20)
+    subprocess.run(["mkfs.ext4", "-q", "-F", str(image)], check=True)
+    mounted = ["mount", "-o", "loop,errors=remount-ro", str(image), str(folder)]
+    if subprocess.run(mounted, check=False).returncode != 0:
+        pytest.skip("this machine has no loop devices: no disk of which one can say that it fails")
+    number = os.stat(folder).st_dev
+    device = Path(f"/sys/dev/block/{os.major(number)}:{os.minor(number)}").resolve().name
+    try:
+        yield folder, Path(f"/sys/fs/ext4/{device}/trigger_fs_error")
+    finally:
+        while subprocess.run(["umount", "--lazy", str(folder)], check=False, stderr=subprocess.DEVNULL).returncode == 0:
+            pass
+
+
+def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_to(
+    failing_disk: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The kernel's own remedy for a broken disk; remounting it by hand is refused while the log is open (EBUSY)."""
+    folder, trigger = failing_disk
+    port = free_udp_port()
+    logs, kept = folder / "logs", tmp_path / "kept"
+    with contextlib.closing(Flood(port, 2)) as flood, Recorder(tmp_path / "rig", config_of(logs, port, 1)) as recorder:
+        recorder.wait_said("device_opened")
+        flood.send(1.5)
+        failed_ns = time.time_ns()
+        trigger.write_text("broken")
+        flood.send_until(lambda: "disk write_failed" in recorder.stderr())
+        wait_until(lambda: "NOT RECORDING: Read-only file system" in recorder.notify.last("STATUS"), "said in STATUS")
+        flood.send(1.0)
+        assert recorder.process.poll() is None
+        shutil.copytree(logs, kept)  # what reached the kernel; the disk itself may hold less
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "swath-test", str(folder)], check=True)
+        flood.send_until(lambda: "disk recording_resumed" in recorder.stderr())
+        flood.send(0.3)
+        time.sleep(1.2)
+        assert recorder.stop() == 0, recorder.stderr()
+    shutil.copytree(logs, kept, dirs_exist_ok=True)
+    content = read_log(kept)
+    status = content.messages["/status/scanner/left"][-1][1]
+    found = [int.from_bytes(data[:8], "little") for _, data in content.units["scanner/left"]]
+    assert status["units"] == flood.sent
+    assert status["lost_write"] > 0
+    assert status["written"] == len(found) == flood.sent - status["lost_write"] - status["lost_kernel"]
+    assert found == sorted(set(found))
+    assert found[-1] == flood.sent - 1
+    (told,) = content.events("write_failed")
+    assert (told["severity"], told["source"]) == ("critical", "disk")
+    assert 0 <= (told["time_ns"] - failed_ns) * 1e-9 < 3.0  # 1 s asked for; this machine may have other work
+    assert content.events("recording_resumed")
 
 
 def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
