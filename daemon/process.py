@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import faulthandler
 import gc
 import logging
 import signal
@@ -154,6 +155,7 @@ class RecorderProcess:
                 self._service.notify(STATUS=f"STUCK: {', '.join(stuck)}")
                 text = f"no progress in {', '.join(stuck)}"
                 self._assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
+                faulthandler.dump_traceback()  # into the journal: where every thread is, before a restart wipes it out
             self._stuck = stuck
             if time.monotonic() - collected_s > COLLECT_ALL_S:
                 collected_s = time.monotonic()

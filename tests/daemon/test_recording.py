@@ -146,6 +146,7 @@ def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
             fed = recorder.notify.count("WATCHDOG")
             time.sleep(2.0)
             assert recorder.notify.count("WATCHDOG") == fed
+        assert "most recent call first" in recorder.stderr()  # where every thread stood
         recorder.kill()  # what the service manager does now
     with Recorder(tmp_path / "again", config) as restarted:
         wait_until(lambda: (logs / "recording.json").exists(), "recording again")
