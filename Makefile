@@ -12,7 +12,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint bench install uninstall clean
+MINUTES ?= 60
+RATE ?= 0.1
+
+.PHONY: help demo test test-long soak-short lint bench install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -26,6 +29,9 @@ test: lint $(VENV)/.tools ## install and run everything: style, types, import ru
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long
+
+soak-short: $(VENV)/.tests ## an hour of all kinds of sensors at a tenth of their rate (MINUTES=, RATE=)
+	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) --rate $(RATE)
 
 lint: $(VENV)/.tests ## style, import rules and types only
 	$(BIN)/ruff check .
