@@ -366,6 +366,7 @@ def memory_mb(recorder: Recorder) -> float:
     return next(int(row.split()[1]) for row in status.splitlines() if row.startswith("RssAnon")) / 1e3
 
 
+@pytest.mark.alone
 def test_garbage_at_full_rate_costs_the_others_nothing(tmp_path: Path, logs: Path) -> None:
     """A line full of beginnings of messages that never end, and 20 000 datagrams a second that are none."""
     good, noisy = udp_wire("scanner/left"), udp_wire("scanner/right")

@@ -27,8 +27,9 @@ from daemon.log.writer import PartWriter
 from daemon.parts import Attachment, Parts
 from daemon.recorder import Recorder, RecorderSettings, WriterHealth, Writing
 from daemon.sd_notify import ServiceManager
+from daemon.wire_trouble import WireTrouble
 from drivers.session import Session
-from drivers.transports.base import PpsSource, RawEdge
+from drivers.transports.base import PpsSource, RawEdge, TransportCounters
 from tests.daemon.log_check import official_counts, read_log
 
 SOURCE = "gnss/rover"
@@ -240,6 +241,29 @@ def test_edges_overwritten_in_the_kernel_are_units_lost(overwrites: bool, lost: 
     assert seen == [7, 8, 11, 12, 15, 2, 3]
     last = [item.count for item in queue.take_all() if item.count is not None][-1]
     assert (last.units, last.lost_kernel) == (7 + lost, lost)
+
+
+# --- a wire's own trouble --------------------------------------------------------------------------------------------
+
+
+def test_trouble_is_told_at_once_and_while_it_goes_on_every_half_minute() -> None:
+    clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
+    events = Events(clock, queue, channels)
+    now_s = 1000.0
+    trouble = WireTrouble("imu/main", events, lambda: now_s)
+    counters = TransportCounters(receive_buffer_bytes=1000)
+    assert trouble.look(counters) == {}
+    for _ in range(100):  # 100 s, ten error frames a second, one of them bus-off after a minute
+        counters.error_frames += 10
+        counters.bus_off += now_s == 1060.0
+        assert trouble.look(counters)["error_frames"] == counters.error_frames
+        now_s += 1.0
+    now_s += 60.0
+    trouble.look(counters)
+    trouble.look(counters)
+    told = [(event.code, event.severity, int(event.text.split()[0])) for event in events.recent]
+    errors = [("can_errors", Severity.WARNING, count) for count in (10, 300, 300, 300, 90)]
+    assert told == [*errors[:2], ("can_bus_off", Severity.ERROR, 1), *errors[2:]]
 
 
 # --- what people and the service manager are told -------------------------------------------------------------------
