@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import lzma
 import operator
 import random
 import zlib
 from collections import Counter
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,6 +21,7 @@ from drivers.core.checksums import (
     FLETCHER_STEP_BYTES,
     crc24q,
     crc32_novatel,
+    crc64_xz,
     nmea_xor,
     ubx_fletcher,
 )
@@ -97,6 +100,22 @@ def test_crc24q_of_long_data_joins_its_steps(length: int) -> None:
 def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
+
+
+def crc64_reference(data: bytes) -> int:
+    """The check of a block as liblzma writes it (The .xz File Format, 2.1.2 and 3.4)."""
+    packed = lzma.compress(data, check=lzma.CHECK_CRC64)
+    index_bytes = 4 * (int.from_bytes(packed[-8:-4], "little") + 1)
+    end = len(packed) - 12 - index_bytes
+    return int.from_bytes(packed[end - 8 : end], "little")
+
+
+@pytest.mark.parametrize("length", [8, 9, 15, 16, 17, 23, 24, 25, 444, 8440, 24_824])
+def test_crc64_of_rows_joins_their_words(length: int) -> None:
+    rows = np.frombuffer(random.Random(length).randbytes(5 * length), dtype=np.uint8).reshape(5, length)
+    assert crc64_xz(rows).tolist() == [crc64_reference(row.tobytes()) for row in rows]
+    assert crc64_xz(rows[::2]).tolist() == [crc64_reference(row.tobytes()) for row in rows[::2]]
+    assert crc64_xz(rows[:0]).tolist() == []
 
 
 def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
