@@ -142,7 +142,9 @@ class GeometryConfig(Section):
         None, description="srep: the kind of deflection"
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
-    file: Text | None = Field(None, description="the device's own table (beam angles, metadata), relative to this file")
+    file: Text | None = Field(
+        None, description="the device's own table (ouster: its metadata, JSON), relative to this file"
+    )
 
     @model_validator(mode="after")
     def _polygon_has_facets(self) -> Self:

@@ -132,6 +132,8 @@ class Driver:
         make_parser: builds the parser of everything.
         make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
             where the device says no time.
+        make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
+            defaults; it is asked when another protocol was configured.
         names_edge: which edge its time messages name by default; None where mixed or none.
         needs: configuration keys without which it cannot work.
     """
@@ -143,5 +145,6 @@ class Driver:
     summary: str
     make_parser: Callable[[DeviceSettings], Parser]
     make_time_parser: Callable[[DeviceSettings], Parser] | None = None
+    make_probe: Callable[[DeviceSettings], Parser] | None = None
     names_edge: NamesEdge | None = None
     needs: tuple[str, ...] = ()
