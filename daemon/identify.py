@@ -78,14 +78,14 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
 
     A parser that decodes records is before one that only finds messages (receivers mix protocols on a port, and
     their parsers frame each other's); the latter must find more than ``than``, what the configured one found. A
-    driver that cannot work without settings that only the right configuration has is left out.
+    driver that cannot work without settings that only the right configuration has is asked by its probe, or left out.
     """
     best, most = None, (0, max(than, LEAST_MESSAGES - 1))
     for protocol, driver in all_drivers(entry.kind).items():
         if protocol == entry.protocol:
             continue
         try:
-            parser = driver.make_parser(_default_settings(entry, protocol))
+            parser = (driver.make_probe or driver.make_parser)(_default_settings(entry, protocol))
         except DriverSettingsError:
             continue
         heard = Heard()
