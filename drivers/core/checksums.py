@@ -6,6 +6,7 @@ whole frame are 0 when it is intact.
 
 from __future__ import annotations
 
+import lzma
 import zlib
 from functools import cache
 from typing import TypeAlias
@@ -148,3 +149,29 @@ def _crc64_tables(zero_bytes: int) -> NDArray[np.uint64]:
         shifted = (shifted >> np.uint64(1)) ^ np.where(shifted & np.uint64(1), CRC64_POLYNOMIAL, np.uint64(0))
     higher = [values << np.uint64(8 * (byte - 1)) for byte in range(1, 8)]
     return np.stack([shifted, *higher])
+
+
+def _xz_part(content: bytes) -> bytes:
+    return content + zlib.crc32(content).to_bytes(4, "little")
+
+
+# The stream's flags say CRC-64; the block's header says no sizes and one filter, LZMA2 with the least dictionary.
+_XZ_BEGIN = b"\xfd7zXZ\0" + _xz_part(bytes([0, 4])) + _xz_part(bytes([2, 0, 0x21, 1, 0, 0, 0, 0]))
+
+
+def crc64_xz_holds(data: bytes, crc: bytes) -> bool:
+    """Whether this is the data's CRC-64/XZ, little-endian: a tenth of the time `crc64_xz` needs to make one.
+
+    liblzma compares it: the data is handed to it as the one stored chunk of an .xz block (The .xz File Format, 2.1,
+    3.1 and 3.4), the CRC as the block's check.
+
+    Args:
+        data: 1 to 65536 bytes.
+        crc: 8 bytes.
+    """
+    chunk = b"\x01" + (len(data) - 1).to_bytes(2, "big") + data + bytes(1 + -len(data) % 4)
+    try:
+        lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(_XZ_BEGIN + chunk + crc)
+    except lzma.LZMAError:
+        return False
+    return True

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.checksums import crc64_xz
+from drivers.core.checksums import crc64_xz, crc64_xz_holds
 from drivers.core.parser import DriverSettingsError
 from drivers.scanner.ouster_head import FILE, FUSA_PROFILE, LARGEST_PACKET_BYTES, OusterHead
 from georef.records import StructArray
@@ -288,10 +288,8 @@ def with_crc(packet: bytes) -> bytes:
 def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(n,) whether packets (n, length) have the CRC of their bytes, or were sent without one."""
     said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
-    without = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
-    holds: NDArray[np.bool_] = without.copy()
-    rows = np.flatnonzero(~without)
-    if len(rows):
-        body = units[:, :-8] if len(rows) == len(units) else units[rows, :-8]
-        holds[rows] = crc64_xz(body) == said[rows]
+    holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
+    for row in np.flatnonzero(~holds).tolist():
+        packet = units[row].tobytes()
+        holds[row] = crc64_xz_holds(packet[:-8], packet[-8:])
     return holds

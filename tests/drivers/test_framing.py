@@ -22,6 +22,7 @@ from drivers.core.checksums import (
     crc24q,
     crc32_novatel,
     crc64_xz,
+    crc64_xz_holds,
     nmea_xor,
     ubx_fletcher,
 )
@@ -116,6 +117,19 @@ def test_crc64_of_rows_joins_their_words(length: int) -> None:
     assert crc64_xz(rows).tolist() == [crc64_reference(row.tobytes()) for row in rows]
     assert crc64_xz(rows[::2]).tolist() == [crc64_reference(row.tobytes()) for row in rows[::2]]
     assert crc64_xz(rows[:0]).tolist() == []
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 6, 444, 8440, 65_536])
+def test_crc64_holds_of_whole_data_only(length: int) -> None:
+    data = random.Random(length).randbytes(length)
+    crc = crc64_reference(data).to_bytes(8, "little")
+    assert crc64_xz_holds(data, crc)
+    for bit in random.Random(1).sample(range(8 * length), min(8 * length, 40)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        assert not crc64_xz_holds(bytes(flipped), crc)
+    for bit in range(64):
+        assert not crc64_xz_holds(data, (int.from_bytes(crc, "little") ^ 1 << bit).to_bytes(8, "little"))
 
 
 def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
