@@ -13,7 +13,7 @@ it orders by range, the one with more signal is.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from drivers.scanner.ouster_layout import (
 )
 from drivers.scanner.ouster_probe import OusterProbe
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, BeamColumns, ReturnSlots, returns_table
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -48,6 +48,9 @@ from georef.records import (
     ScannerReturns,
     StructArray,
 )
+
+Words: TypeAlias = NDArray[np.uint32]
+WordPair: TypeAlias = tuple[Words, Words]
 
 SECOND_NS = 1_000_000_000
 LARGEST_GAP_FRAMES = 600  # half a minute to a minute; more is a head that began anew
@@ -85,7 +88,8 @@ class OusterParser(PacketParser):
         columns = self.head.columns_per_frame
         self._encoder_rad = 2 * np.pi * (-np.arange(columns) % columns) / columns
         ordered = self.head.return_order == "STRONGEST_TO_WEAKEST"
-        self._strongest = "first" if ordered else "signal" if "SIGNAL" in self.layout.profile.fields else "unsaid"
+        self._light = "SIGNAL" if "SIGNAL" in self.layout.profile.fields else "REFLECTIVITY"
+        self._strongest = "first" if ordered else "signal" if self._light == "SIGNAL" else "unsaid"
         self._thinner = SampleThinner() if clock_only else None
         self._init_id: int | None = None
         self._time_ns = 0
@@ -289,41 +293,37 @@ class OusterParser(PacketParser):
 
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:
         """The slots of valid columns; ``number`` is each column's, counted from the first frame on."""
-        beams, layout = self.head.beams, self.layout
-        light = "SIGNAL" if "SIGNAL" in layout.profile.fields else "REFLECTIVITY"
         flags: dict[str, NDArray[Any] | int] = {}
         per_slot: dict[str, NDArray[Any]] = {}
-        pixels = columns["pixels"]
-        range_raw, intensity = (layout.raw_field(pixels, name).reshape(-1, 1) for name in ("RANGE", light))
-        if layout.dual:
-            range_raw, intensity, per_slot["flags"] = _pair_returns(
-                np.hstack([range_raw, layout.raw_field(pixels, "RANGE2").reshape(-1, 1)]),
-                np.hstack([intensity, layout.raw_field(pixels, f"{light}2").reshape(-1, 1)]),
-                self._strongest,
+        chosen: NDArray[np.intp] | None = None
+        range_raw, light = (self._words(columns, name) for name in ("RANGE", self._light))
+        if self.layout.dual:
+            second = self._words(columns, "RANGE2")
+            chosen = np.flatnonzero(range_raw | second)
+            light2 = self._words(columns, f"{self._light}2")[chosen]
+            range_raw, light, per_slot["flags"] = _pair_returns(
+                (range_raw[chosen], second[chosen]), (light[chosen], light2), self._strongest
             )
         else:
+            range_raw, light = range_raw[:, np.newaxis], light[:, np.newaxis]
             flags["flags"] = _SINGLE_FLAGS.get(self.head.return_order, 0)
-        shape = (len(number), beams)
-
-        def each_beam(values: NDArray[Any]) -> NDArray[Any]:
-            return np.broadcast_to(values.reshape(-1, 1), shape).reshape(-1)
-
+        per_column = {
+            "host_time_ns": host_time_ns,
+            "device_time_ns": columns["time_ns"].reshape(-1),
+            "encoder_rad": self._encoder_rad[columns["id"].reshape(-1)],
+        }
         return ReturnSlots(
             range_raw=range_raw,
-            range_unit_m=RANGE_MM * (1 << layout.profile.fields["RANGE"].dropped),
-            intensity=intensity,
+            range_unit_m=RANGE_MM * (1 << self.layout.profile.fields["RANGE"].dropped),
+            intensity=light,
             per_slot=per_slot,
-            per_pulse={
-                "host_time_ns": each_beam(host_time_ns),
-                "device_time_ns": each_beam(columns["time_ns"]),
-                "encoder_rad": each_beam(self._encoder_rad[columns["id"]]),
-                "pulse_id": (number[:, np.newaxis] * beams + np.arange(beams)).reshape(-1),
-                "channel": np.broadcast_to(np.arange(beams, dtype=np.uint16), shape).reshape(-1),
-                "pulse_width_ns": 0,
-                "mta_zone": 0,
-                **flags,
-            },
+            per_pulse={"pulse_width_ns": 0, "mta_zone": 0, **flags},
+            columns=BeamColumns(self.head.beams, number * self.head.beams, per_column, chosen),
         )
+
+    def _words(self, columns: StructArray, name: str) -> Words:
+        """(pulses,) a field of all beams of all columns."""
+        return self.layout.raw_field(columns["pixels"], name).reshape(-1)
 
 
 def _window_ranks(layout: LidarLayout) -> Int64Array:
@@ -339,25 +339,27 @@ def _window_ranks(layout: LidarLayout) -> Int64Array:
     return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
 
 
-def _pair_returns(
-    ranges: NDArray[np.uint32], light: NDArray[np.uint32], strongest: str
-) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """Two returns of a block (pulses, 2), as sent, as slots of rising range: range, light and flags.
+def _pair_returns(ranges: WordPair, light: WordPair, strongest: str) -> tuple[Words, Words, NDArray[np.uint8]]:
+    """Two returns of a block, as sent, as slots (pulses, 2) of rising range: range, light and flags.
 
     Args:
-        ranges, light: (pulses, 2).
+        ranges, light: first and second of the block, each (pulses,).
         strongest: ``first`` of the block, the one of more ``signal``, or ``unsaid``.
     """
-    first, second = ranges[:, 0], ranges[:, 1]
-    two = (first > 0) & (second > 0)
-    in_order = np.where(two, first <= second, first > 0)[:, np.newaxis]
-    near_strongest = in_order[:, 0] if strongest == "first" else (light[:, 0] >= light[:, 1]) == in_order[:, 0]
-    flags = np.empty(ranges.shape, dtype=np.uint8)
-    alone = RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST
+    first, second = ranges
+    near, far = np.minimum(first, second), np.maximum(first, second)
+    two = near > 0
+    in_order = (first == near) == two  # the nearer, or the only one, is the first
+    near_strongest = in_order if strongest == "first" else (light[0] >= light[1]) == in_order
     said = np.uint8(0 if strongest == "unsaid" else RETURN_FLAG_STRONGEST)
-    flags[:, 0] = np.where(two, near_strongest * said, np.uint8(alone))
+    alone = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
+    slots = np.empty((2, len(first), 2), dtype=np.uint32)
+    slots[0, :, 0], slots[0, :, 1] = np.where(two, near, far), np.where(two, far, 0)
+    slots[1, :, 0], slots[1, :, 1] = np.where(in_order, *light), np.where(in_order, light[1], light[0])
+    flags = np.empty((len(first), 2), dtype=np.uint8)
+    flags[:, 0] = np.where(two, near_strongest * said, alone)
     flags[:, 1] = RETURN_FLAG_LAST + ~near_strongest * said
-    return np.where(in_order, ranges, ranges[:, ::-1]), np.where(in_order, light, light[:, ::-1]), flags
+    return slots[0], slots[1], flags
 
 
 def _clock_parser(settings: DeviceSettings) -> OusterParser:
