@@ -22,11 +22,14 @@ from pathlib import Path
 import numpy as np
 from isal.isal_zlib import crc32
 
+from drivers.core.checksums import crc64_xz
 from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Parser, ParserCounters
 from drivers.imu.canmod_gps import CanmodGpsParser
 from drivers.imu.dbc import DbcParser
+from drivers.scanner.ouster import OusterParser
+from drivers.scanner.ouster_layout import LidarLayout
 from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
@@ -163,6 +166,46 @@ def measure_velodyne(repeats: int) -> Iterator[Figure]:
         yield Figure(name, "returns", decode, 10e6, rate(least, rows, repeats), "copy of packets and rows")
 
 
+def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
+    """The first frame of a recording, several times over, with frame numbers, stamps and CRCs that go on."""
+    per_frame = layout.head.columns_per_frame // layout.head.columns_per_packet
+    packets = [unit.data for unit in read_pcap(FIXTURES / "ouster" / f"{recording}.pcap.gz", port=7502)][:per_frame]
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(per_frame, -1)
+    units = np.tile(once, (max(1, 8_000_000 // once.size), 1))
+    table = units.view(layout.dtype).reshape(-1)
+    frame, columns = np.arange(len(units)) // per_frame, table["columns"]
+    columns["time_ns"] = 97_656 * np.arange(columns.size).reshape(columns.shape)
+    if layout.legacy:
+        columns["frame_id"] = frame[:, np.newaxis]
+        return units
+    table["frame_id"] = frame
+    table["crc"] = crc64_xz(units[:, :-8])
+    return units
+
+
+def measure_ouster(repeats: int) -> Iterator[Figure]:
+    """Ouster heads, real packets; those with a header got the CRC that newer firmware sends."""
+    for name, recording, metadata in (
+        ("Ouster, LEGACY, 32 beams", "OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),
+        ("Ouster, dual return, 32 beams", "OS-0-32-U1_v2.2.0_1024x10", "OS-0-32-U1_v2.2.0_1024x10"),
+        ("Ouster, low rate, 128 beams", "OS-1-128_v2.3.0_1024x10_lb_n3", "OS-1-128_v2.3.0_1024x10"),
+    ):
+        file = (FIXTURES / "ouster" / f"{metadata}.json").read_bytes()
+        settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
+        units = ouster_units(recording, OusterParser(settings).layout)
+        batches = batches_of(units)
+        make = lambda s=settings: OusterParser(s)  # noqa: E731
+        rows = decode_all(make, batches)
+        copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+
+        def least(units: ByteRows = units, taken: ByteRows = taken, copy: Callable[[], object] = copy) -> None:
+            np.copyto(taken, units)
+            copy()
+
+        decode = rate(lambda m=make, b=batches: decode_all(m, b), rows, repeats)  # type: ignore[misc]
+        yield Figure(name, "returns", decode, 8e6, rate(least, rows, repeats), "copy of packets and rows")
+
+
 # --- CAN ------------------------------------------------------------------------------------------------------------
 
 
@@ -276,7 +319,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = []
     print(f"{'decoding, one core':<30} {'rate':>10} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
-    for measure in (measure_srep, measure_velodyne, measure_can, measure_framing):
+    for measure in (measure_srep, measure_velodyne, measure_ouster, measure_can, measure_framing):
         for figure in measure(arguments.repeats):
             figures.append(figure)
             asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"
