@@ -9,7 +9,7 @@ import numpy as np
 
 from daemon.config import DeviceEntry, GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import all_drivers
+from drivers.core.registry import all_drivers, find_driver
 from georef.records import ChunkBatch, DeviceClockSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # one frame may be chance
@@ -58,7 +58,7 @@ def describe_time(entry: DeviceEntry, heard: Heard) -> str:
         return f"{describe_tag(heard.valid_time.time)} ({heard.valid_time.message})"
     if heard.time_messages:
         return "not valid"
-    if heard.sees_pps is not None:
+    if heard.sees_pps is not None and find_driver(entry.kind, entry.protocol).tells_pps:
         return "PPS seen" if heard.sees_pps else "no PPS"
     return "none" if entry.kind == "gnss" else ""
 

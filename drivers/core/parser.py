@@ -135,6 +135,7 @@ class Driver:
         make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
             defaults; it is asked when another protocol was configured.
         names_edge: which edge its time messages name by default; None where mixed or none.
+        tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
         needs: configuration keys without which it cannot work.
     """
 
@@ -147,4 +148,5 @@ class Driver:
     make_time_parser: Callable[[DeviceSettings], Parser] | None = None
     make_probe: Callable[[DeviceSettings], Parser] | None = None
     names_edge: NamesEdge | None = None
+    tells_pps: bool = True
     needs: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from drivers.scanner.ouster_head import FILE, read_head
+from drivers.scanner.ouster_head import FILE, SYNC_PULSE, read_head
 from drivers.scanner.ouster_imu import imu_packet_bytes, imu_samples
 from drivers.scanner.ouster_layout import (
     ENCODER_COUNTS,
@@ -78,8 +78,11 @@ class OusterParser(PacketParser):
         if "geometry" not in settings.files:
             raise DriverSettingsError(f"{FILE}: missing; want the head's metadata, a JSON file")
         self.head = read_head(settings.files["geometry"])
+        serial = settings.config.get("serial") or ""
+        if serial and self.head.serial is not None and serial != str(self.head.serial):
+            raise DriverSettingsError(f"{FILE}: it is of head {self.head.serial}, serial is {serial}; want its own")
         self.layout = LidarLayout(self.head)
-        self._latches = self.head.timestamp_mode == "TIME_FROM_SYNC_PULSE_IN" and bool(settings.config.get("pps"))
+        self._latches = self.head.timestamp_mode == SYNC_PULSE and bool(settings.config.get("pps"))
         self._rank = _window_ranks(self.layout)
         per_frame = int(self._rank.max()) + 1
         self._tracker = SequenceTracker(
@@ -226,6 +229,8 @@ class OusterParser(PacketParser):
             "profile": head.profile,
             "timestamp_mode": head.timestamp_mode or "unsaid",
         }
+        if head.timestamp_mode == SYNC_PULSE:
+            values["nmea_input"] = head.nmea_input
         if not self.layout.legacy:
             values["init_id"] = key[0]
             if head.init_id is not None:
@@ -376,6 +381,7 @@ DRIVERS = (
         make_parser=OusterParser,
         make_time_parser=_clock_parser,
         make_probe=OusterProbe,
+        tells_pps=False,
         needs=("installation", "geometry.file"),
     ),
 )

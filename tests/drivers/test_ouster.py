@@ -337,6 +337,9 @@ def test_the_pulse_lies_at_the_whole_second_where_one_is_wired(
     np.testing.assert_array_equal(clock["device_time_ns"], 5_000_000_000 + 97_656 * (16 * np.arange(1, 41) - 1))
     np.testing.assert_array_equal(clock["pps_time_ns"], 5_000_000_000 if latched else -1)
     assert set(clock["locked"].tolist()) == {-1}
+    (status,) = [record for record in records if isinstance(record, DeviceStatus)]
+    assert status.values["timestamp_mode"] == mode
+    assert status.values.get("nmea_input") == (False if "SYNC" in mode else None)
 
 
 # --- lost, repeated and damaged -------------------------------------------------------------------------------------
@@ -402,6 +405,18 @@ def test_a_head_that_starts_anew_is_no_gap() -> None:
     first_of = np.unique(rows["pulse_id"][rows["host_time_ns"] >= 40_000_000] // 256)
     last_of = np.unique(rows["pulse_id"][rows["host_time_ns"] < 40_000_000] // 256)
     assert first_of.min() == last_of.max() + 1
+
+
+def test_a_frame_number_that_begins_anew_is_no_gap() -> None:
+    """LEGACY says no start, and under PTP the stamps go on through it."""
+    parser = parser_of(metadata("LEGACY", columns=512, timestamp_mode="TIME_FROM_PTP_1588"))
+    units = [
+        parser.layout.encode(frame, 16 * at, 10**18 + 10**9 * turn + 10**6 * at + np.arange(16), {"RANGE": 5000})
+        for turn, frame in enumerate((40_000, 40_001, 0, 1))
+        for at in range(32)
+    ]
+    feed(parser, units)
+    assert parser.counters.errors == {"restart": 1}
 
 
 def test_health_is_told_when_it_changes() -> None:

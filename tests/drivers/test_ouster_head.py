@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.scanner.ouster import OusterParser
 from drivers.scanner.ouster_head import read_head
-from tests.drivers.ouster_cases import metadata, metadata_of, parser_of
+from tests.drivers.ouster_cases import SERIAL, metadata, metadata_of, parser_of
 
 
 def test_the_flat_form_of_older_firmware() -> None:
@@ -159,6 +159,13 @@ def test_what_is_no_metadata_is_refused(content: bytes, reason: str) -> None:
 def test_without_metadata_there_is_no_parser() -> None:
     with pytest.raises(DriverSettingsError, match=r"geometry\.file: missing; want the head's metadata"):
         OusterParser(DeviceSettings("scanner/left"))
+
+
+def test_metadata_of_another_head_than_the_configured_one_is_refused() -> None:
+    assert parser_of(metadata(), serial="").head.serial == SERIAL
+    assert parser_of(metadata(), serial=str(SERIAL)).head.serial == SERIAL
+    with pytest.raises(DriverSettingsError, match=f"it is of head {SERIAL}, serial is 99; want its own"):
+        parser_of(metadata(), serial="99")
 
 
 def refusal(content: bytes) -> str | None:
