@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.ouster_head import FILE, SYNC_PULSE, read_head
+from drivers.scanner.ouster_health import HealthReader
 from drivers.scanner.ouster_imu import imu_packet_bytes, imu_samples
 from drivers.scanner.ouster_layout import (
     ENCODER_COUNTS,
-    HEALTH,
     IMU_PACKET,
     LIDAR_PACKET,
     RANGE_MM,
@@ -83,7 +83,7 @@ class OusterParser(PacketParser):
             raise DriverSettingsError(f"{FILE}: it is of head {self.head.serial}, serial is {serial}; want its own")
         self.layout = LidarLayout(self.head)
         self._latches = self.head.timestamp_mode == SYNC_PULSE and bool(settings.config.get("pps"))
-        self._rank = _window_ranks(self.layout)
+        self._rank = self.layout.window_ranks()
         per_frame = int(self._rank.max()) + 1
         self._tracker = SequenceTracker(
             self.counters.errors, self.layout.frame_ids * per_frame, LARGEST_GAP_FRAMES * per_frame
@@ -96,7 +96,7 @@ class OusterParser(PacketParser):
         self._thinner = SampleThinner() if clock_only else None
         self._init_id: int | None = None
         self._time_ns = 0
-        self._status: tuple[int, ...] | None = None
+        self._health = HealthReader(self.layout)
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         """Decode packets of equal length; see `PacketParser.parse_units`."""
@@ -120,13 +120,24 @@ class OusterParser(PacketParser):
 
     def _keep(self, units: ByteRows, packet_type: int, name: str) -> BoolArray:
         """(n,) which packets with a header are of this kind and whole; all are counted."""
-        intact = np.ones(len(units), dtype=np.bool_) if self.head.header == "fusa" else crc_holds(units)
-        self._bad_checksums(int((~intact).sum()), units.shape[1])
-        of_kind = units[:, 0] == packet_type
-        self._refuse("bad_packet_type", int((intact & ~of_kind).sum()), units.shape[1])
-        good: BoolArray = intact & of_kind
+        good = np.ones(len(units), dtype=np.bool_) if self.head.header == "fusa" else crc_holds(units)
+        self._select(good, self._origin(self.layout.headers(units), packet_type), units.shape[1])
         self._count(name, int(good.sum()), units.shape[1])
         return good
+
+    def _select(self, good: BoolArray, criteria: list[tuple[str, BoolArray]], length: int) -> None:
+        """Strike out of ``good``, the packets with a good checksum, what fails a criterion; all others are counted."""
+        self._bad_checksums(int((~good).sum()), length)
+        for code, passes in criteria:
+            self._refuse(code, int((good & ~passes).sum()), length)
+            good &= passes
+
+    def _origin(self, headers: StructArray, packet_type: int) -> list[tuple[str, BoolArray]]:
+        """What a packet's header must say."""
+        criteria: list[tuple[str, BoolArray]] = [("bad_packet_type", headers["type"] == packet_type)]
+        if self.head.serial is not None:
+            criteria.append(("wrong_serial", self.layout.serial(headers) == self.head.serial))
+        return criteria
 
     def _bad_checksums(self, count: int, length: int) -> None:
         self.counters.bad_checksums += count
@@ -155,13 +166,14 @@ class OusterParser(PacketParser):
     def _lidar(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         units = np.ascontiguousarray(units)
         packets = units.view(self.layout.dtype).reshape(-1)
-        good = self._check(packets, units)
+        good = crc_holds(units) if self.layout.has_crc else np.ones(len(packets), dtype=np.bool_)
+        self._select(good, self._criteria(packets), units.shape[1])
         self._count("lidar", int(good.sum()), units.shape[1])
         if not good.all():
             host_time_ns, packets = host_time_ns[good], packets[good]
         if not len(packets):
             return []
-        records: list[Record] = list(self._health(host_time_ns, packets))
+        records: list[Record] = list(self._health.read(host_time_ns, packets))
         unwrapped, fresh = self._follow(packets)
         if not fresh.all():
             host_time_ns, packets, unwrapped = host_time_ns[fresh], packets[fresh], unwrapped[fresh]
@@ -176,22 +188,9 @@ class OusterParser(PacketParser):
                 records.append(ScannerReturns(rows))
         return records
 
-    def _check(self, packets: StructArray, units: ByteRows) -> BoolArray:
-        """(n,) True for packets of this head that can be decoded; the others are counted by what is wrong."""
-        good = crc_holds(units) if self.layout.has_crc else np.ones(len(packets), dtype=np.bool_)
-        self._bad_checksums(int((~good).sum()), units.shape[1])
-        for code, passes in self._tests(packets):
-            self._refuse(code, int((good & ~passes).sum()), units.shape[1])
-            good &= passes
-        return good
-
-    def _tests(self, packets: StructArray) -> list[tuple[str, BoolArray]]:
-        """What a packet must pass, in this order."""
-        tests: list[tuple[str, BoolArray]] = []
-        if not self.layout.legacy:
-            tests.append(("bad_packet_type", packets["type"] == LIDAR_PACKET))
-            if self.head.serial is not None:
-                tests.append(("wrong_serial", self.layout.serial(packets) == self.head.serial))
+    def _criteria(self, packets: StructArray) -> list[tuple[str, BoolArray]]:
+        """What a lidar packet must pass, in this order."""
+        criteria = [] if self.layout.legacy else self._origin(packets, LIDAR_PACKET)
         columns, per_packet = packets["columns"], self.head.columns_per_packet
         valid, first_id = self.layout.valid(columns), self.layout.first_id(columns)
         ids = first_id[:, np.newaxis] + np.arange(per_packet)
@@ -201,42 +200,10 @@ class OusterParser(PacketParser):
             regular &= (np.abs(columns["encoder"].astype(np.int64) - ids * step) < step) | ~valid
         whole = regular.all(axis=1) & (first_id % per_packet == 0)
         whole &= (first_id >= 0) & (first_id <= self.head.columns_per_frame - per_packet)
-        tests.append(("bad_column", whole))
-        tests.append(("outside_window", self._rank[np.where(whole, first_id, 0) // per_packet] >= 0))
-        tests.append(("bad_timestamp", np.all((columns["time_ns"] < np.uint64(1 << 63)) | ~valid, axis=1)))
-        return tests
-
-    def _health(self, host_time_ns: Int64Array, packets: StructArray) -> list[DeviceStatus]:
-        """What the head says of itself, where it changes."""
-        said = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
-        said[:, 0] = self.layout.init_id(packets)
-        if not self.layout.legacy:
-            for place, name in enumerate(HEALTH, start=1):
-                said[:, place] = packets[name]
-        changes = np.flatnonzero((said[1:] != said[:-1]).any(axis=1)) + 1
-        statuses = []
-        for at in (0, *changes.tolist()):
-            key = tuple(said[at].tolist())
-            if key != self._status:
-                self._status = key
-                statuses.append(self._describe(int(host_time_ns[at]), key))
-        return statuses
-
-    def _describe(self, host_ns: int, key: tuple[int, ...]) -> DeviceStatus:
-        head = self.head
-        values: dict[str, float | int | str | bool] = {
-            "model": head.model,
-            "profile": head.profile,
-            "timestamp_mode": head.timestamp_mode or "unsaid",
-        }
-        if head.timestamp_mode == SYNC_PULSE:
-            values["nmea_input"] = head.nmea_input
-        if not self.layout.legacy:
-            values["init_id"] = key[0]
-            if head.init_id is not None:
-                values["metadata_of_this_start"] = key[0] == head.init_id
-            values |= dict(zip(HEALTH, key[1:], strict=True))
-        return DeviceStatus(host_ns, values, message="lidar")
+        criteria.append(("bad_column", whole))
+        criteria.append(("outside_window", self._rank[np.where(whole, first_id, 0) // per_packet] >= 0))
+        criteria.append(("bad_timestamp", np.all((columns["time_ns"] < np.uint64(1 << 63)) | ~valid, axis=1)))
+        return criteria
 
     def _follow(self, packets: StructArray) -> tuple[Int64Array, BoolArray]:
         """Number the packets (n,), gaps left open; False for one that repeats the one before."""
@@ -329,19 +296,6 @@ class OusterParser(PacketParser):
     def _words(self, columns: StructArray, name: str) -> Words:
         """(pulses,) a field of all beams of all columns."""
         return self.layout.raw_field(columns["pixels"], name).reshape(-1)
-
-
-def _window_ranks(layout: LidarLayout) -> Int64Array:
-    """Which packet of a frame a place on the circle is, −1 where the window has none (Azimuth Window).
-
-    Packets are sent whole, in the order of their measurement ids, where the window reaches into them.
-    """
-    head = layout.head
-    first, last = (one // head.columns_per_packet for one in head.column_window)
-    place = np.arange(head.columns_per_frame // head.columns_per_packet)
-    around = head.column_window[0] > head.column_window[1]
-    sent = (place >= first) | (place <= last) if around else (place >= first) & (place <= last)
-    return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
 
 
 def _pair_returns(ranges: WordPair, light: WordPair, strongest: str) -> tuple[Words, Words, NDArray[np.uint8]]:

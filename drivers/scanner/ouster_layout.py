@@ -206,6 +206,12 @@ class LidarLayout:
             word = word >> np.uint32(shift)
         return word & np.uint32((1 << bits.size) - 1) if shift + bits.size < 32 else word
 
+    def headers(self, units: NDArray[np.uint8]) -> StructArray:
+        """(n,) headers of other packets than lidar's, (n, length); LEGACY heads send those with a STANDARD one."""
+        kind = "standard" if self.legacy else self.head.header
+        content = np.ascontiguousarray(units[:, :HEADER_BYTES])
+        return content.view(_table(_HEADERS[kind], HEADER_BYTES)).reshape(-1)
+
     def valid(self, columns: StructArray) -> NDArray[np.bool_]:
         """Which columns hold a measurement: bit 0 of the status."""
         found: NDArray[np.bool_] = (columns["status"] & 1).astype(np.bool_)
@@ -227,6 +233,18 @@ class LidarLayout:
         """How many there are until they begin again."""
         return 1 << (32 if self.head.header == "fusa" else 16)
 
+    def window_ranks(self) -> NDArray[np.int64]:
+        """(packets of a full frame,) which packet of a frame each place on the circle is, −1 where the window has none.
+
+        Packets are sent whole, in the order of their measurement ids, where the window reaches into them.
+        """
+        head = self.head
+        first, last = (one // head.columns_per_packet for one in head.column_window)
+        place = np.arange(head.columns_per_frame // head.columns_per_packet)
+        around = head.column_window[0] > head.column_window[1]
+        sent = (place >= first) | (place <= last) if around else (place >= first) & (place <= last)
+        return np.where(sent, np.cumsum(sent) - 1, -1).astype(np.int64)
+
     def init_id(self, packets: StructArray) -> NDArray[np.int64]:
         """(n,) number of the head's start; 0 in LEGACY, which does not say it."""
         if self.legacy:
@@ -234,7 +252,7 @@ class LidarLayout:
         return ((packets["init_word"] >> _INIT_SHIFT[self.head.header]) & 0xFF_FFFF).astype(np.int64)
 
     def serial(self, packets: StructArray) -> NDArray[np.int64]:
-        """(n,) serial number; not in LEGACY."""
+        """(n,) serial number of packets or headers; not in LEGACY's lidar packets."""
         return (packets["serial_word"] & np.uint64((1 << 40) - 1)).astype(np.int64)
 
     # -- writing

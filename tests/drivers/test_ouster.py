@@ -450,6 +450,20 @@ def test_packets_that_cannot_be_are_counted(at: int, new: bytes, code: str) -> N
     assert set(rows["host_time_ns"].tolist()) == {0, 2_000_000}
 
 
+def test_imu_packets_of_another_head_are_counted() -> None:
+    parser = recorded("imu_zm_no_lidar")
+    units = list(payloads("imu_zm_no_lidar"))
+    for at, place in ((1, 0), (2, 7), (3, 140)):
+        unit = bytearray(units[at])
+        unit[place] ^= 0x40
+        units[at] = bytes(unit) if place == 140 else with_crc(bytes(unit))
+    rows = samples_of(feed(parser, units))
+    assert parser.counters.errors == {"bad_packet_type": 1, "wrong_serial": 1}
+    assert parser.counters.bad_checksums == 1
+    assert parser.counters.messages == {"imu": 5, "zone": 1}
+    assert len(rows) == 5 * 8
+
+
 def test_encoder_counts_of_another_mode_are_refused() -> None:
     """LEGACY packets say the encoder: metadata of another number of columns is found out by it."""
     units = frames_of(parser_of(metadata("LEGACY", columns=512)).layout, 10)
