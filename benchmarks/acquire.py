@@ -1,6 +1,6 @@
 """What recording costs: CPU of the recorder's process, losses and memory, beside the machine's own limits.
 
-python -m benchmarks.acquire [--seconds 60] [--json FILE]
+python -m benchmarks.acquire [--seconds 60] [--repeats 3] [--json FILE]
 
 The limit beside each figure is what the bare building blocks cost in the same run: recvmmsg into slots and one
 writev a batch to a file, without stamps, log format, checksums or index. Sender and receiver share the machine.
@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
+import operator
 import os
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -21,12 +24,13 @@ import threading
 import time
 import tty
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from daemon.log.reader import open_logs
 
 TICKS = os.sysconf("SC_CLK_TCK")
+CAN_GROUP = "239.74.163.99"
 PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -182,42 +186,112 @@ def stall(seconds: float) -> Figure:
     return Figure("0.5 s stall at 20,000 × 1206 B/s", int(out.split()[0]), status["written"], 0.0, None, 0.0, note)
 
 
-def other_sensors(seconds: float, *, load: bool) -> Figure:
-    """GNSS at 921600 baud through a pty and 1000 CAN frames a second on a udp_multicast bus."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        (folder / "rover").symlink_to(os.ttyname(slave))
-        tables = (
-            f'[gnss.rover]\ntransport = "serial:{folder}/rover?baud=921600"\nprotocol = "nmea"\n'
-            '[imu.main]\ntransport = "can:udp_multicast:239.74.163.99"\nprotocol = "canmod-gps"\n'
-        )
-        with recorder(folder, tables) as process:
-            before, started = cpu_s(process.pid), time.monotonic()
-            sent = 0
-            if load:
-                writer = threading.Thread(target=_write_serial, args=(master, 92160.0, seconds))
-                writer.start()
-                can = sender("can", "239.74.163.99", 1000, seconds)
-                out, _ = can.communicate()
-                writer.join()
-                sent = int(out)
-            else:
-                time.sleep(seconds)
-            cpu = (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
-            memory = rss_mb(process.pid)
-            time.sleep(2.0)
+@contextlib.contextmanager
+def serial_port(folder: Path) -> Iterator[int]:
+    """A pseudo-terminal at ``folder``/rover; gives the descriptor to write on."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    (folder / "rover").symlink_to(os.ttyname(slave))
+    try:
+        yield master
+    finally:
         os.close(master)
         os.close(slave)
-        status = last_status(folder)
-    what = "GNSS 921600 baud + CAN 1000 frames/s" if load else "no data at all"
-    note = f"GNSS {status['gnss/rover']['bytes']:,} bytes"
-    return Figure(what, sent, status["imu/main"]["written"], cpu, None, memory, note)
+
+
+@contextlib.contextmanager
+def other_load(master: int, seconds: float) -> Iterator[list[int]]:
+    """GNSS at 921600 baud through a pty and 1000 CAN frames a second on a udp_multicast bus, all the while.
+
+    The number of frames sent stands in what it gives, afterwards.
+    """
+    writer = threading.Thread(target=_write_serial, args=(master, 92160.0, seconds))
+    writer.start()
+    can = sender("can", CAN_GROUP, 1000, seconds)
+    sent: list[int] = []
+    try:
+        yield sent
+    finally:
+        writer.join()
+        sent.append(int(can.communicate()[0]))
+
+
+def with_others(seconds: float) -> Figure:
+    """A scanner of 20 000 datagrams a second alone, then with the other sensors: what they cost on top."""
+    cpu: list[float] = []
+    for others in (False, True):
+        with tempfile.TemporaryDirectory() as name, serial_port(Path(name)) as master:
+            folder, port = Path(name), free_port()
+            tables = scanner_table(port) + (
+                f'[gnss.rover]\ntransport = "serial:{folder}/rover?baud=921600"\nprotocol = "nmea"\n'
+                f'[imu.main]\ntransport = "can:udp_multicast:{CAN_GROUP}"\nprotocol = "canmod-gps"\n'
+            )
+            with recorder(folder, tables) as process:
+                before, started = cpu_s(process.pid), time.monotonic()
+                with contextlib.ExitStack() as load:
+                    sent = load.enter_context(other_load(master, seconds)) if others else []
+                    sender("udp", port, 1206, 20000, seconds).communicate()
+                    cpu.append((cpu_s(process.pid) - before) / (time.monotonic() - started) * 100)
+                memory = rss_mb(process.pid)
+                time.sleep(2.0)
+            status = last_status(folder)
+    note = f"on top of {cpu[0]:.1f} % for the scanner; GNSS {status['gnss/rover']['bytes']:,} bytes"
+    name = "GNSS 921600 baud + CAN 1000 frames/s"
+    return Figure(name, sent[0], status["imu/main"]["written"], cpu[1] - cpu[0], bare_others(seconds), memory, note)
+
+
+BARE_OTHERS = """
+import os, sys, threading, time
+import can
+fd = os.open(sys.argv[1], os.O_RDONLY | os.O_NOCTTY)
+bus = can.Bus(interface="udp_multicast", channel=sys.argv[2])
+out = os.open(sys.argv[3], os.O_WRONLY | os.O_CREAT)
+print("ready", flush=True)
+def serial():
+    while True:
+        time.sleep(0.008)
+        os.write(out, os.read(fd, 65536))
+def frames():
+    while True:
+        time.sleep(0.016)
+        while (message := bus.recv(0)) is not None:
+            os.write(out, message.data)
+threading.Thread(target=serial, daemon=True).start()
+frames()
+"""
+
+
+def bare_others(seconds: float) -> float:
+    """CPU percent of reading the same port and bus and writing the bytes to a file."""
+    with tempfile.TemporaryDirectory() as name, serial_port(Path(name)) as master:
+        command = [sys.executable, "-c", BARE_OTHERS, f"{name}/rover", CAN_GROUP, f"{name}/raw"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            before, started = cpu_s(process.pid), time.monotonic()
+            with other_load(master, seconds):
+                pass
+            return (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def no_data(seconds: float) -> Figure:
+    """What a recorder costs to which nothing comes."""
+    with tempfile.TemporaryDirectory() as name:
+        with recorder(Path(name), scanner_table(free_port())) as process:
+            before, started = cpu_s(process.pid), time.monotonic()
+            time.sleep(seconds)
+            cpu = (cpu_s(process.pid) - before) / (time.monotonic() - started) * 100
+            memory = rss_mb(process.pid)
+    return Figure("no data at all", 0, 0, cpu, None, memory)
 
 
 def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
-    line = b"$PSWTH," + b"x" * 100 + b"\r\n"
+    body = b"PSWTH," + b"x" * 97
+    line = b"$%s*%02X\r\n" % (body, functools.reduce(operator.xor, body))
     sent, start = 0, time.monotonic()
     while (elapsed := time.monotonic() - start) < seconds:
         while sent < elapsed * bytes_per_s:
@@ -225,25 +299,38 @@ def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
         time.sleep(0.001)
 
 
+def measure(seconds: float) -> list[Figure]:
+    """Every line of the table once."""
+    figures: list[Figure] = []
+    for length, rate in ((1206, 20000.0), (8448, 5000.0)):
+        figure = record_udp(length, rate, seconds)
+        figure.limit_cpu_percent = bare_udp(length, rate, min(seconds, 15.0))
+        figures.append(figure)
+    figure = record_udp(1206, 110000.0, 10.0)
+    figure.limit_cpu_percent = bare_udp(1206, 110000.0, 5.0)
+    return [*figures, figure, stall(6.0), with_others(20.0), no_data(10.0)]
+
+
+def median(runs: list[Figure]) -> Figure:
+    """The run in the middle by its CPU; the losses of all runs stand behind it."""
+    middle = sorted(runs, key=lambda figure: figure.cpu_percent)[len(runs) // 2]
+    lost = sum(figure.sent - figure.recorded for figure in runs)
+    spread = f"{min(f.cpu_percent for f in runs):.1f} to {max(f.cpu_percent for f in runs):.1f}"
+    limits = [figure.limit_cpu_percent for figure in runs if figure.limit_cpu_percent is not None]
+    bare = statistics.median(limits) if limits else None
+    note = f"{middle.note}; {lost} lost in {len(runs)} runs; {spread} %"
+    return replace(middle, limit_cpu_percent=bare, rss_mb=max(f.rss_mb for f in runs), note=note)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="of the two sustained loads")
+    parser.add_argument("--repeats", type=int, default=3, help="runs; the table gives their medians")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     arguments = parser.parse_args()
-    figures: list[Figure] = []
-    for length, rate in ((1206, 20000.0), (8448, 5000.0)):
-        figure = record_udp(length, rate, arguments.seconds)
-        figure.limit_cpu_percent = bare_udp(length, rate, min(arguments.seconds, 15.0))
-        figures.append(figure)
-    figure = record_udp(1206, 110000.0, 10.0)
-    figure.limit_cpu_percent = bare_udp(1206, 110000.0, 5.0)
-    figures.append(figure)
-    figures.append(stall(6.0))
-    idle = other_sensors(10.0, load=False)
-    busy = other_sensors(30.0, load=True)
-    busy.note += f"; {busy.cpu_percent - idle.cpu_percent:.1f} points above no data"
-    figures += [idle, busy]
+    runs = [measure(arguments.seconds) for _ in range(arguments.repeats)]
+    figures = [median(list(lines)) for lines in zip(*runs, strict=True)]
     print(f"{'load':<38} {'sent':>10} {'recorded':>10} {'CPU %':>6} {'bare %':>7} {'RSS MB':>7}  note")
     for figure in figures:
         bare = f"{figure.limit_cpu_percent:7.1f}" if figure.limit_cpu_percent is not None else "      -"

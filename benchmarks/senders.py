@@ -1,7 +1,6 @@
-"""Load for the acquisition benchmarks, each sender a process of its own: datagrams by sendmmsg(2), serial, CAN.
+"""Load for the acquisition benchmarks, each sender a process of its own: datagrams by sendmmsg(2), CAN.
 
 python -m benchmarks.senders udp PORT BYTES RATE SECONDS   prints the number sent and the seconds it took
-python -m benchmarks.senders serial PATH BYTES_PER_S SECONDS
 python -m benchmarks.senders can CHANNEL RATE SECONDS
 """
 
@@ -57,23 +56,6 @@ def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, 
         return sent, time.monotonic() - start
 
 
-def send_serial(path: str, bytes_per_s: float, seconds: float) -> int:
-    """Write numbered lines at a line's speed; bytes written."""
-    sent, number, start = 0, 0, time.monotonic()
-    fd = os.open(path, os.O_WRONLY | os.O_NOCTTY)
-    try:
-        while (elapsed := time.monotonic() - start) < seconds:
-            while sent < elapsed * bytes_per_s:
-                line = b"$PSWTH,%010d,%s\r\n" % (number, b"x" * 100)
-                os.write(fd, line)
-                sent += len(line)
-                number += 1
-            time.sleep(0.001)
-    finally:
-        os.close(fd)
-    return sent
-
-
 def send_can(channel: str, rate: float, seconds: float) -> int:
     """Send numbered 8-byte frames on a udp_multicast bus; frames sent."""
     import can
@@ -93,8 +75,6 @@ def main() -> None:
     kind, *rest = sys.argv[1:]
     if kind == "udp":
         print(*send_udp(int(rest[0]), int(rest[1]), float(rest[2]), float(rest[3])))
-    elif kind == "serial":
-        print(send_serial(rest[0], float(rest[1]), float(rest[2])))
     else:
         print(send_can(rest[0], float(rest[1]), float(rest[2])))
 

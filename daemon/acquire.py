@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -226,7 +226,7 @@ class UnitReceiver(Receiver):
     """Takes serial reads, datagrams or CAN frames of one wire."""
 
     def __init__(
-        self, wire: Wire, session: Session[UnitBlock], shared: Shared, units_seen: UnitsSeen | None = None
+        self, wire: Wire, session: Session[UnitBlock], shared: Shared, units_seen: Sequence[UnitsSeen] = ()
     ) -> None:
         super().__init__(wire.source, shared)
         self._wire = wire
@@ -250,9 +250,9 @@ class UnitReceiver(Receiver):
         self._update_kernel_losses(force=False)
         for block, log_time_ns in zip(blocks, times, strict=True):
             self._hand_over(block, log_time_ns)
-        if self._units_seen is not None:
+        for units_seen in self._units_seen:
             for block, log_time_ns in zip(blocks, times, strict=True):
-                self._units_seen(log_time_ns, block)
+                units_seen(log_time_ns, block)
         return int(times[-1][-1])
 
     def receive_once(self) -> None:
@@ -271,6 +271,11 @@ class UnitReceiver(Receiver):
         self.tell_account(now=True)
 
     def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
+        pair = read_clock_pair()
+        if len(blocks) == 1:
+            host = self.stamps.convert_at(blocks[0].kernel_realtime_ns, len(blocks[0].units), pair)
+            self.account.ambiguous = self.stamps.ambiguous
+            return [host]
         counts = [len(block.units) for block in blocks]
         if all(block.kernel_realtime_ns is None for block in blocks):
             joined = None
@@ -281,7 +286,7 @@ class UnitReceiver(Receiver):
                     for block, n in zip(blocks, counts, strict=True)
                 ]
             )
-        host = self.stamps.convert_at(joined, sum(counts), read_clock_pair())
+        host = self.stamps.convert_at(joined, sum(counts), pair)
         self.account.ambiguous = self.stamps.ambiguous
         return np.split(host, np.cumsum(counts)[:-1])
 

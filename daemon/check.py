@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from daemon.config import Config, DeviceEntry
-from daemon.identify import Heard, describe_time, identify
+from daemon.identify import Heard, describe_time, not_understood
 from drivers.core.registry import find_driver
 from drivers.session import Session
 from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
@@ -31,6 +31,7 @@ from georef.records import ChunkBatch
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
 DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
+CLOCK_RATE_FACTOR = 5.0  # a counter that runs faster or slower by this is read in the wrong unit
 EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
 
 
@@ -285,13 +286,9 @@ def _answer_problems(reading: Reading) -> list[str]:
     """What is wrong with what came."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
-    if not good or not heard.counts:
-        other = identify(entry, reading.kept, than=good)
-        if other is not None:
-            return [f"answers as {other}, configured as {entry.protocol}"]
-    if not good:
-        hint = "; is the baud rate right?" if entry.transport.kind == "serial" else ""
-        return [f"nothing of it is {entry.protocol} nor any other {entry.kind} protocol known{hint}"]
+    other = not_understood(entry, heard, good, reading.kept)
+    if other is not None:
+        return [other]
     found: list[str] = []
     if not heard.counts:
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
@@ -303,11 +300,14 @@ def _answer_problems(reading: Reading) -> list[str]:
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """A GNSS must say a valid time; a device on a PPS that says whether it sees it must see it."""
+    """A GNSS must say a valid time, a counter must run like time, a device that says whether it sees its PPS see it."""
     if entry.kind == "gnss":
         if heard.time_messages == 0:
             return ["no time message: the clock cannot be set by it; switch one on"]
         return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
+    rate = heard.imu_clock_rate
+    if rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
+        return [f"its counter runs {rate:.3g} times as fast as time: is tick_hz right?"]
     if entry.pps is not None and heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]
     return []

@@ -97,7 +97,7 @@ class StampConverter:
             new_step = old_step
         previous_read_ns, self._previous_read_ns, self._step_ns = self._previous_read_ns, read_ns, new_step
         if stamps_ns is None:
-            return np.full(count, read_ns, dtype=np.int64)
+            return np.array([read_ns] * count, dtype=np.int64)
         host = stamps_ns - new_step
         if new_step != old_step:
             host = self._place(stamps_ns, old_step, new_step, previous_read_ns, read_ns)

@@ -10,9 +10,10 @@ import numpy as np
 from daemon.config import DeviceEntry, GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import all_drivers, find_driver
-from georef.records import ChunkBatch, DeviceClockSamples, Record, TimeMessage, TimeTag
+from georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # one frame may be chance
+LEAST_CLOCK_SPAN_NS = 500_000_000  # less says nothing of a counter's rate
 IDENTITY = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
@@ -25,12 +26,14 @@ class Heard:
         time_messages: how many said a time.
         valid_time: the last one that the device vouches for.
         sees_pps: whether the device says, last, that it has a PPS latched or is locked to it; None: it does not say.
+        imu_clock: host and device time of the first and of the last inertial sample since the counter last went back.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
     time_messages: int = 0
     valid_time: TimeMessage | None = None
     sees_pps: bool | None = None
+    imu_clock: tuple[tuple[int, int], tuple[int, int]] | None = None
 
     def add(self, records: list[Record]) -> None:
         """Count records."""
@@ -42,6 +45,32 @@ class Heard:
                 self.valid_time = record if record.valid else self.valid_time
             elif isinstance(record, DeviceClockSamples):
                 self._add_clock(record)
+            elif isinstance(record, ImuSamples):
+                self._add_imu_clock(record)
+
+    @property
+    def imu_clock_rate(self) -> float | None:
+        """Seconds of the device's counter a second of the host's; None where it has none, or too little came."""
+        if self.imu_clock is None:
+            return None
+        (first_host, first_device), (last_host, last_device) = self.imu_clock
+        span_ns = last_host - first_host
+        return (last_device - first_device) / span_ns if span_ns >= LEAST_CLOCK_SPAN_NS else None
+
+    def _add_imu_clock(self, record: ImuSamples) -> None:
+        rows = record.rows[record.rows["device_time_ns"] >= 0]
+        device_ns = rows["device_time_ns"]
+        if not len(rows):
+            return
+        pairs = list(zip(rows["host_time_ns"].tolist(), device_ns.tolist(), strict=True))
+        began_again = np.flatnonzero(device_ns[1:] < device_ns[:-1])
+        if len(began_again):
+            first = pairs[began_again[-1] + 1]
+        elif self.imu_clock is not None and pairs[0][1] >= self.imu_clock[1][1]:
+            first = self.imu_clock[0]
+        else:
+            first = pairs[0]
+        self.imu_clock = (first, pairs[-1])
 
     def _add_clock(self, record: DeviceClockSamples) -> None:
         rows = record.rows
@@ -98,6 +127,26 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     return best
 
 
+def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch]) -> str | None:
+    """What a device is instead of what it was configured as, or that nothing of it is known; None: it is understood.
+
+    Args:
+        entry: the device as configured.
+        heard: what the configured parser made of its bytes.
+        messages: how many the configured parser found in them.
+        kept: the bytes, or the first of them.
+    """
+    if messages and heard.counts:
+        return None
+    other = identify(entry, kept, than=messages)
+    if other is not None:
+        return f"answers as {other}, configured as {entry.protocol}"
+    if messages:
+        return None
+    hint = "; is the baud rate right?" if entry.transport.kind == "serial" else ""
+    return f"nothing of it is {entry.protocol} nor any other {entry.kind} protocol known{hint}"
+
+
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
     """Settings of a device of which only the protocol is known; what frames need no value of ours is stood in for."""
     transport = entry.transport.text
@@ -105,7 +154,7 @@ def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
     if entry.kind == "gnss":
         table = GnssConfig(transport=transport, protocol=protocol)
     elif entry.kind == "imu":
-        table = ImuConfig(transport=transport, protocol=protocol)
+        table = ImuConfig(transport=transport, protocol=protocol, tick_hz=1_000_000.0)
     else:
         table = ScannerConfig(transport=transport, protocol=protocol, mirror_factor=1.0, installation=IDENTITY)
     return DeviceSettings(entry.source, table.model_dump())

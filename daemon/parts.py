@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from daemon.channels import ChannelTable
+from daemon.log.durable import sync_directory
 from daemon.log.encode import EncodedBlock
 from daemon.log.format import SessionInfo
 from daemon.log.writer import PartWriter
@@ -27,15 +28,6 @@ class Attachment:
     name: str
     media_type: str
     data: bytes
-
-
-def sync_directory(directory: Path) -> None:
-    """Make a directory's entries durable."""
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 @dataclass(slots=True)

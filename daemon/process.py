@@ -12,6 +12,7 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daemon.answers import judge
 from daemon.block_queue import QueueItem
 from daemon.errors import ExitCode, UserError
 from daemon.events import Severity
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("swath")
 
 CLOCK_PERIOD_S = 0.1
+JUDGE_PERIOD_S = 1.0
 STEP_TOLD_NS = 1_000_000
 COLLECT_ALL_S = 60.0  # between two full garbage collections; the young are collected each second
 RECEIVERS_END_S = 3.0
@@ -58,7 +60,7 @@ class RecorderProcess:
         loop.add_signal_handler(signal.SIGHUP, self._assembly.recorder.new_part.set)
         self._start()
         self._service.notify(READY="1", STATUS=self._sentence())
-        jobs = {"clock": self._clock(), "watch": self._watch(), "repair": self._repair()}
+        jobs = {"clock": self._clock(), "watch": self._watch(), "repair": self._repair(), "judge": self._judge()}
         tasks = [asyncio.create_task(self._job(name, job)) for name, job in jobs.items()]
         try:
             with contextlib.suppress(TimeoutError):
@@ -180,6 +182,19 @@ class RecorderProcess:
 
         reserve_bytes = int(assembly.config.session.reserve_mb * 1e6)
         await repair_left_open(parts.directory, reserve_bytes, is_current, assembly.shared.events)
+
+    async def _judge(self) -> None:
+        """Tell of devices that speak another protocol than the one configured, once each."""
+        waiting = self._assembly.first_units
+        while waiting:
+            await asyncio.sleep(JUDGE_PERIOD_S)
+            judged = [(first, kept) for first in waiting if (kept := first.take()) is not None]
+            waiting = [first for first in waiting if first not in dict(judged)]
+            for first, kept in judged:
+                text = await asyncio.to_thread(judge, first.entry, kept)
+                if text is not None:
+                    events = self._assembly.shared.events
+                    events.post(Severity.ERROR, first.entry.source, "wrong_protocol", f"{text}; recorded all the same")
 
     def _sentence(self) -> str:
         assembly = self._assembly

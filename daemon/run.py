@@ -14,8 +14,9 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.acquire import Receiver, Shared, UnitReceiver, Wire
+from daemon.acquire import Receiver, Shared, UnitReceiver, UnitsSeen, Wire
 from daemon.acquire_pps import PpsReceiver
+from daemon.answers import FirstUnits
 from daemon.block_queue import BlockQueue
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.config import Config, DeviceEntry
@@ -92,6 +93,7 @@ class Assembly:
     timekeeper: TimeKeeper
     clock_channel: JsonChannel
     receivers: list[Receiver] = field(default_factory=list)
+    first_units: list[FirstUnits] = field(default_factory=list)
 
 
 def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
@@ -147,10 +149,12 @@ def _add_pps(assembly: Assembly) -> None:
 def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
     if device.transport is None or device.transport.kind == "gnss":
         return  # inside another stream: logged there
-    units_seen = None
+    first_units = FirstUnits(device)
+    assembly.first_units.append(first_units)
+    units_seen: list[UnitsSeen] = [first_units.add]
     if device.kind == "gnss":
         _add_gnss_time(assembly, device)
-        units_seen = assembly.timekeeper.units_seen(device.source)
+        units_seen.append(assembly.timekeeper.units_seen(device.source))
     main = _wire(device, device.transport, "")
     session = Session(lambda: open_transport(device.transport))
     assembly.receivers.append(UnitReceiver(main, session, assembly.shared, units_seen))

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from daemon.log.reader import Session
+    from daemon.wire_player import Output, PlayReport
 
 
 def command(
@@ -17,26 +24,17 @@ def command(
 ) -> None:
     """Play a log's bytes back to ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from daemon.config import load_config
-    from daemon.errors import ExitCode, UserError, one_line
-    from daemon.log.format import LogError
-    from daemon.log.reader import open_logs
-    from daemon.replay import close_outputs, open_outputs, timed_units
-    from daemon.wire_player import PlayReport, play, wait_for_readers
+    from daemon.errors import ExitCode, UserError
+    from daemon.replay import close_outputs, open_outputs
+    from daemon.wire_player import wait_for_readers
 
     if pace <= 0:
         raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
-    console = Console(stderr=True)
-    left_out: list[str] = []
-    try:
-        sessions = open_logs(logs, left_out)
-    except LogError as error:
-        raise UserError(str(error), exit_code=ExitCode.IO) from error
-    for line in left_out:
-        console.print(f"passed over: {one_line(line)}", markup=False, highlight=False)
+    console = Console(stderr=True, markup=False, highlight=False)
+    sessions = _open_sessions(logs, console)
     stop: list[int] = []
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, lambda number, frame: stop.append(number))
@@ -50,27 +48,53 @@ def command(
         for session in sessions:
             if stop:
                 break
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TimeElapsedColumn(),
-                TextColumn("{task.fields[told]}"),
-            )
-            with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-                task = bar.add_task(session.session_id, total=None, told="")
-
-                def tell(seconds: float, report: PlayReport) -> None:
-                    bar.update(task, told=f"{seconds:.0f} s, {sum(report.units.values())} units")  # noqa: B023
-
-                units = timed_units(session, with_pps=pace == 1.0)
-                report = play(units, outputs, pace=pace, progress=tell, stopped=lambda: bool(stop))
-            for source in sorted(report.passed_over):
-                console.print(f"{source}: in the log, not in {wire}; not played")
-            for source in sorted(outputs):
-                if not report.units[source] and not report.refused[source]:
-                    console.print(f"{source}: nothing in {session.session_id} was played to it")
-                    continue
-                refused = f", {report.refused[source]} refused by a reader" if report.refused[source] else ""
-                console.print(f"{source}: {report.units[source]} units, {report.bytes[source]} bytes{refused}")
+            report = _play_session(session, outputs, pace, console, lambda: bool(stop))
+            _tell_report(report, session, outputs, wire, console)
     finally:
         close_outputs(outputs)
+
+
+def _open_sessions(logs: list[Path], console: Console) -> list[Session]:
+    from daemon.errors import ExitCode, UserError, one_line
+    from daemon.log.format import LogError
+    from daemon.log.reader import open_logs
+
+    left_out: list[str] = []
+    try:
+        sessions = open_logs(logs, left_out)
+    except LogError as error:
+        raise UserError(str(error), exit_code=ExitCode.IO) from error
+    for line in left_out:
+        console.print(f"passed over: {one_line(line)}")
+    return sessions
+
+
+def _play_session(
+    session: Session, outputs: Mapping[str, Output], pace: float, console: Console, stopped: Callable[[], bool]
+) -> PlayReport:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from daemon.replay import timed_units
+    from daemon.wire_player import play
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(session.session_id, total=None, told="")
+
+        def tell(seconds: float, report: PlayReport) -> None:
+            bar.update(task, told=f"{seconds:.0f} s, {sum(report.units.values())} units")
+
+        return play(timed_units(session, with_pps=pace == 1.0), outputs, pace=pace, progress=tell, stopped=stopped)
+
+
+def _tell_report(
+    report: PlayReport, session: Session, outputs: Mapping[str, Output], wire: Path, console: Console
+) -> None:
+    for source in sorted(report.passed_over):
+        console.print(f"{source}: in the log, not in {wire}; not played")
+    for source in sorted(outputs):
+        if not report.units[source] and not report.refused[source]:
+            console.print(f"{source}: nothing in {session.session_id} was played to it")
+            continue
+        refused = f", {report.refused[source]} refused by a reader" if report.refused[source] else ""
+        console.print(f"{source}: {report.units[source]} units, {report.bytes[source]} bytes{refused}")

@@ -89,6 +89,8 @@ class SignalsConfig(Section):
     sample_ticks: Signal | None = Field(None, description="the device's counter when the sample was taken")
     pps_ticks: Signal | None = Field(None, description="the counter latched at the last PPS edge")
     temperature: Signal | None = Field(None, description="°C")
+    status: Signal | None = Field(None, description="the device's status word, kept with each sample")
+    packet_counter: Signal | None = Field(None, description="a counter of samples sent; what it skips is counted")
 
 
 class NoiseConfig(Section):
@@ -118,18 +120,29 @@ class ImuConfig(Section):
     source_address: int | None = Field(
         None, ge=0, le=253, description="nmea2000: the device to listen to; absent: the first that sends each PGN"
     )
+    ids: dict[str, int] | None = Field(
+        None, description="sbg-ellipse, xsens-mti: CAN identifiers that differ from the maker's, by message name"
+    )
+    extended_ids: bool = Field(False, description="sbg-ellipse, xsens-mti: the identifiers have 29 bits")
+    byte_order: Literal["big", "little"] = Field("big", description="xsens-mti: of the numbers in a CAN frame")
+    pps_event: Literal["A", "B", "C", "D", "E"] | None = Field(
+        None, description="sbg-ellipse: the Sync In that PPS is wired to; its event message latches the counter"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
     rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
-    tick_hz: float = Field(
-        1_000_000.0, gt=0.0, le=1e12, description="of its counters; they wrap at their signals' width"
+    tick_hz: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e12,
+        description="of its counters, which wrap at their signals' width; absent: 1000000; xsens-mti needs it",
     )
     pps: Name | None = Field(None, description="name of the [pps.<name>] its latched counter follows")
     sample: Literal["mean", "instant", "increment"] = Field(
         "mean", description="mean over the interval, instant value, or increment (delta velocity, delta angle)"
     )
     stamp: Literal["end", "middle", "start"] = Field("end", description="what of the interval the stamp is")
-    group: Literal["last", "first"] = Field(
-        "last", description="the message with sample_ticks closes (last) or opens (first) a sample"
+    group: Literal["last", "first"] | None = Field(
+        None, description="the message with sample_ticks closes (last) or opens (first) a sample; absent: last for dbc"
     )
     signals: SignalsConfig | None = Field(None, description="the map of the DBC's signals")
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="for the navigation filter")

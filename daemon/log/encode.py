@@ -19,6 +19,8 @@ from georef.records import ByteRows, Int64Array
 
 MESSAGE_HEADER_BYTES = 31
 _OP_MESSAGE, _OP_MESSAGE_INDEX = 5, 7
+_MESSAGE = struct.Struct("<BQHIQQ")
+_FIRST = np.zeros(1, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +74,13 @@ def encode_block(
         publish_time_ns: (n,); the log time where None.
     """
     count, length = units.shape
+    if count == 1:  # a read of a serial port: NumPy's rows would cost several times the message
+        log_time = int(log_time_ns[0])
+        publish_time = log_time if publish_time_ns is None else int(publish_time_ns[0])
+        sequence = first_sequence & 0xFFFFFFFF
+        content = MESSAGE_HEADER_BYTES - 9 + length
+        head = _MESSAGE.pack(_OP_MESSAGE, content, channel_id, sequence, log_time, publish_time)
+        return EncodedBlock(channel_id, 1, log_time_ns, _FIRST, memoryview(head + units.tobytes()))
     layout = _layout(length)
     rows = np.empty(count, layout)
     rows["opcode"] = _OP_MESSAGE

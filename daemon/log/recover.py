@@ -6,7 +6,6 @@ and told. The copy has index and footer, so that every MCAP reader opens it.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import Counter
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from typing import BinaryIO
 from mcap import records
 
 from daemon.log.claim import is_being_written
+from daemon.log.durable import sync_directory
 from daemon.log.encode import encode_raw
 from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
 from daemon.log.reader import RECOVERED, chunk_batches, orphan_damage, read_part_head
@@ -121,7 +121,7 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
     try:
         report = _pass(path, temporary)
         temporary.rename(target)
-        _sync_folder(folder)
+        sync_directory(folder)
     finally:
         temporary.unlink(missing_ok=True)
     report.recovered = target
@@ -207,11 +207,3 @@ def _copy_outside(found: Record, writer: PartWriter) -> None:
 def _as_chunk(found: Record) -> bytes:
     """A record outside chunks as if it stood in one."""
     return bytes([found.opcode]) + len(found.body).to_bytes(8, "little") + found.body
-
-
-def _sync_folder(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

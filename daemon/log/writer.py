@@ -22,6 +22,7 @@ from isal.isal_zlib import crc32
 from mcap import records
 
 from daemon.log.claim import claim
+from daemon.log.durable import sync_directory
 from daemon.log.encode import EncodedBlock, message_index
 from daemon.log.format import (
     CHUNK_BYTES,
@@ -92,7 +93,7 @@ class PartWriter:
             self._write([MAGIC, record_bytes(records.Header(profile=PROFILE, library=LIBRARY))])
             self.add_metadata(SESSION_METADATA, session.to_metadata(part))
             os.fsync(self._fd)
-            _sync_directory(path.parent)
+            sync_directory(path.parent)
         except OSError:
             self.abandon()
             raise
@@ -330,11 +331,3 @@ def _after(views: list[memoryview], count: int) -> list[memoryview]:
             return [view[count:], *views[number + 1 :]]
         count -= view.nbytes
     return []
-
-
-def _sync_directory(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

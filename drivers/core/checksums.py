@@ -1,11 +1,12 @@
 """Checksums of the serial protocols, each fast enough to run on everything that arrives.
 
 The cyclic ones are linear, so a message with its own checksum behind it leaves 0: `crc24q` and `crc32_novatel` of a
-whole frame are 0 when it is intact.
+whole frame are 0 when it is intact. SBF has its checksum in front and lowest byte first, so it is compared.
 """
 
 from __future__ import annotations
 
+import binascii
 import lzma
 import zlib
 from functools import cache
@@ -92,6 +93,11 @@ def crc32_novatel(data: Bytes) -> int:
     zlib inverts the register before and after; inverting its seed and its result takes both away.
     """
     return zlib.crc32(data, 0xFFFF_FFFF) ^ 0xFFFF_FFFF
+
+
+def crc16_ccitt(data: Bytes) -> int:
+    """CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no inversion."""
+    return binascii.crc_hqx(data, 0)
 
 
 CRC64_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # ECMA-182's, reflected

@@ -1,11 +1,11 @@
-"""The frames that GNSS receivers lay into a serial stream, as a table: sync, length and its bound, checksum, name."""
+"""The frames that receivers and inertial units lay into a stream: sync, length and its bound, checksum, name."""
 
 from __future__ import annotations
 
 import re
 import struct
 
-from drivers.core.checksums import crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from drivers.core.framing import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
 
 # --- NMEA 0183: $ttsss,field,…*hh CR LF -----------------------------------------------------------------------------
@@ -163,6 +163,68 @@ def novatel_name(frame: bytes) -> str:
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
+# --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
+
+XBUS_MAX_DATA_BYTES = 2048  # of a message with an extended length
+XBUS_EXTENDED = 0xFF  # length byte: the length follows in two bytes, high one first
+XBUS_MTDATA2 = 0x36
+XBUS_NAMES = {0x32: "MTData", XBUS_MTDATA2: "MTData2", 0x3E: "WakeUp", 0x42: "Error"}  # what a device says by itself
+XBUS_IDENTIFIERS = bytes(sorted({*XBUS_NAMES, *range(1, 256, 2)}))  # its answers are the odd ones
+
+
+def measure_xbus(buffer: bytes, start: int, final: bool) -> int:
+    """Preamble, bus and message identifier, length, data and checksum."""
+    if len(buffer) - start < 4:
+        return UNDECIDED
+    length = buffer[start + 3]
+    if length != XBUS_EXTENDED:
+        return length + 5
+    if len(buffer) - start < 6:
+        return UNDECIDED
+    length = buffer[start + 4] << 8 | buffer[start + 5]
+    return length + 7 if length <= XBUS_MAX_DATA_BYTES else OVER_BOUND
+
+
+def intact_xbus(frame: bytes) -> bool:
+    """All bytes but the preamble, checksum included, add up to 0 modulo 256."""
+    return sum(frame[1:]) & 0xFF == 0
+
+
+def xbus_name(frame: bytes) -> str:
+    """``MTData2``; ``XBUS-31`` where the table has no name."""
+    return XBUS_NAMES.get(frame[2]) or f"XBUS-{frame[2]:02X}"
+
+
+# --- Septentrio SBF: $@, CRC-16, block id, length, block (PolaRx5TR reference guide, 4.1.1) ---------------------------
+
+# The length field reaches 64 KiB; RTKLIB, which decodes the longest blocks (measurements), takes 16 KiB (MAXRAWLEN).
+SBF_MAX_BYTES = 16 * 1024
+SBF_HEADER_BYTES = 8
+SBF_HEADER = struct.Struct("<2xHHH")  # CRC, id and revision, length
+SBF_CRC_START = 4  # the CRC covers everything from the id on
+SBF_NUMBER_BITS = 0x1FFF  # of the id; the three above are the revision
+
+
+def measure_sbf(buffer: bytes, start: int, final: bool) -> int:
+    """The length field, which counts the whole block; always a multiple of 4."""
+    if len(buffer) - start < SBF_HEADER_BYTES:
+        return UNDECIDED
+    length: int = SBF_HEADER.unpack_from(buffer, start)[2]
+    if length % 4 or length < SBF_HEADER_BYTES:
+        return FALSE_SYNC
+    return length if length <= SBF_MAX_BYTES else OVER_BOUND
+
+
+def intact_sbf(frame: bytes) -> bool:
+    """The CRC in the header against that of the rest."""
+    return bool(SBF_HEADER.unpack_from(frame)[0] == crc16_ccitt(memoryview(frame)[SBF_CRC_START:]))
+
+
+def sbf_name(frame: bytes) -> str:
+    """``SBF-4007``: the block's number; `drivers.gnss.sbf` knows the names."""
+    return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
+
+
 NMEA = FrameKind("nmea", (b"$!", bytes(range(0x41, 0x5B))), NMEA_MAX_BYTES, measure_nmea, intact_nmea, nmea_name)
 UBX = FrameKind(
     "ubx",
@@ -196,6 +258,18 @@ NOVATEL_SHORT = FrameKind(
     lambda frame: crc32_novatel(frame) == 0,
     novatel_name,
 )
+
+XBUS = FrameKind(
+    "xbus",
+    (b"\xfa", b"\xff", XBUS_IDENTIFIERS),
+    XBUS_MAX_DATA_BYTES + 7,
+    measure_xbus,
+    intact_xbus,
+    xbus_name,
+)
+
+
+SBF = FrameKind("sbf", (b"$", b"@"), SBF_MAX_BYTES, measure_sbf, intact_sbf, sbf_name)
 
 GNSS_KINDS = (NMEA, UBX, RTCM3)  # on one port of a u-blox or of most others
 NOVATEL_KINDS = (NOVATEL, NOVATEL_SHORT, NMEA, RTCM3)

@@ -18,19 +18,15 @@ What each log gives:
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
-
-import numpy as np
 
 from drivers.core.frame_kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
-from drivers.gnss.novatel_records import DECODERS, Header, Row, State
+from drivers.gnss.novatel_records import DECODERS, Header, State
+from drivers.gnss.rows import Row, join_rows
 from georef.records import (
-    IMU_DTYPE,
-    INS_DTYPE,
     Chunk,
     DeviceStatus,
     EventMark,
@@ -106,21 +102,8 @@ class NovatelParser(StreamParser):
         return self._decode_all(self._framer.close())
 
     def _decode_all(self, frames: list[Frame]) -> list[Record]:
-        """Records in order; rows of neighbouring messages are one array."""
-        records: list[Record] = []
-        run: list[Row] = []
-        for frame in frames:
-            if not frame.kind.startswith("novatel"):
-                continue
-            for item in self._decode(frame):
-                if run and not (isinstance(item, Row) and item.record is run[0].record):
-                    records.append(_array(run))
-                    run = []
-                if isinstance(item, Row):
-                    run.append(item)
-                else:
-                    records.append(item)
-        return [*records, _array(run)] if run else records
+        logs = (frame for frame in frames if frame.kind.startswith("novatel"))
+        return join_rows(item for log in logs for item in self._decode(log))
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
         """One frame; a short body is counted."""
@@ -149,14 +132,6 @@ class NovatelParser(StreamParser):
             return []
         self._last_named = epoch
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
-
-
-def _array(run: list[Row]) -> Record:
-    """Rows of one kind as one record."""
-    values: list[Any] = [row.values for row in run]
-    if run[0].record is ImuSamples:
-        return ImuSamples(np.array(values, dtype=IMU_DTYPE))
-    return InsSolution(np.array(values, dtype=INS_DTYPE))
 
 
 def _split(frame: Frame, name: str) -> tuple[Header | None, bytes]:

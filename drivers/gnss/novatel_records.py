@@ -12,6 +12,7 @@ import numpy as np
 from drivers.core.parser import ParserCounters
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
+from drivers.gnss.rows import Row
 from georef.records import (
     DeviceStatus,
     EventMark,
@@ -54,13 +55,6 @@ class Header(NamedTuple):
     def tag(self, earlier_ns: int = 0) -> TimeTag:
         """The header's GPS time less ``earlier_ns``."""
         return gps_tag(self.week, self.milliseconds * NS_PER_MS - earlier_ns)
-
-
-class Row(NamedTuple):
-    """One row of an array record, collected with its neighbours."""
-
-    record: type[ImuSamples] | type[InsSolution]
-    values: tuple[Any, ...]
 
 
 @dataclass(slots=True)

@@ -68,6 +68,24 @@ class CounterUnwrapper:
         return counts
 
 
+class GapCounter:
+    """Counts what a counter of samples sent skips; a step of half its range or more is a restart and no gap."""
+
+    def __init__(self, bits: int) -> None:
+        self._bits = bits
+        self._last: np.uint64 | None = None
+
+    def missing(self, raw: NDArray[np.uint64]) -> int:
+        """How many values lie between the raw ones (n,), the last of the call before included."""
+        if not len(raw):
+            return 0
+        before = raw[:1] if self._last is None else np.array([self._last])
+        self._last = raw[-1]
+        steps = np.diff(np.concatenate([before, raw])) & np.uint64((1 << self._bits) - 1)
+        skipped = steps[(steps > 1) & (steps < (1 << (self._bits - 1)))]
+        return int(skipped.sum()) - len(skipped)
+
+
 class LatchTracker:
     """Makes the counter latched at a PPS edge continuous on the scale of its running counter.
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from drivers.core.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
 from drivers.core.parser import DeviceSettings, Driver, PacketParser
-from drivers.imu.counters import CounterUnwrapper, LatchTracker, nanoseconds
-from drivers.imu.dbc_settings import MappedSignal, Part, map_signals
+from drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
+from drivers.imu.dbc_settings import MappedSignal, Part, SignalMap, map_signals
 from drivers.imu.sample_groups import Frames, SampleGrouper, Samples, no_frames
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -56,25 +56,30 @@ class SideSignal:
 class DbcParser(PacketParser):
     """Decodes CAN units to `ImuSamples`, and `DeviceClockSamples` where the device latches PPS."""
 
-    def __init__(self, settings: DeviceSettings, *, clock_only: bool = False) -> None:
+    def __init__(
+        self, settings: DeviceSettings, *, clock_only: bool = False, signal_map: SignalMap | None = None
+    ) -> None:
         """Read the DBC and find the signals.
 
         Args:
             settings: the device's table and the DBC's bytes (``files["dbc"]``).
             clock_only: give `DeviceClockSamples` only, for the recorder.
+            signal_map: what a profile has found already; None: found here.
 
         Raises:
             DriverSettingsError: naming the key or signal and what would be right.
         """
         super().__init__()
-        self._map = map_signals(settings)
+        self._map = signal_map or map_signals(settings)
         self._clock_only = clock_only
         self._width = 8 if all(part.needs_bytes <= 8 for part in self._map.parts) else 64
         self._grouper = SampleGrouper(self._map.grouped, self._map.rule, self._map.key_part, self._width)
         ticks, latch = self._map.sample_ticks, self._map.pps_ticks
         self._unwrapper = CounterUnwrapper(ticks.layout.length, float(self._map.tick_hz)) if ticks else None
         self._latch = LatchTracker(latch.layout.length) if latch else None
-        optional = (latch, self._map.temperature)
+        packets = self._map.packet_counter
+        self._gaps = GapCounter(packets.layout.length) if packets else None
+        optional = (latch, self._map.temperature, self._map.status)
         self._side = {
             signal.layout.name: SideSignal(signal) for signal in optional if signal and signal.part >= self._map.grouped
         }
@@ -83,6 +88,7 @@ class DbcParser(PacketParser):
         """Decode CAN frames, (n, 16) or (n, 72)."""
         self.counters.bytes += units.size
         frames = self._configured_frames(host_time_ns, units)
+        self._count_gaps(frames)
         return self._samples_of(frames) if len(frames.part) else []
 
     def close(self) -> list[Record]:
@@ -126,6 +132,14 @@ class DbcParser(PacketParser):
     def _count_bad(self, frames: int) -> None:
         self.counters.bad_messages += frames
         self.counters.errors["bad_length"] += frames
+
+    def _count_gaps(self, frames: Frames) -> None:
+        """Count what the device's own counter says was sent and is not there."""
+        packets = self._map.packet_counter
+        if packets is not None and self._gaps is not None:
+            missing = self._gaps.missing(packets.layout.bits(frames.data[frames.part == packets.part]))
+            if missing:
+                self.counters.errors["packet_gap"] += missing
 
     def _count_flagged(self, can_id: NDArray[np.uint32]) -> None:
         """Count error frames and remote requests; their identifiers match no message."""
@@ -183,7 +197,7 @@ class DbcParser(PacketParser):
             rows["pps_time_ns"] = np.where(latched >= 0, nanoseconds(latched, self._map.tick_hz), -1)
 
     def _fill_values(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
-        """Specific force, angular rate and temperature."""
+        """Specific force, angular rate, temperature and status (its low 32 bits)."""
         for number, signal in enumerate(self._map.vectors):
             values = signal.layout.values(signal.layout.bits(data[signal.part]))
             field = "specific_force_b" if number < 3 else "angular_rate_b"
@@ -193,6 +207,9 @@ class DbcParser(PacketParser):
         if temperature is not None:
             bits, known = self._bits_of(temperature, data, position)
             rows["temperature_c"][known] = temperature.layout.values(bits[known])
+        if self._map.status is not None:
+            bits, known = self._bits_of(self._map.status, data, position)
+            rows["status"] = np.where(known, bits & np.uint64(0xFFFF_FFFF), 0)
 
     def _bits_of(
         self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]

@@ -24,7 +24,9 @@ INCREMENT_UNITS = {
 RIGHT_UNITS = {"specific_force": "m/s2 or g", "angular_rate": "deg/s or rad/s"}
 RIGHT_INCREMENTS = {"specific_force": "m/s", "angular_rate": "rad or deg"}
 VECTORS = ("specific_force", "angular_rate")
-SCALARS = ("sample_ticks", "pps_ticks", "temperature")
+SCALARS = ("sample_ticks", "pps_ticks", "temperature", "status", "packet_counter")
+INTEGERS = {"sample_ticks": "counter", "pps_ticks": "counter", "status": "status word", "packet_counter": "counter"}
+DEFAULT_TICK_HZ = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +62,10 @@ class SignalMap:
 
     Attributes:
         parts: the frames a sample is made of, then those beside it (a PPS latch or a temperature in a message of its
-            own), which hold until the next.
+            own), whose values hold until the next.
         grouped: how many of `parts` make a sample.
         vectors: specific force x y z, angular rate x y z.
-        sample_ticks, pps_ticks, temperature: None where not configured.
+        sample_ticks, pps_ticks, temperature, status, packet_counter: None where not configured.
         tick_hz: rate of the counters.
         rule, key_part: how frames make samples.
     """
@@ -74,6 +76,8 @@ class SignalMap:
     sample_ticks: MappedSignal | None
     pps_ticks: MappedSignal | None
     temperature: MappedSignal | None
+    status: MappedSignal | None
+    packet_counter: MappedSignal | None
     tick_hz: Fraction
     rule: GroupRule
     key_part: int
@@ -150,6 +154,8 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
         sample_ticks=ticks,
         pps_ticks=scalar("pps_ticks"),
         temperature=scalar("temperature"),
+        status=scalar("status"),
+        packet_counter=scalar("packet_counter"),
         tick_hz=_tick_hz(config, ticks),
         rule=rule,
         key_part=ticks.part if ticks else 0,
@@ -171,9 +177,9 @@ def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[
     for key in SCALARS:
         if key in names:
             found[key] = [find_signal(database, str(names[key]), file_name)]
-    for key in ("sample_ticks", "pps_ticks"):
+    for key, kind in INTEGERS.items():
         if key in found and found[key][0].layout.is_float:
-            raise DriverSettingsError(f"signals.{key}: {names[key]} is a float; a counter must be an integer")
+            raise DriverSettingsError(f"signals.{key}: {names[key]} is a float; a {kind} must be an integer")
     return found
 
 
@@ -222,6 +228,8 @@ def _tick_hz(config: Mapping[str, Any], ticks: MappedSignal | None) -> Fraction:
     value = config.get("tick_hz")
     if ticks is None:
         return Fraction(1)
+    if value is None:
+        return Fraction(DEFAULT_TICK_HZ)
     if not isinstance(value, int | float) or value <= 0:
-        raise DriverSettingsError("tick_hz: needed with signals.sample_ticks, counts per second, above 0")
+        raise DriverSettingsError(f"tick_hz: got {value}, want counts per second, above 0")
     return Fraction(value).limit_denominator(1000)

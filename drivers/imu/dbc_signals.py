@@ -79,7 +79,8 @@ class SignalLayout:
         """Physical values of right-aligned bits."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]
-            raw = bits.astype(unsigned).view(floating).astype(np.float64)
+            with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is a NaN like any other
+                raw = bits.astype(unsigned).view(floating).astype(np.float64)
         elif self.signed:
             up = np.uint64(WORD_BITS - self.length)
             raw = ((bits << up).view(np.int64) >> np.int64(up)).astype(np.float64)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import radians
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.scanner.ouster_head import FloatArray, OusterHead
 from drivers.scanner.ouster_layout import FOOTER_BYTES, HEADER_BYTES, IMU_PACKET, with_crc
@@ -65,8 +65,8 @@ def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> 
         table = np.ascontiguousarray(units).view(LEGACY_DTYPE)[:, 0]
         host, status = host_time_ns, np.zeros(len(table), dtype=np.uint32)
         stamps = table["accelerometer_ns"] // 2 + table["gyroscope_ns"] // 2
-        force = table["acceleration_g"].astype(np.float64) * STANDARD_GRAVITY
-        rate = table["rate_deg_per_s"].astype(np.float64) * radians(1.0)
+        force = _doubles(table["acceleration_g"]) * STANDARD_GRAVITY
+        rate = _doubles(table["rate_deg_per_s"]) * radians(1.0)
     else:
         begin, end = HEADER_BYTES + NMEA_BYTES, units.shape[1] - FOOTER_BYTES
         sent = np.ascontiguousarray(units[:, begin:end]).view(SAMPLE_DTYPE)
@@ -74,7 +74,7 @@ def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> 
         table = sent[valid]
         host, status = np.broadcast_to(host_time_ns[:, np.newaxis], valid.shape)[valid], table["status"]
         stamps = table["time_ns"]
-        force, rate = table["acceleration"].astype(np.float64), table["rate"].astype(np.float64)
+        force, rate = _doubles(table["acceleration"]), _doubles(table["rate"])
     good = np.isfinite(force).all(axis=1) & np.isfinite(rate).all(axis=1) & (stamps < np.uint64(1 << 63))
     rows = np.zeros(int(good.sum()), dtype=IMU_DTYPE)
     rows["host_time_ns"], rows["device_time_ns"], rows["status"] = host[good], stamps[good], status[good]
@@ -83,6 +83,11 @@ def imu_samples(host_time_ns: Int64Array, units: ByteRows, head: OusterHead) -> 
     rows["angular_rate_b"] = rate[good] @ head.rot_sensor_from_imu.T
     rows["temperature_c"] = np.nan
     return rows, len(good) - len(rows)
+
+
+def _doubles(values: NDArray[np.float32]) -> FloatArray:
+    with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is a NaN like any other
+        return values.astype(np.float64)
 
 
 def encode_imu_packet(head: OusterHead, time_ns: ArrayLike, force: FloatArray, rate: FloatArray) -> bytes:

@@ -24,9 +24,11 @@ from drivers.transports.uri import TransportSpec
 
 DEFAULT_BAUD = 115200
 READ_BYTES = 65536
-BATCH_S = 0.004  # after the first byte, so that a fast port is not read byte by byte; 370 bytes at 921600 baud
+BATCH_S = 0.008  # after the first byte, so that a fast port is not read byte by byte; 740 bytes at 921600 baud,
+BATCH_BYTES = 2048  # but no more than half of what a terminal holds (4096, n_tty(4))
 SEND_TIMEOUT_S = 2.0
 
+_BITS_A_BYTE = 10  # with start and stop bit
 _TIOCGICOUNT = 0x545D  # <asm-generic/ioctls.h>
 # struct serial_icounter_struct, <linux/serial.h>: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun, reserved
 _ICOUNTER = struct.Struct("@11i36x")
@@ -45,6 +47,7 @@ class SerialTransport(DescriptorTransport):
         super().__init__(spec.text or f"serial:{spec.address}")
         self._spec = spec
         self._path = spec.address
+        self._batch_s = min(BATCH_S, BATCH_BYTES * _BITS_A_BYTE / int(spec.options.get("baud", DEFAULT_BAUD)))
         self._port: serial.Serial | None = None
         self._fd = -1
         self._errors_at_open: int | None = None
@@ -124,7 +127,7 @@ class SerialTransport(DescriptorTransport):
         if not events:
             return []
         if not events & HUNG_UP:
-            gate.pause(min(BATCH_S, deadline_s - time.monotonic()))
+            gate.pause(min(self._batch_s, deadline_s - time.monotonic()))
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:

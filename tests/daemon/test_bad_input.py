@@ -10,8 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from drivers.transports.capture_file import read_pcap
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import Recorder, free_udp_port, session_table
+from tests.daemon.wires import pty, udp_sender
+from tests.drivers.recordings import recording
+from tests.drivers.srep_cases import scan_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 SCANNER = '[scanner.{name}]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
@@ -55,6 +59,30 @@ def test_no_such_configuration(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "daemon.cli.main", "run", str(tmp_path / "nothing.toml")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert "nothing.toml" in the_line(done, 2)
+
+
+def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
+    """Each device that speaks something else is named, the one that is right is not, and every byte is recorded."""
+    ubx = recording("ubx", "ublox-zed-f9p-hp.log")
+    srep = scan_lines()
+    velodyne = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/nebula_vlp16.pcap.gz")]
+    left, right = free_udp_port(), free_udp_port()
+    tables = SCANNER.format(name="left", port=left) + SCANNER.format(name="right", port=right)
+    with (
+        pty(lambda number: ubx[number * 1000 % len(ubx) :][:1000]) as path,
+        udp_sender(left, lambda number: srep[number % len(srep)]),
+        udp_sender(right, lambda number: velodyne[number % len(velodyne)]),
+    ):
+        tables += f'[gnss.rover]\ntransport = "serial:{path}"\nprotocol = "novatel"\n'
+        with Recorder(tmp_path, session_table(tmp_path / "logs") + tables) as recorder:
+            recorder.wait_said("wrong_protocol", times=2)
+            assert recorder.stop() == 0
+    log = read_log(tmp_path / "logs")
+    assert {event["source"]: event["text"] for event in log.events("wrong_protocol")} == {
+        "gnss/rover": "answers as ubx, configured as novatel; recorded all the same",
+        "scanner/right": "answers as velodyne-vlp16, configured as srep; recorded all the same",
+    }
+    assert all(log.units[source] for source in ("gnss/rover", "scanner/left", "scanner/right"))
 
 
 @pytest.mark.parametrize("what", ["absent", "no PPS device"])

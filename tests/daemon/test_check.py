@@ -5,12 +5,11 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
-import threading
 import time
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import xor
@@ -22,13 +21,16 @@ import numpy as np
 import pytest
 
 from daemon.check import Report, bitrate_problems, check_everything
-from daemon.config import parse_config
-from daemon.identify import describe_tag
+from daemon.config import DeviceEntry, parse_config
+from daemon.identify import describe_tag, identify
+from drivers.core.can_frames import encode_can_frame
+from drivers.core.parser import DeviceSettings
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
-from georef.records import TimeScale, TimeTag
+from georef.records import ChunkBatch, TimeScale, TimeTag
 from tests.daemon.rig import free_udp_port
+from tests.daemon.wires import pty, repeating, udp_sender
 
 ROOT = Path(__file__).parents[2]
 CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
@@ -60,59 +62,6 @@ def srep_datagram(sequence: int, pps_count: int = 3) -> bytes:
     )
     ticks = np.arange(10) * 50
     return encode_datagram(header, ticks, np.arange(10) * 100, np.full((10, 1), 9_000_000))
-
-
-@contextmanager
-def repeating(job: Callable[[int], None], period_s: float = 0.05) -> Iterator[None]:
-    """Call a job again and again in a thread of its own."""
-    stop = threading.Event()
-
-    def run() -> None:
-        number = 0
-        while not stop.wait(period_s):
-            job(number)
-            number += 1
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-
-
-@contextmanager
-def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
-    """A serial device that sends something again and again; its path."""
-    main, secondary = os.openpty()
-    tty.setraw(secondary)
-    os.set_blocking(main, False)
-
-    def write(number: int) -> None:
-        if send is not None:
-            try:
-                os.write(main, send(number))
-            except BlockingIOError:
-                pass
-
-    try:
-        with repeating(write):
-            yield os.ttyname(secondary)
-    finally:
-        os.close(main)
-        os.close(secondary)
-
-
-@contextmanager
-def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
-    """Datagrams to a port of this computer."""
-    with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
-        yield
-
-
-def _send(sender: socket, port: int, data: bytes) -> None:
-    sender.sendto(data, ("127.0.0.1", port))
 
 
 @contextmanager
@@ -215,6 +164,14 @@ class TestAllWell:
         assert reports["imu/main"].bytes == reports["gnss/rover"].bytes > 0
         assert reports["imu/main"].problems == []
 
+    def test_an_imu_on_a_serial_line(self, tmp_path: Path) -> None:
+        data = gzip.decompress((ROOT / "fixtures/xsens/1_output.bin.gz").read_bytes())
+        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
+            report = check(f'[imu.main]\ntransport = "serial:{path}"\nprotocol = "xsens-xbus"\n', tmp_path)["imu/main"]
+        assert report.problems == []
+        assert report.records["ImuSamples"] > 10
+        assert report.time.startswith("2019-01-20 13:47:2")
+
     def test_the_auxiliary_port_has_its_own_line(self, tmp_path: Path) -> None:
         port, auxiliary = free_udp_port(), free_udp_port()
         with udp_sender(port, srep_datagram), udp_sender(auxiliary, lambda _: bytes(512)):
@@ -278,6 +235,11 @@ class TestSomethingElse:
             ("novatel", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
             ("novatel", "nmea/nmea-rtk.log.gz", "nmea"),
             ("ubx", "novatel/propak6-basic-fix.gps.gz", "novatel"),
+            ("novatel", "sbf/sbfdata.log.gz", "sbf"),
+            ("nmea", "sbf/sbfdata.log.gz", "sbf"),
+            ("ubx", "sbf/pygpsdata_x5status.log.gz", "sbf"),
+            ("sbf", "nmea/polarx2.log.gz", "nmea"),
+            ("sbf", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
         ],
     )
     def test_a_real_recording_of_another_receiver_is_named(
@@ -302,6 +264,23 @@ class TestSomethingElse:
         with udp_sender(port, lambda number: recorded[number % len(recorded)]):
             report = check(srep(port), tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["answers as ouster, configured as srep"]
+
+    @pytest.mark.parametrize(
+        ("unit", "frames", "protocol"),
+        [
+            (2048, gzip.decompress((ROOT / "fixtures/xsens/2_output.bin.gz").read_bytes()), "xsens-xbus"),
+            (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x120, 0x121, 0x122)) * 20, "sbg-ellipse"),
+            (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x005, 0x032, 0x034)) * 20, "xsens-mti"),
+        ],
+        ids=["xsens-xbus", "sbg-ellipse", "xsens-mti"],
+    )
+    def test_an_imu_of_another_protocol_is_named(self, unit: int, frames: bytes, protocol: str) -> None:
+        whole = len(frames) // unit
+        rows = np.frombuffer(frames[: whole * unit], np.uint8).reshape(whole, unit)
+        kept = [ChunkBatch("imu/main", np.arange(whole, dtype=np.int64) * 1_000_000, rows)]
+        spec = parse_transport("serial:/dev/ttyUSB0")
+        entry = DeviceEntry("imu", "main", spec, None, "nmea2000", None, DeviceSettings("imu/main"), {})
+        assert identify(entry, kept, than=0) == protocol
 
     def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
@@ -343,6 +322,30 @@ class TestCan:
         assert report.problems == []
         assert report.records["ImuSamples"] > 100
         assert report.bytes == 16 * report.units
+
+    @pytest.mark.parametrize(("tick_hz", "rate"), [(1_000_000, None), (10_000, 100.0), (100_000_000, 0.01)])
+    def test_a_counter_read_in_the_wrong_unit_is_said(self, tick_hz: int, rate: float | None, tmp_path: Path) -> None:
+        """An MTi whose SampleTime is in microseconds; the maker's documents say two units."""
+        port = free_udp_port()
+        with can.Bus(interface="udp_multicast", channel=GROUP, port=port, ignore_config=True) as bus:
+
+            def send(_: int) -> None:
+                ticks = (time.monotonic_ns() // 1000 % 2**32).to_bytes(4, "big")
+                for identifier, data in ((0x005, ticks), (0x032, bytes(6)), (0x034, bytes(6))):
+                    bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+            with repeating(send, 0.02):
+                transport = f"can:udp_multicast:{GROUP}?port={port}"
+                table = f'transport = "{transport}"\nprotocol = "xsens-mti"\ntick_hz = {tick_hz}\n'
+                report = check(f"[imu.main]\n{table}", tmp_path)["imu/main"]
+        assert report.records["ImuSamples"] > 10
+        if rate is None:
+            assert report.problems == []
+        else:
+            [problem] = report.problems
+            said = re.fullmatch(r"its counter runs (\S+) times as fast as time: is tick_hz right\?", problem)
+            assert said
+            assert float(said[1]) == pytest.approx(rate, rel=0.1)
 
     def test_answers_as_something_else(self, port: int, tmp_path: Path) -> None:
         (tmp_path / "imu.dbc").write_bytes((ROOT / "fixtures/config/imu.dbc").read_bytes())

@@ -283,6 +283,7 @@ def test_begins_at_once_whatever_lies_in_the_directory(tmp_path: Path, logs: Pat
     with recorder:
         assert "recording test-" in recorder.notify.last("STATUS")
         assert "repair" not in recorder.stderr()  # READY came before anything was looked at
+        recorder.wait_said("scanner/left device_opened")
         numbers.send(500, 0.001)
         assert recorder.stop() == 0
     (path,) = logs.glob("test-*.mcap")

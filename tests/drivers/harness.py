@@ -228,8 +228,8 @@ class Damage(NamedTuple):
     garbage: bytes
 
 
-def damage_strategy(size: int) -> st.SearchStrategy[list[Damage]]:
-    """Up to eight places of damage; the garbage likes the bytes that frames begin with."""
+def damage_strategy(size: int, starts: Sequence[bytes] = ()) -> st.SearchStrategy[list[Damage]]:
+    """Up to eight places of damage; the garbage likes the bytes that frames begin with, ``starts`` among them."""
     syncs = st.sampled_from(
         [
             b"$",
@@ -241,6 +241,9 @@ def damage_strategy(size: int) -> st.SearchStrategy[list[Damage]]:
             b"\xd3\x03\xff",
             b"\xaaD\x12\x1c",
             b"\xaaD\x13",
+            *starts,
+            b"$@",
+            b"$@\x00\x00\xa7\x0f\x00\x08",
         ]
     )
     garbage = st.one_of(st.just(b""), syncs, st.binary(max_size=40))
@@ -270,14 +273,16 @@ def untouched(messages: Sequence[Message], damages: Sequence[Damage]) -> Counter
     return names
 
 
-def check_damage(make: Factory, data: bytes, *, examples: int = 60, window: int = 6 * 1024) -> None:
+def check_damage(
+    make: Factory, data: bytes, *, examples: int = 60, window: int = 6 * 1024, starts: Sequence[bytes] = ()
+) -> None:
     """Bytes flipped and garbage between: never raises, accounts for every byte, finds what was not touched."""
     head = data[:window]
     messages = find_messages(make, head)
     assert messages, "no message in this recording"
 
     @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-    @given(damages=damage_strategy(len(head)), seed=st.integers(0, 1000))
+    @given(damages=damage_strategy(len(head), starts), seed=st.integers(0, 1000))
     def property_holds(damages: list[Damage], seed: int) -> None:
         broken = damaged(head, damages)
         parser = make()
@@ -290,12 +295,11 @@ def check_damage(make: Factory, data: bytes, *, examples: int = 60, window: int 
     property_holds()
 
 
-def check_garbage(make: Factory, *, examples: int = 60) -> None:
+def check_garbage(make: Factory, *, examples: int = 60, starts: Sequence[bytes] = ()) -> None:
     """Random bytes, with frame beginnings among them: never raises, accounts for every byte."""
-    starts = st.sampled_from(
-        [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
-    )
-    pieces = st.lists(st.one_of(st.binary(max_size=200), starts), max_size=20)
+    common = [b"$GPGGA,", b"\xb5b\x01\x07\x5c\x00", b"\xd3\x00\x13", b"\xaaD\x12\x1c", b"\xaaD\x13", b"*00\r\n"]
+    common.append(b"$@\x00\x00\xa7\x0f\x60\x00")
+    pieces = st.lists(st.one_of(st.binary(max_size=200), st.sampled_from([*common, *starts])), max_size=20)
 
     @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(pieces=pieces)

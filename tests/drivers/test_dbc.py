@@ -265,6 +265,47 @@ def test_a_temperature_in_a_message_of_its_own_holds() -> None:
     np.testing.assert_array_equal(rows["temperature_c"], np.array([np.nan, 21.5, 21.5], np.float32))
 
 
+STATUS_DBC = (
+    IMU_DBC
+    + """
+BO_ 262 STATE: 8 IMU
+ SG_ word : 0|40@1+ (1,0) [0|0] "" IMU
+ SG_ count : 40|8@1+ (1,0) [0|0] "" IMU
+"""
+)
+
+
+def state_frame(word: int, count: int) -> bytes:
+    return encode_can_frame(262, word.to_bytes(5, "little") + bytes([count & 0xFF, 0, 0]))
+
+
+def test_a_status_word_is_kept_with_each_sample_and_holds() -> None:
+    signals = {**without("pps_ticks"), "status": "STATE.word"}
+    parser = DbcParser(settings(STATUS_DBC, signals=signals))
+    rows = imu_rows(feed(parser, [*_sample(0), state_frame(0xAB_8000_0001, 0), *_sample(5000), *_sample(10_000)]))
+    assert rows["status"].tolist() == [0, 0x8000_0001, 0x8000_0001], "its low 32 bits"
+
+
+def test_what_a_packet_counter_skips_is_counted_however_batches_are_cut() -> None:
+    signals = {**without("pps_ticks"), "packet_counter": "STATE.count"}
+    counts = [254, 255, 256, 256, 259, 260, 264, 200, 201]  # repeated, 2 and 3 missing, gone back by 64
+    frames = [
+        frame for number, count in enumerate(counts) for frame in (*_sample(5000 * number), state_frame(0, count))
+    ]
+    for size in (1, 3, 7, len(frames)):
+        parser = DbcParser(settings(STATUS_DBC, signals=signals))
+        for start in range(0, len(frames), size):
+            feed(parser, frames[start : start + size], np.arange(start, len(frames))[:size] * 1_000_000)
+        assert parser.counters.errors == {"packet_gap": 5}
+
+
+@pytest.mark.parametrize("key", ["status", "packet_counter"])
+def test_a_status_or_counter_that_is_a_float_is_refused(key: str) -> None:
+    text = STATUS_DBC.replace("word : 0|40@1+", "word : 0|32@1-") + "\nSIG_VALTYPE_ 262 word : 1;\n"
+    with pytest.raises(DriverSettingsError, match=f"signals.{key}: STATE.word is a float"):
+        DbcParser(settings(text, signals={**without("pps_ticks"), key: "STATE.word"}))
+
+
 def test_error_and_remote_frames_are_counted_not_decoded() -> None:
     error = np.zeros(1, CAN_FRAME_DTYPE)
     error["can_id"] = CAN_ERR_FLAG | ACC
@@ -364,7 +405,7 @@ def test_a_signal_of_all_pages_beside_signals_of_two_is_refused() -> None:
             {"signals": {**without(), "specific_force": ["TEMP.celsius"] * 3}},
             'has unit "degC"; specific_force needs m/s2',
         ),
-        ({"tick_hz": None}, "tick_hz: needed with signals.sample_ticks"),
+        ({"tick_hz": 0}, "tick_hz: got 0, want counts per second, above 0"),
         ({"group": "middle"}, 'group: got "middle", want "last" or "first"'),
         ({"sample": "increment"}, "rate_hz: needed with sample"),
     ],
@@ -373,6 +414,11 @@ def test_wrong_settings_are_one_line_that_names_them(changes: dict[str, Any], te
     with pytest.raises(DriverSettingsError, match=text) as caught:
         DbcParser(settings(**changes))
     assert "\n" not in str(caught.value)
+
+
+def test_the_tick_is_a_microsecond_unless_said() -> None:
+    parser = make("last", "pps_ticks", tick_hz=None)
+    assert _run(parser, [1000, 6000], [0.0, 0.005])["device_time_ns"].tolist() == [1_000_000, 6_000_000]
 
 
 def test_the_driver_is_found_and_gives_the_recorder_its_clock() -> None:
@@ -406,7 +452,7 @@ def test_a_makers_own_dbc_with_the_counter_first() -> None:
         "sample_ticks": f"{prefix}INFO.TIME_STAMP",
         "temperature": f"{prefix}INFO.TEMPERATURE",
     }
-    dbc = (Path(__file__).parents[2] / "fixtures/dbc/sbgCan.dbc").read_bytes()
+    dbc = (Path(__file__).parents[2] / "fixtures/sbg-ellipse/sbgCan.dbc").read_bytes()
     config = {"dbc": "sbgCan.dbc", "signals": signals, "group": "first", "tick_hz": 1_000_000}
     parser = DbcParser(DeviceSettings("imu/main", config, {"dbc": dbc}))
     frames = [

@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.core.parser import DriverSettingsError
 from drivers.imu.dbc_signals import find_signal, load_database, signal_layout
 from tests.drivers.imu_dbc import IMU_DBC
 
-DBC_FILES = sorted((Path(__file__).parents[2] / "fixtures/dbc").glob("*.dbc"))
+FIXTURES = Path(__file__).parents[2] / "fixtures"
+DBC_FILES = [*sorted((FIXTURES / "dbc").glob("*.dbc")), FIXTURES / "sbg-ellipse/sbgCan.dbc"]
 CANMOD_DBC = Path(__file__).parents[2] / "drivers/imu/canmod-gps.dbc"
 
 
@@ -80,6 +81,7 @@ def assert_like_cantools(message: Any, signal: Any, data: np.ndarray[Any, np.dty
     return compared
 
 
+@example(DbcSignal(17, 32, False, True, True, 1.0, 0.0, 8), [b"\0\0\0\0\1\xff" + bytes(58)])  # a signalling NaN
 @settings(max_examples=300, deadline=None)
 @given(dbc_signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=4))
 def test_any_signal_reads_as_cantools_reads_it(signal: DbcSignal, payloads: list[bytes]) -> None:

@@ -14,11 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyrtcm import calc_crc24q as crc24q_reference  # type: ignore[import-untyped]
+from pysbf2 import calc_crc as crc16_reference
 from pyubx2 import calc_checksum as fletcher_reference
 
 from drivers.core.checksums import (
     CRC24Q_STEP_BYTES,
     FLETCHER_STEP_BYTES,
+    crc16_ccitt,
     crc24q,
     crc32_novatel,
     crc64_xz,
@@ -31,6 +33,8 @@ from drivers.core.frame_kinds import (
     NMEA_MAX_BYTES,
     NOVATEL,
     NOVATEL_SHORT,
+    SBF,
+    SBF_MAX_BYTES,
     UBX_MAX_PAYLOAD_BYTES,
 )
 from drivers.core.framing import Frame, FrameKind, Framer
@@ -41,7 +45,7 @@ from georef.records import Chunk, Record
 from tests.drivers.harness import check_damage, check_garbage, check_stream
 from tests.drivers.recordings import every_recording, expected, recording
 
-ALL_KINDS = (*GNSS_KINDS, NOVATEL, NOVATEL_SHORT)
+ALL_KINDS = (*GNSS_KINDS, NOVATEL, NOVATEL_SHORT, SBF)
 
 
 class FramingParser(StreamParser):
@@ -89,6 +93,7 @@ def test_checksums_equal_other_implementations(data: bytes) -> None:
     assert nmea_xor(data) == functools.reduce(operator.xor, data, 0)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
     assert crc24q(data) == crc24q_reference(data)
+    assert crc16_ccitt(data) == crc16_reference(data)
 
 
 @pytest.mark.parametrize("length", [CRC24Q_STEP_BYTES - 1, CRC24Q_STEP_BYTES, CRC24Q_STEP_BYTES + 1, 1030, 1031, 5000])
@@ -174,7 +179,7 @@ def test_every_recording_has_the_frames_others_found(family: str, name: str) -> 
     counters, scan = parser.counters, entry["frame_scan_own"]
     kinds = Counter(frame.kind for frame in parser.frames)
     assert (kinds["ubx"], kinds["rtcm3"], kinds["nmea"]) == (scan["ubx_ok"], scan["rtcm3_crc_ok"], scan["nmea_ok"])
-    assert kinds["novatel"] == kinds["novatel-short"] == 0
+    assert kinds["novatel"] == kinds["novatel-short"] == kinds["sbf"] == 0
     assert counters.bytes_framed == sum(len(frame.data) for frame in parser.frames)
     assert counters.bytes == counters.bytes_framed + counters.bytes_skipped == len(data)
     theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
@@ -182,6 +187,18 @@ def test_every_recording_has_the_frames_others_found(family: str, name: str) -> 
         theirs[name_here(message)] += count
     by_name = {key: count for key, count in counters.messages.items() if not key.startswith(NAMED_BY_NUMBER)}
     assert by_name == {key: count for key, count in theirs.items() if not key.startswith(NAMED_BY_NUMBER)}
+
+
+@pytest.mark.parametrize("name", sorted(expected("sbf")))
+def test_every_sbf_recording_has_the_frames_others_found(name: str) -> None:
+    data, entry = recording("sbf", name), expected("sbf")[name]
+    parser = frames_of(data)
+    numbers = Counter(frame.data[4] | (frame.data[5] & 0x1F) << 8 for frame in parser.frames if frame.kind == "sbf")
+    assert numbers == {int(number): count for number, count in entry["frame_scan_own"]["by_id"].items()}
+    others = sum(count for message, count in entry["messages"].items() if not message.startswith("SBF:"))
+    if name != "pygpsdata_ubx.log":
+        assert len(parser.frames) == numbers.total() + others
+    assert parser.counters.bytes == parser.counters.bytes_framed + parser.counters.bytes_skipped == len(data)
 
 
 def test_skipped_bytes_of_broken_files_are_those_that_belong_to_no_frame() -> None:
@@ -206,6 +223,14 @@ FRAME = encode_frame(b"\x01\x22", bytes(20))
         b"\xd3",
         b"\xaaD\x12\x1c\x2a\x00\x02\x20\x00\x50",
         b"\xaaD\x13\xff",
+        b"$@",
+        b"$@\x00\x00\xa7\x0f\x60\x00",
+        b"$@\x00\x00\xa7\x0f\x00\x40",
+        b"$@\x00\x00\xa7\x0f\x61\x00",  # no multiple of 4
+        b"$@\x00\x00\xa7\x0f\x04\x00",
+        b"$@$@$@$@$@$@$@$@",
+        b"$R: setSBFOutput, Stream1, COM1\r\n",
+        b"\r\nCOM1>",
         b"$GPGGA,12",
         b"$",
         b"$$$$!A!",
@@ -228,6 +253,7 @@ def test_a_false_sync_holds_back_no_more_than_its_bound(kind: FrameKind) -> None
         "rtcm3": b"\xd3\x03\xff",
         "novatel": b"\xaaD\x12\x40" + bytes(4) + (24 * 1024).to_bytes(2, "little"),
         "novatel-short": b"\xaaD\x13\xff",
+        "sbf": b"$@\x00\x00\xa7\x0f" + SBF_MAX_BYTES.to_bytes(2, "little"),
     }
     parser = FramingParser()
     parser.feed(Chunk("gnss/test", 0, starts[kind.name]))
@@ -245,6 +271,10 @@ def test_lengths_beyond_the_bound_are_counted_and_not_waited_for() -> None:
     parser.feed(Chunk("gnss/test", 0, b"\xb5b\x01\x07\x01\x20" + FRAME))
     assert [frame.data for frame in parser.frames] == [FRAME]
     assert parser.counters.errors == {"ubx_length_over_bound": 1}
+    parser = FramingParser()
+    parser.feed(Chunk("gnss/test", 0, b"$@\x00\x00\xa7\x0f" + (SBF_MAX_BYTES + 4).to_bytes(2, "little") + FRAME))
+    assert [frame.data for frame in parser.frames] == [FRAME]
+    assert parser.counters.errors == {"sbf_length_over_bound": 1}
 
 
 def test_a_sentence_longer_than_the_bound_is_no_sentence() -> None:
@@ -289,3 +319,18 @@ def test_rtcm3_damaged() -> None:
 
 def test_garbage_alone() -> None:
     check_garbage(count_frames)
+
+
+def test_sbf_between_nmea_and_rtcm3_however_it_is_cut() -> None:
+    """Block, sentence, block, RTCM3 and the replies of the command line between them, all on one port."""
+    mixed = recording("sbf", "pygpsdata_mixed.log")
+    blocks = recording("sbf", "pygpsdata_x5_status.log")
+    reply = b"$R: setDataInOut, COM1, , SBF\r\n  DataInOut, COM1, CMD, SBF\r\nCOM1>"
+    outcome = check_stream(count_frames, mixed + reply + blocks + GOOD + reply + mixed)
+    assert outcome.counters["messages"]["SBF-4007"] == 2
+    assert outcome.counters["messages"].total() == 2 * 6 + 13 + 1
+    assert outcome.counters["bytes_skipped"] == 2 * len(reply)
+
+
+def test_sbf_damaged() -> None:
+    check_damage(count_frames, recording("sbf", "sbfdata.log"))

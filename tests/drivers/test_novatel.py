@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.core.parser import DeviceSettings
+from drivers.core.registry import find_driver
 from drivers.gnss.novatel import NovatelParser, make_time_parser
 from drivers.gnss.novatel_tables import FIX_TYPES
 from georef.records import (
@@ -32,6 +33,7 @@ from tests.drivers.harness import (
     check_random_cuts,
     check_random_reads,
     check_stream,
+    packed_rows,
 )
 from tests.drivers.novatel_ascii import WEEK_NS, AsciiLog, ascii_logs, recording
 
@@ -341,6 +343,23 @@ def test_rawimusx_is_edies_and_weighs_one_g() -> None:
         assert row["device_time_ns"] == round(float(log.fields[3]) * 1e9)
         assert row["gps_week"] == (int(log.fields[2]) or -1)
         assert row["status"] == int(log.fields[4], 16)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "kind"),
+    [("unit_test_vectors.bin", 4, ImuSamples), (SPAN, 1988, InsSolution), ("ins1.gps", 243, InsSolution)],
+)
+def test_the_imu_inside_the_stream_gives_what_the_receiver_gives(
+    name: str, rows: int, kind: type[InsSolution] | type[ImuSamples]
+) -> None:
+    """By ``transport = "gnss:rover"`` the same bytes; the recording of SPAN has no RAWIMU, only CORRIMUDATA."""
+    parser = find_driver("imu", "novatel").make_parser(DeviceSettings("imu/main"))
+    records = [*parser.feed(Chunk("imu/main", HOST_NS, recording(name))), *parser.close()]
+    assert {type(record) for record in records} <= {ImuSamples, InsSolution}
+    inside = rows_of(records, kind)
+    assert len(inside) == rows
+    assert packed_rows(inside) == packed_rows(rows_of(parse(recording(name)), kind))
+    assert (kind is ImuSamples) == any(isinstance(record, ImuSamples) for record in records)
 
 
 @pytest.mark.parametrize(("name", "message", "first"), [("ins1.gps", "CORRIMUS", 1), (SPAN, "CORRIMUDATA", 2)])

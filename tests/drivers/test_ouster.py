@@ -227,9 +227,10 @@ def test_imu_packets_are_encoded_as_they_are_decoded(capture: str) -> None:
     np.testing.assert_array_equal(rows["device_time_ns"], 1_000_000 * np.arange(1, count + 1))
 
 
-def test_samples_that_are_no_numbers_are_left_out() -> None:
+@pytest.mark.parametrize("word", [0x7FC0_0000, 0x7FA0_0000, 0xFF80_0000], ids=["NaN", "signalling NaN", "-infinity"])
+def test_samples_that_are_no_numbers_are_left_out(word: int) -> None:
     parser = recorded("crc_test")
-    assert feed(parser, [struct.pack("<3Q6f", 1, 2, 3, float("nan"), 0, 1, 0, 0, 0)]) == []
+    assert feed(parser, [struct.pack("<3QI5f", 1, 2, 3, word, 0, 1, 0, 0, 0)]) == []
     assert parser.counters.errors == {"bad_sample": 1}
 
 

@@ -1,0 +1,40 @@
+"""Rows of array records, collected one message at a time and joined with their neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from georef.records import IMU_DTYPE, INS_DTYPE, ImuSamples, InsSolution, Record
+
+
+class Row(NamedTuple):
+    """One row of an array record, its fields in the order of the record's dtype."""
+
+    record: type[ImuSamples] | type[InsSolution]
+    values: tuple[Any, ...]
+
+
+def join_rows(items: Iterable[Record | Row]) -> list[Record]:
+    """Records in order; neighbouring rows of one kind are one array."""
+    records: list[Record] = []
+    run: list[Row] = []
+    for item in items:
+        if run and not (isinstance(item, Row) and item.record is run[0].record):
+            records.append(_array(run))
+            run = []
+        if isinstance(item, Row):
+            run.append(item)
+        else:
+            records.append(item)
+    return [*records, _array(run)] if run else records
+
+
+def _array(run: list[Row]) -> Record:
+    """Rows of one kind as one record."""
+    values: list[Any] = [row.values for row in run]
+    if run[0].record is ImuSamples:
+        return ImuSamples(np.array(values, dtype=IMU_DTYPE))
+    return InsSolution(np.array(values, dtype=INS_DTYPE))

@@ -1,0 +1,58 @@
+"""Named devices over `drivers.imu.dbc`: their messages are known, their CAN identifiers are what the user set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from drivers.core.can_frames import CAN_EFF_MASK, frame_id
+from drivers.core.parser import DeviceSettings, DriverSettingsError
+from drivers.imu.dbc_settings import SignalMap, map_signals
+
+
+def profile_map(
+    settings: DeviceSettings, contents: bytes, name: str, signals: Mapping[str, Any], *, prefix: str = ""
+) -> SignalMap:
+    """The signal map of a device whose messages are described by a DBC that comes with its driver.
+
+    The message with the counter opens a sample unless the table's ``group`` says otherwise.
+
+    Args:
+        settings: the device's table; ``ids`` and ``extended_ids`` say what differs from the DBC's identifiers.
+        contents: the DBC.
+        name: of the DBC, for what is said of it.
+        signals: which of its signals is what, as in ``[imu.NAME.signals]``.
+        prefix: what all its message names begin with; the keys of ``ids`` leave it out.
+
+    Raises:
+        DriverSettingsError: naming the key and what would be right.
+    """
+    if settings.config.get("sample") == "increment":
+        raise DriverSettingsError(
+            'sample: got "increment"; this device\'s messages are rates, want "mean" or "instant"'
+        )
+    config = {**settings.config, "signals": signals, "dbc": name, "group": settings.config.get("group") or "first"}
+    found = map_signals(DeviceSettings(settings.source, config, {"dbc": contents}))
+    words = _can_ids(settings.config, {part.message.removeprefix(prefix): part.can_id for part in found.parts})
+    parts = tuple(replace(part, can_id=words[part.message.removeprefix(prefix)]) for part in found.parts)
+    return replace(found, parts=parts)
+
+
+def _can_ids(config: Mapping[str, Any], defaults: Mapping[str, int]) -> dict[str, int]:
+    """The ``can_id`` word of each message."""
+    extended = bool(config.get("extended_ids"))
+    given = dict(config.get("ids") or {})
+    unknown = sorted(set(given) - set(defaults))
+    if unknown:
+        raise DriverSettingsError(f"ids.{unknown[0]} is unknown; there are: {', '.join(sorted(defaults))}")
+    numbers = {name: given.get(name, word & CAN_EFF_MASK) for name, word in defaults.items()}
+    messages: dict[int, str] = {}
+    for name, number in numbers.items():
+        if messages.setdefault(number, name) != name:
+            raise DriverSettingsError(f"ids: {messages[number]} and {name} are both 0x{number:X}; give each its own")
+    try:
+        return {name: frame_id(number, extended=extended) for name, number in numbers.items()}
+    except ValueError as error:
+        hint = "want 0 to 0x1FFFFFFF" if extended else "want 0 to 0x7FF; 29 bits need extended_ids = true"
+        raise DriverSettingsError(f"ids: {error}; {hint}") from error

@@ -1,0 +1,24 @@
+"""The IMU of a Septentrio INS receiver, inside the receiver's own stream (``transport = "gnss:NAME"``)."""
+
+from __future__ import annotations
+
+from drivers.core.parser import DeviceSettings, Driver
+from drivers.gnss.sbf import SbfParser
+from georef.records import ImuSamples, InsSolution
+
+
+def make_imu_parser(settings: DeviceSettings) -> SbfParser:
+    """A parser of the receiver's stream that gives what is inertial."""
+    return SbfParser(settings, wanted=(ImuSamples, InsSolution))
+
+
+DRIVERS = (
+    Driver(
+        protocol="sbf",
+        kind="imu",
+        transports=("gnss",),
+        yields=(ImuSamples, InsSolution),
+        summary="IMU and INS of a Septentrio INS receiver, inside its GNSS stream",
+        make_parser=make_imu_parser,
+    ),
+)

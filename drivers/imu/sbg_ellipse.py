@@ -1,0 +1,61 @@
+"""SBG Systems Ellipse (Ekinox, Apogee, Quanta alike) on CAN.
+
+The maker's own DBC (sbg-ellipse.dbc beside this file: github.com/SBG-Systems/sbgECom, can/sbgCan.dbc, MIT licence
+inside) and its document canProtocol.md agree on all that is read here. A sample is IMU_INFO with the time stamp in
+microseconds since power-on, then IMU_ACCEL and IMU_GYRO of the same cycle, which carry no time of their own. All
+identifiers are disabled until the user chooses them; those of the DBC are the document's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivers.core.parser import DeviceSettings, Driver
+from drivers.imu.can_profile import profile_map
+from drivers.imu.dbc import DbcParser
+from drivers.imu.dbc_settings import SignalMap
+from georef.records import DeviceClockSamples, ImuSamples
+
+DBC_PATH = Path(__file__).with_name("sbg-ellipse.dbc")
+PREFIX = "SBG_ECAN_MSG_"
+SIGNALS = {  # canProtocol.md; TIME_STAMP is in µs, which is what tick_hz is when absent
+    "specific_force": [f"{PREFIX}IMU_ACCEL.ACCEL_{axis}" for axis in "XYZ"],
+    "angular_rate": [f"{PREFIX}IMU_GYRO.GYRO_{axis}" for axis in "XYZ"],
+    "sample_ticks": f"{PREFIX}IMU_INFO.TIME_STAMP",
+    "temperature": f"{PREFIX}IMU_INFO.TEMPERATURE",
+    "status": f"{PREFIX}IMU_INFO.STATUS",
+}
+
+
+def signal_map(settings: DeviceSettings) -> SignalMap:
+    """Where the signals lie; with ``pps_event``, the time of that Sync In's last event is the latched counter.
+
+    Raises:
+        DriverSettingsError: naming the key and what would be right.
+    """
+    event = settings.config.get("pps_event")
+    latch = {"pps_ticks": f"{PREFIX}EVENT_INFO_{event}.TIME_STAMP"} if event else {}
+    return profile_map(settings, DBC_PATH.read_bytes(), DBC_PATH.name, SIGNALS | latch, prefix=PREFIX)
+
+
+def make_parser(settings: DeviceSettings) -> DbcParser:
+    """The parser of everything."""
+    return DbcParser(settings, signal_map=signal_map(settings))
+
+
+def make_clock_parser(settings: DeviceSettings) -> DbcParser:
+    """The recorder's parser: the device's clock only."""
+    return DbcParser(settings, clock_only=True, signal_map=signal_map(settings))
+
+
+DRIVERS = (
+    Driver(
+        protocol="sbg-ellipse",
+        kind="imu",
+        transports=("can",),
+        yields=(ImuSamples, DeviceClockSamples),
+        summary="SBG Systems Ellipse, Ekinox, Apogee and Quanta: IMU messages on CAN",
+        make_parser=make_parser,
+        make_time_parser=make_clock_parser,
+    ),
+)

@@ -1,0 +1,114 @@
+"""Xsens (Movella) MTi-600 series on CAN.
+
+Layouts are those of "MTi 600-series MT CAN Protocol Documentation", MT1604P revision A (2019), as a public audit
+quotes them, and of XsCanDataIdentifier in the maker's SDK. No recording was at hand. Two things the makers' documents
+leave open are settings:
+
+- the unit of SampleTime: MT1604P and the SDK say microseconds, Movella's page on CAN messages 10 kHz: ``tick_hz`` has
+  no default;
+- the byte order, which MT1604P does not say: ``byte_order`` is big unless set, as three implementations have it and as
+  the maker's serial protocol is.
+
+DeltaV, DeltaQ and the high-rate messages are not read: DeltaV's exponent and the identifiers of the high-rate ones are
+said by one document each, or contradicted, and DeltaQ resolves no more than 6e-5 rad a sample.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError
+from drivers.imu.can_profile import profile_map
+from drivers.imu.dbc import DbcParser
+from drivers.imu.dbc_settings import SignalMap
+from georef.records import ImuSamples
+
+BYTE_ORDERS = {"big": 0, "little": 1}  # as a DBC numbers them
+
+
+class Message(NamedTuple):
+    """One message: fields of equal width from its first byte on.
+
+    Attributes:
+        name: as MT1604P has it, without its prefix.
+        identifier: default.
+        fields: names.
+        bits, signed: of each field.
+        scale: to the unit.
+        unit: as a DBC spells it.
+    """
+
+    name: str
+    identifier: int
+    fields: tuple[str, ...]
+    bits: int
+    signed: bool
+    scale: float
+    unit: str
+
+
+MESSAGES = (  # the comment is the section of MT1604P
+    Message("SampleTime", 0x005, ("ticks",), 32, False, 1.0, ""),  # 6.1.2
+    Message("GroupCounter", 0x006, ("count",), 16, False, 1.0, ""),  # 6.1.3
+    Message("StatusWord", 0x011, ("status",), 32, False, 1.0, ""),  # 6.2.1
+    Message("RateOfTurn", 0x032, ("x", "y", "z"), 16, True, 2.0**-9, "rad/s"),  # 6.4.2
+    Message("Acceleration", 0x034, ("x", "y", "z"), 16, True, 2.0**-8, "m/s2"),  # 6.4.4
+    Message("Temperature", 0x051, ("celsius",), 16, True, 2.0**-8, "degC"),  # 6.6.1
+)
+SIGNALS = {
+    "specific_force": [f"Acceleration.{axis}" for axis in "xyz"],
+    "angular_rate": [f"RateOfTurn.{axis}" for axis in "xyz"],
+    "sample_ticks": "SampleTime.ticks",
+    "temperature": "Temperature.celsius",
+    "status": "StatusWord.status",
+    "packet_counter": "GroupCounter.count",
+}
+
+
+def dbc_text(byte_order: str) -> str:
+    """The messages as a DBC, with the default identifiers."""
+    order = BYTE_ORDERS[byte_order]
+    lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: MTi", ""]
+    for message in MESSAGES:
+        lines.append(f"BO_ {message.identifier} {message.name}: {len(message.fields) * message.bits // 8} MTi")
+        sign = "-" if message.signed else "+"
+        for number, field in enumerate(message.fields):
+            start = number * message.bits + (7 if order == 0 else 0)
+            place = f"{start}|{message.bits}@{order}{sign}"
+            lines.append(f' SG_ {field} : {place} ({message.scale},0) [0|0] "{message.unit}" Vector__XXX')
+        lines.append("")
+    return "\n".join(lines)
+
+
+def signal_map(settings: DeviceSettings) -> SignalMap:
+    """Where the signals lie.
+
+    Raises:
+        DriverSettingsError: naming the key and what would be right.
+    """
+    if settings.config.get("tick_hz") is None:
+        raise DriverSettingsError(
+            "tick_hz: say 1000000 or 10000: the maker's documents contradict each other on the unit of SampleTime"
+        )
+    order = settings.config.get("byte_order") or "big"
+    if order not in BYTE_ORDERS:
+        raise DriverSettingsError(f'byte_order: got "{order}", want "big" or "little"')
+    return profile_map(settings, dbc_text(order).encode(), "xsens-mti's messages", SIGNALS)
+
+
+def make_parser(settings: DeviceSettings) -> DbcParser:
+    """The parser of everything."""
+    return DbcParser(settings, signal_map=signal_map(settings))
+
+
+DRIVERS = (
+    Driver(
+        protocol="xsens-mti",
+        kind="imu",
+        transports=("can",),
+        yields=(ImuSamples,),
+        summary="Xsens MTi-600 series on CAN",
+        make_parser=make_parser,
+        needs=("tick_hz",),
+    ),
+)

@@ -1,0 +1,63 @@
+"""Devices that say the same again and again: a serial port, a sender of datagrams."""
+
+from __future__ import annotations
+
+import os
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from socket import AF_INET, SOCK_DGRAM, socket
+
+
+@contextmanager
+def repeating(job: Callable[[int], None], period_s: float = 0.05) -> Iterator[None]:
+    """Call a job again and again in a thread of its own."""
+    stop = threading.Event()
+
+    def run() -> None:
+        number = 0
+        while not stop.wait(period_s):
+            job(number)
+            number += 1
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
+    """A serial device that sends something again and again; its path."""
+    main, secondary = os.openpty()
+    tty.setraw(secondary)
+    os.set_blocking(main, False)
+
+    def write(number: int) -> None:
+        if send is not None:
+            try:
+                os.write(main, send(number))
+            except BlockingIOError:
+                pass
+
+    try:
+        with repeating(write):
+            yield os.ttyname(secondary)
+    finally:
+        os.close(main)
+        os.close(secondary)
+
+
+@contextmanager
+def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
+    """Datagrams to a port of this computer."""
+    with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
+        yield
+
+
+def _send(sender: socket, port: int, data: bytes) -> None:
+    sender.sendto(data, ("127.0.0.1", port))
