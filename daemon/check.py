@@ -306,7 +306,7 @@ def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
             return ["no time message: the clock cannot be set by it; switch one on"]
         return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
     rate = heard.imu_clock_rate
-    if rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
+    if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
         return [f"its counter runs {rate:.3g} times as fast as time: is tick_hz right?"]
     if entry.pps is not None and heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]
