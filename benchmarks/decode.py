@@ -27,6 +27,8 @@ from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Parser, ParserCounters
 from drivers.imu.canmod_gps import CanmodGpsParser
 from drivers.imu.dbc import DbcParser
+from drivers.scanner.hesai import HesaiParser
+from drivers.scanner.hesai_heads import QT64, XT32
 from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
@@ -143,6 +145,34 @@ def velodyne_units(name: str, step_us: float) -> ByteRows:
     return units
 
 
+def head_figure(name: str, make: Callable[[], Parser], units: ByteRows, target: float, repeats: int) -> Figure:
+    """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
+    batches = batches_of(units)
+    rows = decode_all(make, batches)
+    copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+
+    def least() -> None:
+        np.copyto(taken, units)
+        copy()
+
+    decode = rate(lambda: decode_all(make, batches), rows, repeats)
+    return Figure(name, "returns", decode, target, rate(least, rows, repeats), "copy of packets and rows")
+
+
+def measure_hesai(repeats: int) -> Iterator[Figure]:
+    """PandarXT-32 and PandarQT, dual return, real packets with a sequence that goes on."""
+    for name, head, recording in (
+        ("PandarXT-32, dual return", XT32, "nebula_xt32.pcap.gz"),
+        ("PandarQT, dual return", QT64, "nebula_qt64.pcap.gz"),
+    ):
+        packets = [unit.data for unit in read_pcap(FIXTURES / "hesai" / recording)]
+        units = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(len(packets), -1)
+        units = np.tile(units, (max(1, 3600 // len(units)), 1))
+        units.view(head.packet_dtype())["sequence"][:, 0] = np.arange(1, len(units) + 1)
+        settings = DeviceSettings("scanner/bench")
+        yield head_figure(name, lambda h=head, s=settings: HesaiParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
+
+
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
     """VLP-16, both return modes, real packets."""
     for name, recording, step_us in (
@@ -150,17 +180,7 @@ def measure_velodyne(repeats: int) -> Iterator[Figure]:
         ("VLP-16, dual return", "nebula_vlp16.pcap.gz", 663.552),
     ):
         units = velodyne_units(recording, step_us)
-        batches = batches_of(units)
-        make = lambda: VelodyneParser(DeviceSettings("scanner/bench"))  # noqa: E731
-        rows = decode_all(make, batches)
-        copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
-
-        def least(units: ByteRows = units, taken: ByteRows = taken, copy: Callable[[], object] = copy) -> None:
-            np.copyto(taken, units)
-            copy()
-
-        decode = rate(lambda m=make, b=batches: decode_all(m, b), rows, repeats)  # type: ignore[misc]
-        yield Figure(name, "returns", decode, 10e6, rate(least, rows, repeats), "copy of packets and rows")
+        yield head_figure(name, lambda: VelodyneParser(DeviceSettings("scanner/bench")), units, 10e6, repeats)
 
 
 # --- CAN ------------------------------------------------------------------------------------------------------------
@@ -276,7 +296,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = []
     print(f"{'decoding, one core':<30} {'rate':>10} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
-    for measure in (measure_srep, measure_velodyne, measure_can, measure_framing):
+    for measure in (measure_srep, measure_velodyne, measure_hesai, measure_can, measure_framing):
         for figure in measure(arguments.repeats):
             figures.append(figure)
             asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, PacketParser
+from drivers.scanner.beams import FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
-from drivers.scanner.velodyne_heads import VLP16, FloatArray, SpinningHead
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, pair_slots, returns_table
+from drivers.scanner.velodyne_heads import VLP16, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -201,7 +202,11 @@ class VelodyneParser(PacketParser):
         azimuth = packets["blocks"]["azimuth"]
         if mode == MODE_DUAL:
             azimuth = azimuth[:, ::2]
-            range_raw, reflectivity, of_pair = _pair_returns(packets["blocks"]["returns"])
+            returns = packets["blocks"]["returns"]
+            range_raw, reflectivity, of_pair = pair_slots(
+                (returns["range"][:, ::2].reshape(-1), returns["range"][:, 1::2].reshape(-1)),
+                (returns["reflectivity"][:, ::2].reshape(-1), returns["reflectivity"][:, 1::2].reshape(-1)),
+            )
             per_slot["flags"] = of_pair | np.uint8(locked)
         else:
             returns = packets["blocks"]["returns"]
@@ -226,27 +231,6 @@ class VelodyneParser(PacketParser):
                 **flags,
             },
         )
-
-
-def _pair_returns(
-    returns: StructArray,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Dual returns (n, 12, 32) as slots (pulses, 2): range, reflectivity and flags, by the module's rule."""
-    (last, odd), (last_light, odd_light) = (
-        (returns[field][:, ::2].reshape(-1), returns[field][:, 1::2].reshape(-1)) for field in ("range", "reflectivity")
-    )
-    odd_is_far = odd > last
-    near, far = np.minimum(last, odd), np.maximum(last, odd)
-    near_light = np.where(odd_is_far, last_light, odd_light)
-    far_light = np.where(odd_is_far, odd_light, last_light)
-    two = (near > 0) & (near != far)
-    near_strongest = (near_light > far_light) | ((near_light == far_light) & ~odd_is_far)
-    alone = RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST
-    range_raw = np.stack([np.where(two, near, far), np.where(two, far, 0)], axis=1)
-    reflectivity = np.stack([np.where(two, near_light, far_light), far_light], axis=1)
-    first_flags = np.where(two, near_strongest * np.uint8(RETURN_FLAG_STRONGEST), np.uint8(alone))
-    last_flags = RETURN_FLAG_LAST + ~near_strongest * np.uint8(RETURN_FLAG_STRONGEST)
-    return range_raw, reflectivity, np.stack([first_flags, last_flags], axis=1).astype(np.uint8)
 
 
 def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, blocks: int) -> Int64Array:

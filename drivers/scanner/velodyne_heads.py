@@ -1,4 +1,4 @@
-"""Velodyne heads: how the lasers of a model are fired, where they point, and the maker's formula for x, y, z."""
+"""Velodyne heads: how the lasers of a model are fired and where they point."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import StructArray
-
-FloatArray = NDArray[np.float64]
+from drivers.scanner.beams import BeamTable, beam_table
 
 
 @dataclass(frozen=True)
@@ -23,9 +21,7 @@ class SpinningHead:
         channel: (32,) laser of each place in a data block.
         offset_ns: (32,) firing time of each place after the block's time.
         block_ns: from the time of one block's azimuth to the next one's.
-        elevation_deg: (lasers,) vertical angle ω.
-        azimuth_deg: (lasers,) added to the head's azimuth.
-        vertical_m: (lasers,) added to z: the beams do not leave from one point.
+        beams: design values of its lasers.
     """
 
     name: str
@@ -34,9 +30,7 @@ class SpinningHead:
     channel: NDArray[np.uint16]
     offset_ns: NDArray[np.int64]
     block_ns: int
-    elevation_deg: FloatArray
-    azimuth_deg: FloatArray
-    vertical_m: FloatArray
+    beams: BeamTable
 
 
 _PLACES = np.arange(32)
@@ -51,26 +45,9 @@ VLP16 = SpinningHead(
     channel=(_PLACES % 16).astype(np.uint16),
     offset_ns=(_PLACES // 16) * 55_296 + (_PLACES % 16) * 2_304,
     block_ns=2 * 55_296,
-    elevation_deg=np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], dtype=np.float64),
-    azimuth_deg=np.zeros(16),
-    vertical_m=1e-3
-    * np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]),
+    beams=beam_table(
+        [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15],
+        up_m=1e-3
+        * np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]),
+    ),
 )
-
-
-def beam_points(rows: StructArray, head: SpinningHead = VLP16) -> FloatArray:
-    """Where returns lie in the maker's frame (manual 9.2): x right at azimuth 90°, y at azimuth 0, z the spin axis.
-
-    Args:
-        rows: (n,) `RETURN_DTYPE`; ``encoder_rad`` is the azimuth at the laser's own firing.
-        head: the model.
-
-    Returns:
-        (n, 3) metres, s frame of CONVENTIONS' multi-beam scanners, no calibration but the manual's.
-    """
-    channel = rows["channel"]
-    azimuth = rows["encoder_rad"] + np.radians(head.azimuth_deg)[channel]
-    elevation = np.radians(head.elevation_deg)[channel]
-    flat = rows["range_m"] * np.cos(elevation)
-    height = rows["range_m"] * np.sin(elevation) + head.vertical_m[channel]
-    return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), height], axis=1)
