@@ -31,7 +31,8 @@ from drivers.scanner.hesai import HesaiParser
 from drivers.scanner.hesai_heads import QT64, XT32
 from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
+from drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
+from drivers.scanner.velodyne_heads import VLP16, VLP32C
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
@@ -136,15 +137,6 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
         yield Figure(name, "returns", decode, 15e6, rate(least, rows, repeats), "CRC-32 + copy of the rows")
 
 
-def velodyne_units(name: str, step_us: float) -> ByteRows:
-    """The data packets of a recording, several times over, with stamps that go on."""
-    packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
-    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
-    units = np.tile(once, (max(1, 3600 // len(once)), 1))
-    units.view(PACKET_DTYPE)["stamp_us"][:, 0] = np.rint(np.arange(len(units)) * step_us)
-    return units
-
-
 def head_figure(name: str, make: Callable[[], Parser], units: ByteRows, target: float, repeats: int) -> Figure:
     """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
     batches = batches_of(units)
@@ -173,14 +165,41 @@ def measure_hesai(repeats: int) -> Iterator[Figure]:
         yield head_figure(name, lambda h=head, s=settings: HesaiParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
 
 
+def velodyne_units(name: str, step_us: float) -> ByteRows:
+    """The data packets of a recording, several times over, with stamps that go on."""
+    packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
+    return with_stamps(np.tile(once, (max(1, 3600 // len(once)), 1)), step_us)
+
+
+def with_stamps(units: ByteRows, step_us: float) -> ByteRows:
+    """Velodyne data packets with stamps that go on."""
+    units.view(PACKET_DTYPE)["stamp_us"][:, 0] = np.rint(np.arange(len(units)) * step_us)
+    return units
+
+
+def as_dual(units: ByteRows) -> ByteRows:
+    """Single-return packets of one azimuth a block as dual-return ones: each block's returns a pair with the next's."""
+    dual = units.copy()
+    packets = dual.view(PACKET_DTYPE)[:, 0]
+    packets["mode"], packets["blocks"]["azimuth"] = (
+        MODE_DUAL,
+        np.repeat(packets["blocks"]["azimuth"][:, ::2], 2, axis=1),
+    )
+    return dual
+
+
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
-    """VLP-16, both return modes, real packets."""
-    for name, recording, step_us in (
-        ("VLP-16, strongest return", "mrpt_vlp16_gps.pcap.gz", 1327.104),
-        ("VLP-16, dual return", "nebula_vlp16.pcap.gz", 663.552),
+    """VLP-16 in both return modes and VLP-32C, real packets; the VLP-32C's as dual ones too."""
+    vlp32c = velodyne_units("nebula_vlp32.pcap.gz", 663.552)
+    for name, head, units in (
+        ("VLP-16, strongest return", VLP16, velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)),
+        ("VLP-16, dual return", VLP16, velodyne_units("nebula_vlp16.pcap.gz", 663.552)),
+        ("VLP-32C, strongest return", VLP32C, vlp32c),
+        ("VLP-32C, dual return", VLP32C, with_stamps(as_dual(vlp32c), 331.776)),
     ):
-        units = velodyne_units(recording, step_us)
-        yield head_figure(name, lambda: VelodyneParser(DeviceSettings("scanner/bench")), units, 10e6, repeats)
+        settings = DeviceSettings("scanner/bench")
+        yield head_figure(name, lambda h=head, s=settings: VelodyneParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
 
 
 # --- CAN ------------------------------------------------------------------------------------------------------------

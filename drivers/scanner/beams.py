@@ -39,6 +39,11 @@ class BeamTable:
         return len(self.elevation_deg)
 
 
+def numbers(text: str) -> list[float]:
+    """A table written as words."""
+    return [float(word) for word in text.split()]
+
+
 def beam_table(elevation_deg: object, **others: object) -> BeamTable:
     """A table of what is given; zeros for the rest."""
     elevation = np.array(elevation_deg, dtype=np.float64)

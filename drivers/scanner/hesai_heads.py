@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.core.parser import DriverSettingsError
-from drivers.scanner.beams import BeamTable, beam_table
+from drivers.scanner.beams import BeamTable, beam_table, numbers
 from georef.records import Int64Array
 
 
@@ -124,10 +124,6 @@ _QT_AZIMUTH_DEG = """
 """
 
 
-def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split()]
-
-
 QT64 = HesaiHead(
     name="PandarQT",
     protocol_major=3,
@@ -145,8 +141,8 @@ QT64 = HesaiHead(
     round_ns=500_000 / 3,
     stamped_round=FIRST_ROUND,
     start_ns=25_710 + 10_000,
-    offset_ns=np.rint(1000 * np.array(_numbers(_QT_FIRES_US))).astype(np.int64),
-    beams=beam_table(_numbers(_QT_ELEVATION_DEG), azimuth_deg=_numbers(_QT_AZIMUTH_DEG)),
+    offset_ns=np.rint(1000 * np.array(numbers(_QT_FIRES_US))).astype(np.int64),
+    beams=beam_table(numbers(_QT_ELEVATION_DEG), azimuth_deg=numbers(_QT_AZIMUTH_DEG)),
 )
 
 

@@ -1,4 +1,4 @@
-"""Velodyne heads: how the lasers of a model are fired and where they point."""
+"""Velodyne heads: how the lasers of a model are fired and where they point. A further model is an entry here."""
 
 from __future__ import annotations
 
@@ -7,47 +7,98 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.scanner.beams import BeamTable, beam_table
+from drivers.scanner.beams import BeamTable, beam_table, numbers
+
+BLOCKS = 12  # of a data packet
+PLACES = 32  # of a block
 
 
 @dataclass(frozen=True)
 class SpinningHead:
     """One model.
 
+    Blocks that carry one azimuth are a group: one block, or one for each bank of lasers. In dual return every block
+    is there twice, and what does not fill a group is empty.
+
     Attributes:
         name: as the maker writes it.
-        product_id: second factory byte of its data packets.
+        product_ids: second factory byte of its data packets.
         range_unit_m: metres of one unit of distance.
-        channel: (32,) laser of each place in a data block.
-        offset_ns: (32,) firing time of each place after the block's time.
-        block_ns: from the time of one block's azimuth to the next one's.
+        channel: (places,) laser of each place in a group.
+        offset_ns: (places,) firing time of each place after the group's first.
+        group_ns: from the time of one group's azimuth to the next one's.
         beams: design values of its lasers.
+        stamp_ns: the first firing's time less the packet's stamp.
+        block_flags: what the blocks of a group begin with.
     """
 
     name: str
-    product_id: int
+    product_ids: tuple[int, ...]
     range_unit_m: float
     channel: NDArray[np.uint16]
     offset_ns: NDArray[np.int64]
-    block_ns: int
+    group_ns: int
     beams: BeamTable
+    stamp_ns: int = 0
+    block_flags: tuple[int, ...] = (0xEEFF,)  # FF EE on the wire
+
+    def groups(self, *, dual: bool) -> int:
+        """How many groups a packet holds."""
+        return BLOCKS // (len(self.block_flags) * (2 if dual else 1))
+
+    def used_block_flags(self, *, dual: bool) -> NDArray[np.uint16]:
+        """What the blocks of a packet begin with, as many as are used."""
+        group = np.repeat(np.array(self.block_flags, dtype=np.uint16), 2 if dual else 1)
+        return np.tile(group, self.groups(dual=dual))
 
 
-_PLACES = np.arange(32)
+_PLACES = np.arange(PLACES)
 
 # VLP-16 User Manual 63-9243 rev. D: distances in 2 mm (9.3.1.3); vertical angles and vertical corrections by laser id
 # (table 9-1); 16 lasers 2.304 µs apart, then 18.43 µs of recharge, a sequence each 55.296 µs, two sequences in a data
 # block (9.4, figure 9-9); product id 0x22 (table 9-2).
 VLP16 = SpinningHead(
     name="VLP-16",
-    product_id=0x22,
+    product_ids=(0x22,),
     range_unit_m=0.002,
     channel=(_PLACES % 16).astype(np.uint16),
     offset_ns=(_PLACES // 16) * 55_296 + (_PLACES % 16) * 2_304,
-    block_ns=2 * 55_296,
+    group_ns=2 * 55_296,
     beams=beam_table(
         [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15],
         up_m=1e-3
         * np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]),
     ),
+)
+
+
+def _focal_beams(focal_m: float, elevation_deg: list[float], azimuth_deg: list[float]) -> BeamTable:
+    """Beams that cross in one point so far from the spin axis: they leave the axis at other heights.
+
+    The focal distances are those velodyne-decoder 3.1.0 takes from the maker's envelope drawings (calib_db.cpp); the
+    VLP-16 manual's vertical corrections follow from its 41.91 mm.
+    """
+    height_m = -focal_m * np.tan(np.radians(elevation_deg))
+    return beam_table(elevation_deg, azimuth_deg=azimuth_deg, up_m=height_m)
+
+
+# VLP-32C User Manual 63-9325 rev. C: distances in 4 mm; 16 pairs of lasers 2.304 µs apart, a sequence each 55.296 µs
+# and in each data block (9.4); vertical angles and azimuth offsets (tables 9-2 and 9-6, with the signs of 9.5: those
+# of the maker's XML and of nebula's calib_VLP32.yaml are opposite); product id 0x28 (VLP-16 manual, table 9-2).
+_VLP32C_ELEVATION_DEG = """
+-25 -1 -1.667 -15.639 -11.31 0 -0.667 -8.843 -7.254 0.333 -0.333 -6.148 -5.333 1.333 0.667 -4
+-4.667 1.667 1 -3.667 -3.333 3.333 2.333 -2.667 -3 7 4.667 -2.333 -2 15 10.333 -1.333
+"""
+_VLP32C_AZIMUTH_DEG = """
+1.4 -4.2 1.4 -1.4 1.4 -1.4 4.2 -1.4 1.4 -4.2 1.4 -1.4 4.2 -1.4 4.2 -1.4
+1.4 -4.2 1.4 -4.2 4.2 -1.4 1.4 -1.4 1.4 -1.4 1.4 -4.2 4.2 -1.4 1.4 -1.4
+"""
+VLP32C = SpinningHead(
+    name="VLP-32C",
+    product_ids=(0x28,),
+    range_unit_m=0.004,
+    channel=_PLACES.astype(np.uint16),
+    offset_ns=(_PLACES // 2) * 2_304,
+    group_ns=55_296,
+    beams=_focal_beams(0.0424, numbers(_VLP32C_ELEVATION_DEG), numbers(_VLP32C_AZIMUTH_DEG)),
 )
