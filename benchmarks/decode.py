@@ -32,7 +32,7 @@ from drivers.scanner.hesai_heads import QT64, XT32
 from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
-from drivers.scanner.velodyne_heads import VLP16, VLP32C
+from drivers.scanner.velodyne_heads import VLP16, VLP32C, VLS128
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
@@ -189,14 +189,24 @@ def as_dual(units: ByteRows) -> ByteRows:
     return dual
 
 
+def as_vls128(units: ByteRows) -> ByteRows:
+    """VLP-32C packets as a VLS-128's: four blocks a sequence with one azimuth."""
+    other = units.copy()
+    packets = other.view(PACKET_DTYPE)[:, 0]
+    packets["product"], packets["blocks"]["flag"] = VLS128.product_ids[0], VLS128.used_block_flags(dual=False)
+    packets["blocks"]["azimuth"] = np.repeat(packets["blocks"]["azimuth"][:, ::4], 4, axis=1)
+    return other
+
+
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
-    """VLP-16 in both return modes and VLP-32C, real packets; the VLP-32C's as dual ones too."""
+    """VLP-16 in both return modes and VLP-32C, real packets; the VLP-32C's as dual ones and as a VLS-128's too."""
     vlp32c = velodyne_units("nebula_vlp32.pcap.gz", 663.552)
     for name, head, units in (
         ("VLP-16, strongest return", VLP16, velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)),
         ("VLP-16, dual return", VLP16, velodyne_units("nebula_vlp16.pcap.gz", 663.552)),
         ("VLP-32C, strongest return", VLP32C, vlp32c),
         ("VLP-32C, dual return", VLP32C, with_stamps(as_dual(vlp32c), 331.776)),
+        ("VLS-128, strongest return", VLS128, with_stamps(as_vls128(vlp32c), 159.9)),
     ):
         settings = DeviceSettings("scanner/bench")
         yield head_figure(name, lambda h=head, s=settings: VelodyneParser(s, h), units, 10e6, repeats)  # type: ignore[misc]

@@ -102,3 +102,33 @@ VLP32C = SpinningHead(
     group_ns=55_296,
     beams=_focal_beams(0.0424, numbers(_VLP32C_ELEVATION_DEG), numbers(_VLP32C_AZIMUTH_DEG)),
 )
+
+# VLS-128 User Manual 63-9483 rev. A: distances in 4 mm (9.3.1.3); four banks of 32 lasers, a block each, FF EE, FF DD,
+# FF CC, FF BB on the wire; in dual return one sequence in eight blocks and four empty ones (p. 57). Groups of eight
+# lasers fire 2.665 µs apart, a group's time is left out after eight groups, three at the end: 53.3 µs; the stamp is
+# adjusted by 8.7 µs (9.4). Vertical angles and azimuth offsets as in ros-drivers/velodyne's VLS128.yaml and
+# velodyne-decoder's calib_db.cpp, with the manual's sign. Product id 0xA1 on the wire (ros-drivers/velodyne, 161);
+# 0x63 in table 9-2 of the VLP-16 manual.
+_VLS128_ELEVATION_DEG = """
+-11.742 -1.99 3.4 -5.29 -0.78 4.61 -4.08 1.31 -6.5 -1.11 4.28 -4.41 0.1 6.48 -3.2 2.19
+-3.86 1.53 -9.244 -1.77 2.74 -5.95 -0.56 4.83 -2.98 2.41 -6.28 -0.89 3.62 -5.07 0.32 7.58
+-0.34 5.18 -3.64 1.75 -25 -2.43 2.96 -5.73 0.54 9.7 -2.76 2.63 -7.65 -1.55 3.84 -4.85
+3.18 -5.51 -0.12 5.73 -4.3 1.09 -16.042 -2.21 4.06 -4.63 0.76 15 -3.42 1.97 -6.85 -1.33
+-5.62 -0.23 5.43 -3.53 0.98 -19.582 -2.32 3.07 -4.74 0.65 11.75 -2.65 1.86 -7.15 -1.44 3.95
+-2.1 3.29 -5.4 -0.01 4.5 -4.19 1.2 -13.565 -1.22 4.17 -4.52 0.87 6.08 -3.31 2.08 -6.65
+1.42 -10.346 -1.88 3.51 -6.06 -0.67 4.72 -3.97 2.3 -6.39 -1 4.39 -5.18 0.21 6.98 -3.09
+4.98 -3.75 1.64 -8.352 -2.54 2.85 -5.84 -0.45 8.43 -2.87 2.52 -6.17 -1.66 3.73 -4.96 0.43
+"""
+_VLS128_AZIMUTH_DEG = 16 * [6.354, 4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354]
+_FIRING_GROUP = np.arange(128) // 8
+VLS128 = SpinningHead(
+    name="VLS-128",
+    product_ids=(0xA1, 0x63),
+    range_unit_m=0.004,
+    channel=np.arange(128, dtype=np.uint16),
+    offset_ns=(_FIRING_GROUP + _FIRING_GROUP // 8) * 2_665,
+    group_ns=53_300,
+    beams=_focal_beams(0.05863, numbers(_VLS128_ELEVATION_DEG), _VLS128_AZIMUTH_DEG),
+    stamp_ns=-8_700,
+    block_flags=(0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF),
+)

@@ -14,7 +14,7 @@ from drivers.core.registry import find_driver
 from drivers.scanner.beams import beam_points
 from drivers.scanner.velodyne import MODE_DUAL, MODE_LAST, MODE_STRONGEST, VelodyneParser, encode_data_packet
 from drivers.scanner.velodyne_calibration import read_calibration
-from drivers.scanner.velodyne_heads import BLOCKS, PLACES, VLP16, VLP32C, SpinningHead
+from drivers.scanner.velodyne_heads import BLOCKS, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import encode_position_packet
 from georef.records import (
     RETURN_DTYPE,
@@ -32,7 +32,7 @@ from tests.drivers.spinning import feed, payloads, read_pcd, returns_of, ros_poi
 
 VLP32C_CAPTURE = "velodyne/nebula_vlp32.pcap.gz"
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
-HEADS = {"velodyne-vlp16": VLP16, "velodyne-vlp32c": VLP32C}
+HEADS = {"velodyne-vlp16": VLP16, "velodyne-vlp32c": VLP32C, "velodyne-vls128": VLS128}
 EVERY_HEAD = pytest.mark.parametrize("head", HEADS.values(), ids=HEADS.keys())
 
 
@@ -155,6 +155,94 @@ def test_vlp32c_precision_azimuth_of_the_manual() -> None:
     flat = 20.0 * np.cos(np.radians(2.0))
     height = -20.0 * np.sin(np.radians(2.0)) + 0.0424 * np.tan(np.radians(2.0))
     np.testing.assert_allclose(point, [flat * np.sin(azimuth), flat * np.cos(azimuth), height], atol=1e-9)
+
+
+def test_vls128_firing_times_of_the_manual() -> None:
+    """VLS-128 manual 9.4: groups of eight each 2.665 µs, one left out after the eighth, sequences 53.3 µs, −8.7 µs."""
+    times = decode(packet(VLS128), VLS128)["device_time_ns"].reshape(3, 128) - 2_000_000
+    for sequence, laser, want_us in (
+        (0, 0, -8.7),
+        (0, 7, -8.7),
+        (0, 8, -6.035),
+        (0, 24, -0.705),
+        (0, 63, 9.955),
+        (0, 64, 15.285),
+        (0, 127, 33.94),
+        (1, 0, 44.6),
+        (2, 127, 140.54),
+    ):
+        assert times[sequence, laser] == round(1000 * want_us)
+    times = decode(packet(VLS128, MODE_DUAL), VLS128)["device_time_ns"] - 2_000_000
+    assert len(times) == 128
+    assert times[127] == 33_940
+    early = decode(packet(VLS128, stamp_us=5), VLS128)["device_time_ns"]
+    assert early[0] == 3_600_000_000_000 - 3_700
+
+
+def test_vls128_packet_as_the_manual_draws_it() -> None:
+    """Four blocks a sequence, a bank each; in dual return each bank's last and strongest, then four empty blocks."""
+    single, dual = packet(VLS128), packet(VLS128, MODE_DUAL)
+    assert [single[at : at + 2].hex() for at in range(0, 1200, 100)] == 3 * ["ffee", "ffdd", "ffcc", "ffbb"]
+    pairs = ["ffee", "ffee", "ffdd", "ffdd", "ffcc", "ffcc", "ffbb", "ffbb"]
+    assert [dual[at : at + 2].hex() for at in range(0, 1200, 100)] == [*pairs, *4 * ["0000"]]
+    for at, unit in ((800, dual), (1100, dual), (1102, dual)):
+        assert len(decode(unit[:at] + b"\xff\xff" + unit[at + 2 :], VLS128)) == 128  # of an empty block
+    for at, unit, code in (
+        (100, single, "bad_block_flag"),
+        (700, dual, "bad_block_flag"),
+        (702, dual, "bad_azimuth"),
+        (1102, single, "bad_azimuth"),
+    ):
+        parser = make_parser(VLS128)
+        assert parser.feed(Chunk("scanner/left", 1, unit[:at] + b"\xff\xff" + unit[at + 2 :])) == []
+        assert parser.counters.errors == {code: 1}
+
+
+def test_vls128_design_angles() -> None:
+    """128 lasers from −25° to +15°, eight azimuth offsets (manual 9.3.1.2); laser 36 looks down most."""
+    beams = VLS128.beams
+    assert len(beams) == len(np.unique(beams.elevation_deg)) == 128
+    assert (beams.elevation_deg.min(), beams.elevation_deg.max()) == (-25.0, 15.0)
+    np.testing.assert_array_equal(np.unique(beams.azimuth_deg, return_counts=True)[1], 16)
+    assert beams.elevation_deg[36] == -25.0
+    assert beams.azimuth_deg[36] == -0.911  # VLS128.yaml: rot_correction 0.0158999… rad
+    np.testing.assert_allclose(beams.up_m[36], 0.05863 * np.tan(np.radians(25.0)))
+
+
+def test_vls128_dual_return_turns_with_the_packet_before() -> None:
+    """A dual-return packet has one azimuth: the rotation is that since the last one, also past a lost packet."""
+    number = np.array([0, 1, 2, 5, 6, 7, 8])
+    azimuth = (35_970 + 20 * number) % 36_000
+    azimuth[-2:] += 9_000  # the field of view steps on
+    units = [
+        encode_data_packet(round(1000 + 53.3 * n), np.full(12, at), np.full((12, 32), 100), 1, MODE_DUAL, VLS128)
+        for n, at in zip(number.tolist(), azimuth.tolist(), strict=True)
+    ]
+    parser = make_parser(VLS128)
+    rows = returns_of(feed(parser, units))
+    assert parser.counters.errors == {"cadence_gap": 2}
+    degrees = np.degrees(rows["encoder_rad"]).reshape(len(units), 128)
+    fraction = VLS128.offset_ns / VLS128.group_ns
+    np.testing.assert_allclose(degrees[0], 359.7, atol=1e-9)  # nothing is known before
+    want = azimuth[1:, np.newaxis] / 100 + 0.2 * fraction
+    np.testing.assert_allclose(degrees[1:], want % 360, atol=1e-9)
+
+
+def test_batches_of_every_head_may_be_cut_anywhere() -> None:
+    for head in HEADS.values():
+        random = np.random.default_rng(1)
+        units, stamp_us = [], 3_599_990_000.0
+        for at in range(90):
+            mode = MODE_DUAL if 30 <= at < 70 else MODE_STRONGEST
+            groups = head.groups(dual=mode == MODE_DUAL)
+            turned = azimuths(head, mode == MODE_DUAL, first=round(35_000 + stamp_us / 2.6) % 36_000)
+            ranges = random.integers(0, 3, (BLOCKS, PLACES)) * 700
+            if at % 17:
+                units.append(encode_data_packet(int(stamp_us) % 3_600_000_000, turned, ranges, at, mode, head))
+            stamp_us += groups * head.group_ns / 1000
+        units.insert(40, encode_position_packet(3_599_999_000, 2, ""))
+        check_packets(lambda head=head: make_parser(head), units)  # type: ignore[misc]
+        check_packet_damage(lambda head=head: make_parser(head), units[25:45], examples=15)  # type: ignore[misc]
 
 
 @EVERY_HEAD
