@@ -24,7 +24,7 @@ from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
 from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, pair_slots, returns_table
 from drivers.scanner.velodyne_calibration import read_calibration
-from drivers.scanner.velodyne_heads import BLOCKS, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -328,6 +328,7 @@ def _driver(protocol: str, head: SpinningHead) -> Driver:
 
 
 DRIVERS = (
+    _driver("velodyne-hdl32e", HDL32E),
     _driver("velodyne-vlp16", VLP16),
     _driver("velodyne-vlp32c", VLP32C),
     _driver("velodyne-vls128", VLS128),

@@ -132,3 +132,25 @@ VLS128 = SpinningHead(
     stamp_ns=-8_700,
     block_flags=(0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF),
 )
+
+# HDL-32E: distances in 2 mm (User's Manual, appendix B); 32 lasers 1.152 µs apart, a sequence each 46.08 µs and in
+# each data block, times after the stamp (application note 63-9277 rev. D, as velodyne-decoder has it); vertical angles
+# of the maker's XML (ros-drivers/velodyne, 32db.yaml); vertical corrections of the envelope drawing 86-0106 rev. B
+# (velodyne-decoder, calib_db.cpp); product id 0x21 (VLP-16 manual, table 9-2).
+_HDL32E_ELEVATION_DEG = """
+-30.67 -9.33 -29.33 -8 -28 -6.67 -26.67 -5.33 -25.33 -4 -24 -2.67 -22.67 -1.33 -21.33 0
+-20 1.33 -18.67 2.67 -17.33 4 -16 5.33 -14.67 6.67 -13.33 8 -12 9.33 -10.67 10.67
+"""
+_HDL32E_HEIGHT_MM = """
+17.17 4.76 16.27 4.07 15.4 3.38 14.54 2.7 13.71 2.02 12.89 1.35 12.09 0.67 11.31 0
+10.54 -0.67 9.78 -1.35 9.04 -2.02 8.3 -2.7 7.58 -3.38 6.86 -4.07 6.15 -4.76 5.45 -5.45
+"""
+HDL32E = SpinningHead(
+    name="HDL-32E",
+    product_ids=(0x21,),
+    range_unit_m=0.002,
+    channel=_PLACES.astype(np.uint16),
+    offset_ns=_PLACES * 1_152,
+    group_ns=46_080,
+    beams=beam_table(numbers(_HDL32E_ELEVATION_DEG), up_m=1e-3 * np.array(numbers(_HDL32E_HEIGHT_MM))),
+)

@@ -14,7 +14,7 @@ from drivers.core.registry import find_driver
 from drivers.scanner.beams import beam_points
 from drivers.scanner.velodyne import MODE_DUAL, MODE_LAST, MODE_STRONGEST, VelodyneParser, encode_data_packet
 from drivers.scanner.velodyne_calibration import read_calibration
-from drivers.scanner.velodyne_heads import BLOCKS, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import encode_position_packet
 from georef.records import (
     RETURN_DTYPE,
@@ -32,7 +32,7 @@ from tests.drivers.spinning import feed, payloads, read_pcd, returns_of, ros_poi
 
 VLP32C_CAPTURE = "velodyne/nebula_vlp32.pcap.gz"
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
-HEADS = {"velodyne-vlp16": VLP16, "velodyne-vlp32c": VLP32C, "velodyne-vls128": VLS128}
+HEADS = {"velodyne-hdl32e": HDL32E, "velodyne-vlp16": VLP16, "velodyne-vlp32c": VLP32C, "velodyne-vls128": VLS128}
 EVERY_HEAD = pytest.mark.parametrize("head", HEADS.values(), ids=HEADS.keys())
 
 
@@ -226,6 +226,25 @@ def test_vls128_dual_return_turns_with_the_packet_before() -> None:
     np.testing.assert_allclose(degrees[0], 359.7, atol=1e-9)  # nothing is known before
     want = azimuth[1:, np.newaxis] / 100 + 0.2 * fraction
     np.testing.assert_allclose(degrees[1:], want % 360, atol=1e-9)
+
+
+def test_hdl32e_firing_times_of_the_manual() -> None:
+    """HDL-32E manual, appendix E: block · 46.08 µs + laser · 1.152 µs, 542.592 µs from the first firing to the last."""
+    times = decode(packet(HDL32E), HDL32E)["device_time_ns"].reshape(12, 32) - 2_000_000
+    for block, laser, want_us in ((0, 0, 0.0), (0, 1, 1.152), (0, 31, 35.712), (1, 0, 46.08), (11, 31, 542.592)):
+        assert times[block, laser] == round(1000 * want_us)
+    times = decode(packet(HDL32E, MODE_DUAL), HDL32E)["device_time_ns"].reshape(6, 32) - 2_000_000
+    assert times[5, 31] == round(1000 * (5 * 46.08 + 35.712))
+
+
+def test_hdl32e_lasers_in_firing_order() -> None:
+    """HDL-32E manual, laser firing sequence: the lowest first, then both banks of 16 in turn, 4/3° apart."""
+    elevation = HDL32E.beams.elevation_deg
+    np.testing.assert_allclose(elevation[0::2], -92 / 3 + 4 / 3 * np.arange(16), atol=0.01)
+    np.testing.assert_allclose(elevation[1::2], -28 / 3 + 4 / 3 * np.arange(16), atol=0.01)
+    assert elevation[15] == 0.0  # DSR 15
+    np.testing.assert_allclose(HDL32E.beams.up_m, -0.02883 * np.tan(np.radians(elevation)), atol=1e-4)
+    assert not HDL32E.beams.azimuth_deg.any()
 
 
 def test_batches_of_every_head_may_be_cut_anywhere() -> None:
