@@ -7,8 +7,6 @@ pandarQT.h) for the tables of firing times and design angles.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 
@@ -153,14 +151,16 @@ def read_angle_file(data: bytes, head: HesaiHead) -> BeamTable:
         DriverSettingsError: it is none, or not this model's.
     """
     found: dict[int, tuple[float, float]] = {}
-    for line, row in enumerate(csv.reader(io.StringIO(data.decode("utf-8-sig", "replace"))), start=1):
-        if line == 1 or not any(cell.strip() for cell in row):
-            continue  # the first line names the columns
+    below_names = data.decode("utf-8-sig", "replace").splitlines()[1:]
+    for line, text in enumerate(below_names, start=2):
+        row = text.split(",")
+        if not text.strip(", \t"):
+            continue
         try:
             channel, elevation, azimuth = int(row[0]), float(row[1]), float(row[2])
         except (ValueError, IndexError):
             raise DriverSettingsError(
-                f"geometry.file: line {line} is {','.join(row)[:40]!r}, want channel, elevation, azimuth in degrees"
+                f"geometry.file: line {line} is {text[:40]!r}, want channel, elevation, azimuth in degrees"
             ) from None
         if not (math.isfinite(azimuth) and abs(azimuth) <= 360 and abs(elevation) <= 90):
             raise DriverSettingsError(

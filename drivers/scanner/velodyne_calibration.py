@@ -37,7 +37,7 @@ def read_calibration(data: bytes, head: SpinningHead) -> BeamTable:
     """
     try:
         resolution_m, lasers = _read_xml(data) if data.lstrip()[:1] == b"<" else _read_yaml(data)
-    except (ValueError, TypeError, KeyError, RecursionError, ElementTree.ParseError) as error:
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError, ElementTree.ParseError) as error:
         text = (str(error).splitlines() or [type(error).__name__])[0]
         raise DriverSettingsError(f"geometry.file: no db.xml nor YAML of a Velodyne head: {text}") from error
     if resolution_m is not None and not math.isclose(resolution_m, head.range_unit_m, rel_tol=1e-3):

@@ -41,9 +41,11 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
+from georef.timescales import DeviceClock
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.spinning import are_near, clock_of, feed, payloads, read_pcd, returns_of
+from tests.georef.test_timescales_device import START_S, host_clock, host_ns
 
 XYZ = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
 NOON = dt.datetime(2026, 11, 21, 12, 0, 0, 250_000, tzinfo=dt.UTC)
@@ -393,6 +395,30 @@ def test_lock_makes_the_second_a_latch() -> None:
     rows = returns_of(records)
     flagged = (rows["flags"] & RETURN_FLAG_PPS_LOCKED) != 0
     np.testing.assert_array_equal(flagged, rows["host_time_ns"] == 2_000_000)
+
+
+def test_a_locked_head_is_placed_by_its_latches() -> None:
+    """Through `DeviceClock`: to its microseconds while locked, whatever the delay; by arrival while it is not."""
+    parser = find_driver("scanner", "hesai-xt32").make_time_parser
+    assert parser is not None
+    random, host = np.random.default_rng(3), host_clock(70)
+    for locked in (True, False):
+        head, clock = parser(DeviceSettings("scanner/left")), DeviceClock(host)
+        for tenth in range(51, 601):
+            time = dt.datetime(2026, 11, 21, 12, 0, 0, 123_000, tzinfo=dt.UTC) + dt.timedelta(seconds=tenth / 10)
+            arrival = int(host_ns(tenth / 10 + 0.123 + 0.02 * random.random()))
+            units = [encode_gps_packet(time.replace(microsecond=20), locked=locked)] if tenth % 10 == 1 else []
+            for unit in [*units, packet(time=time, sequence=tenth)]:
+                for record in head.feed(Chunk("scanner/left", arrival, unit)):
+                    if isinstance(record, DeviceClockSamples):
+                        clock.add(record.rows)
+        true_s = np.arange(10.0, 55.0, 0.37)
+        device = NOON_NS - 250_000_000 + np.rint(true_s * 1e9).astype(np.int64)
+        gps, sigma = clock.gps_from_device(device)
+        error_ns = gps - START_S * 10**9 - np.rint(true_s * 1e9)
+        assert clock.status().latched is locked
+        assert np.abs(error_ns).max() < (300 if locked else 20e6)
+        assert (sigma < 1e5).all() == locked
 
 
 @pytest.mark.parametrize(
