@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +21,7 @@ from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.hesai_gps import GPS_BYTES, NS, GpsReader
 from drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, pair_slots, returns_table
+from drivers.scanner.spinning import Firings, returns_of_packets
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -196,7 +194,11 @@ class HesaiParser(PacketParser):
         clock = self._clock_samples(host_time_ns[chosen], stamp_ns[chosen], second_ns[chosen], packets["mode"][chosen])
         records: list[Record] = [DeviceClockSamples(clock)] if len(clock) else []
         if self._thinner is None:
-            rows = self._returns(host_time_ns, packets, stamp_ns, number)
+            rows = returns_of_packets(
+                packets["mode"],
+                self._head.blocks * self._head.channels,
+                lambda part: self._firings(host_time_ns[part], packets[part], stamp_ns[part], number[part]),
+            )
             if len(rows):
                 records.append(ScannerReturns(rows))
         return records
@@ -218,67 +220,24 @@ class HesaiParser(PacketParser):
         rows["locked"] = self._gps.locked
         return rows
 
-    def _returns(
+    def _firings(
         self, host_time_ns: Int64Array, packets: StructArray, stamp_ns: Int64Array, number: Int64Array
-    ) -> StructArray:
-        """Returns of all packets in order, in blocks of one return mode."""
-        mode = packets["mode"]
-        places = self._head.blocks * self._head.channels
-        edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(packets)]
-        step = BLOCK_SLOTS // places
-        table = returns_table(len(packets) * places)
-        filled = 0
-        for start, stop in pairwise(edges):
-            for at in range(start, stop, step):
-                part = slice(at, min(at + step, stop))
-                block = self._block(host_time_ns[part], packets[part], stamp_ns[part], number[part])
-                filled += block.fill(table[filled:])
-        return table[:filled]
-
-    def _block(
-        self, host_time_ns: Int64Array, packets: StructArray, stamp_ns: Int64Array, number: Int64Array
-    ) -> ReturnSlots:
-        """The slots of packets of one return mode."""
+    ) -> Firings:
+        """The firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
-        locked = RETURN_FLAG_PPS_LOCKED if self._gps.locked == 1 else 0
-        blocks = packets["blocks"]
-        range_raw, reflectivity = blocks["returns"]["range"], blocks["returns"]["reflectivity"]
-        per_slot: dict[str, NDArray[Any]] = {}
-        flags: dict[str, NDArray[Any] | int] = {}
-        azimuth = blocks["azimuth"]
-        if mode in DUAL_NAMES:
-            azimuth = azimuth[:, ::2]
-            names_strongest, names_last = DUAL_NAMES[mode]
-            range_raw, reflectivity, of_pair = pair_slots(
-                (range_raw[:, ::2].reshape(-1), range_raw[:, 1::2].reshape(-1)),
-                (reflectivity[:, ::2].reshape(-1), reflectivity[:, 1::2].reshape(-1)),
-                names_strongest=names_strongest,
-                names_last=names_last,
-            )
-            per_slot["flags"] = of_pair | np.uint8(locked)
-        else:
-            range_raw, reflectivity = range_raw.reshape(-1, 1), reflectivity.reshape(-1, 1)
-            flags["flags"] = locked | SINGLE_FLAGS[mode]
-        rounds = azimuth.shape[1]
-        shape = (len(packets), rounds * head.channels)
-        firing_ns = (head.round_start_ns(rounds)[:, np.newaxis] + head.offset_ns).reshape(-1)
-        serial = number[:, np.newaxis] * (head.blocks * head.channels) + np.arange(shape[1])
-        channel = np.arange(head.channels, dtype=np.uint16)
-        return ReturnSlots(
-            range_raw=range_raw,
+        azimuth = packets["blocks"]["azimuth"][:, :: 2 if mode in DUAL_NAMES else 1]
+        firing_ns = (head.round_start_ns(azimuth.shape[1])[:, np.newaxis] + head.offset_ns).reshape(-1)
+        return Firings(
+            returns=packets["blocks"]["returns"],
             range_unit_m=DISTANCE_UNIT_MM * 1e-3,
-            intensity=reflectivity,
-            per_slot=per_slot,
-            per_pulse={
-                "host_time_ns": np.broadcast_to(host_time_ns[:, np.newaxis], shape).reshape(-1),
-                "device_time_ns": (stamp_ns[:, np.newaxis] + firing_ns).reshape(-1),
-                "encoder_rad": _azimuths(azimuth, packets["motor_rpm"], head).reshape(-1),
-                "pulse_id": serial.reshape(-1),
-                "channel": np.broadcast_to(channel, (len(packets) * rounds, head.channels)).reshape(-1),
-                "pulse_width_ns": 0,
-                "mta_zone": 0,
-                **flags,
-            },
+            host_time_ns=host_time_ns,
+            number=number,
+            most=head.blocks * head.channels,
+            device_time_ns=stamp_ns[:, np.newaxis] + firing_ns,
+            azimuth_rad=_azimuths(azimuth, packets["motor_rpm"], head),
+            channel=np.arange(head.channels, dtype=np.uint16),
+            flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._gps.locked == 1 else 0),
+            pair=DUAL_NAMES.get(mode),
         )
 
 

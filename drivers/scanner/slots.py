@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
+from georef.records import RETURN_DTYPE, StructArray
 
 BLOCK_SLOTS = 32768  # slots worked on at once, so that the temporaries stay in the processor's second-level cache
 
@@ -76,36 +76,3 @@ class ReturnSlots:
 def returns_table(slots: int) -> StructArray:
     """A `RETURN_DTYPE` table for at most so many returns; what is not written to takes no memory."""
     return np.empty(slots, dtype=RETURN_DTYPE)
-
-
-def pair_slots(
-    range_raw: tuple[NDArray[np.uint16], NDArray[np.uint16]],
-    intensity: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-    *,
-    names_strongest: bool = True,
-    names_last: bool = True,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Dual returns of a spinning head, a block each, as slots (pulses, 2): range, intensity and flags.
-
-    Equal ranges are one return, the only one: strongest and last. Of two the nearer comes first. Where the pair holds
-    the last return it is the farther; where it holds the strongest, that is the one of greater intensity (the second
-    block's where they are equal), since a head puts the second strongest beside a strongest that is also the other.
-
-    Args:
-        range_raw, intensity: of the first and of the second block, each (pulses,), 0 = no return.
-        names_strongest: one of the two is the strongest return.
-        names_last: one of the two is the last return.
-    """
-    (one, other), (one_light, other_light) = range_raw, intensity
-    other_is_far = other > one
-    near, far = np.minimum(one, other), np.maximum(one, other)
-    near_light = np.where(other_is_far, one_light, other_light)
-    far_light = np.where(other_is_far, other_light, one_light)
-    two = (near > 0) & (near != far)
-    near_strongest = (near_light > far_light) | ((near_light == far_light) & ~other_is_far)
-    alone = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
-    strongest, last = np.uint8(RETURN_FLAG_STRONGEST * names_strongest), np.uint8(RETURN_FLAG_LAST * names_last)
-    range_slots = np.stack([np.where(two, near, far), np.where(two, far, 0)], axis=1)
-    light_slots = np.stack([np.where(two, near_light, far_light), far_light], axis=1)
-    flags = np.stack([np.where(two, near_strongest * strongest, alone), last + ~near_strongest * strongest], axis=1)
-    return range_slots, light_slots, flags.astype(np.uint8, copy=False)

@@ -13,8 +13,6 @@ not say which case it is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
 from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, pair_slots, returns_table
+from drivers.scanner.spinning import Firings, returns_of_packets
 from drivers.scanner.velodyne_calibration import read_calibration
 from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
@@ -44,6 +42,7 @@ from georef.records import (
 DATA_BYTES = 1206
 MODE_STRONGEST, MODE_LAST, MODE_DUAL = 0x37, 0x38, 0x39  # first factory byte, table 9-2
 RETURN_MODES = (MODE_STRONGEST, MODE_LAST, MODE_DUAL)
+SINGLE_FLAGS = {MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
 FULL_CIRCLE = 36_000  # azimuth in 0.01°, 9.3.1.4
 MAX_GAP = 200  # 0.01° between groups: 20 rev/s make 79.6; more is a step of the field of view, not rotation
 HOUR_NS = 3_600_000_000_000
@@ -138,7 +137,12 @@ class VelodyneParser(PacketParser):
             clock = clock[self._thinner.choose(host_time_ns)]
         records: list[Record] = [DeviceClockSamples(clock)] if len(clock) else []
         if self._thinner is None:
-            rows = self._returns(host_time_ns, packets, turn)
+            number = self._packets + np.arange(len(packets), dtype=np.int64)
+            rows = returns_of_packets(
+                packets["mode"],
+                BLOCKS * PLACES,
+                lambda part: self._firings(host_time_ns[part], packets[part], turn[part], number[part]),
+            )
             if len(rows):
                 records.append(ScannerReturns(rows))
         self._packets += len(packets)
@@ -211,57 +215,23 @@ class VelodyneParser(PacketParser):
         self._last_azimuth, self._last_turn = int(azimuth[-1]), float(turn[-1])
         return turn
 
-    def _returns(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray) -> StructArray:
-        """Returns of all packets in order, in blocks of one return mode."""
-        mode = packets["mode"]
-        edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(packets)]
-        step = BLOCK_SLOTS // (BLOCKS * PLACES)
-        table = returns_table(len(packets) * BLOCKS * PLACES)
-        filled = 0
-        for start, stop in pairwise(edges):
-            for at in range(start, stop, step):
-                part = slice(at, min(at + step, stop))
-                block = self._block(host_time_ns[part], packets[part], turn[part], self._packets + at)
-                filled += block.fill(table[filled:])
-        return table[:filled]
-
-    def _block(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray, number: int) -> ReturnSlots:
-        """The slots of packets of one return mode, the first of which is the parser's ``number``-th."""
+    def _firings(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray, number: Int64Array) -> Firings:
+        """The firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
-        locked = RETURN_FLAG_PPS_LOCKED if self._position.locked == 1 else 0
-        per_slot: dict[str, NDArray[Any]] = {}
-        flags: dict[str, NDArray[Any] | int] = {}
         dual = mode == MODE_DUAL
         used, groups = len(self._flags[dual]), head.groups(dual=dual)
-        returns = packets["blocks"]["returns"][:, :used]
         azimuth = packets["blocks"]["azimuth"][:, : used : used // groups]
-        if dual:
-            range_raw, reflectivity, of_pair = pair_slots(
-                (returns["range"][:, ::2].reshape(-1), returns["range"][:, 1::2].reshape(-1)),
-                (returns["reflectivity"][:, ::2].reshape(-1), returns["reflectivity"][:, 1::2].reshape(-1)),
-            )
-            per_slot["flags"] = of_pair | np.uint8(locked)
-        else:
-            range_raw, reflectivity = returns["range"].reshape(-1, 1), returns["reflectivity"].reshape(-1, 1)
-            flags["flags"] = locked | (RETURN_FLAG_STRONGEST if mode == MODE_STRONGEST else RETURN_FLAG_LAST)
-        places = len(head.channel)
-        shape = (len(packets), groups * places)
-        serial = (number + np.arange(len(packets)))[:, np.newaxis] * (BLOCKS * PLACES) + np.arange(shape[1])
-        return ReturnSlots(
-            range_raw=range_raw,
+        return Firings(
+            returns=packets["blocks"]["returns"][:, :used],
             range_unit_m=head.range_unit_m,
-            intensity=reflectivity,
-            per_slot=per_slot,
-            per_pulse={
-                "host_time_ns": np.broadcast_to(host_time_ns[:, np.newaxis], shape).reshape(-1),
-                "device_time_ns": _firing_times(packets["stamp_us"], head, groups).reshape(-1),
-                "encoder_rad": _firing_azimuths(azimuth, turn, head).reshape(-1),
-                "pulse_id": serial.reshape(-1),
-                "channel": np.broadcast_to(head.channel, (len(packets) * groups, places)).reshape(-1),
-                "pulse_width_ns": 0,
-                "mta_zone": 0,
-                **flags,
-            },
+            host_time_ns=host_time_ns,
+            number=number,
+            most=BLOCKS * PLACES,
+            device_time_ns=_firing_times(packets["stamp_us"], head, groups),
+            azimuth_rad=_firing_azimuths(azimuth, turn, head),
+            channel=head.channel,
+            flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._position.locked == 1 else 0),
+            pair=(True, True) if dual else None,
         )
 
 
