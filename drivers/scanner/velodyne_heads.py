@@ -75,8 +75,8 @@ VLP16 = SpinningHead(
 def _focal_beams(focal_m: float, elevation_deg: list[float], azimuth_deg: list[float]) -> BeamTable:
     """Beams that cross in one point so far from the spin axis: they leave the axis at other heights.
 
-    The focal distances are those velodyne-decoder 3.1.0 takes from the maker's envelope drawings (calib_db.cpp); the
-    VLP-16 manual's vertical corrections follow from its 41.91 mm.
+    The focal distances are velodyne-decoder 3.1.0's (calib_db.cpp, which cites the maker's envelope drawings of other
+    models); the VLP-16 manual's vertical corrections follow from its 41.91 mm.
     """
     height_m = -focal_m * np.tan(np.radians(elevation_deg))
     return beam_table(elevation_deg, azimuth_deg=azimuth_deg, up_m=height_m)
