@@ -286,7 +286,7 @@ def _answer_problems(reading: Reading) -> list[str]:
     """What is wrong with what came."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
-    other = not_understood(entry, heard, good, reading.kept)
+    other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
     if other is not None:
         return [other]
     found: list[str] = []

@@ -127,7 +127,9 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     return best
 
 
-def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch]) -> str | None:
+def not_understood(
+    entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch], *, refused: int = 0
+) -> str | None:
     """What a device is instead of what it was configured as, or that nothing of it is known; None: it is understood.
 
     Args:
@@ -135,8 +137,10 @@ def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[C
         heard: what the configured parser made of its bytes.
         messages: how many the configured parser found in them.
         kept: the bytes, or the first of them.
+        refused: messages it could make nothing of. More than good ones: a head's second port may say the same in
+            another model, while its own port is not understood.
     """
-    if messages and heard.counts:
+    if messages and heard.counts and refused <= messages:
         return None
     other = identify(entry, kept, than=messages)
     if other is not None:

@@ -6,6 +6,7 @@ docs/configuration.md prints.
 
 from __future__ import annotations
 
+import datetime as dt
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -73,6 +74,10 @@ class GnssConfig(Section):
     lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre x_a^b")
     secondary_lever_arm_m: Vector | None = Field(None, description="second antenna, for dual-antenna heading")
     leap_seconds: int = Field(18, ge=0, le=60, description="GPS − UTC, only used until the receiver says, for NMEA")
+    date_floor: dt.date | None = Field(
+        None,
+        description="oldest date believed, for week numbers of ten bits; absent: 2009-01-01",
+    )
     datum: str | None = Field(
         None,
         min_length=1,
@@ -156,7 +161,7 @@ class GeometryConfig(Section):
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
     file: Text | None = Field(
-        None, description="the device's own table (ouster: its metadata, JSON), relative to this file"
+        None, description="the device's own table (beam angles; ouster: its metadata, JSON), relative to this file"
     )
 
     @model_validator(mode="after")

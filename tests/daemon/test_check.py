@@ -282,6 +282,33 @@ class TestSomethingElse:
         entry = DeviceEntry("imu", "main", spec, None, "nmea2000", None, DeviceSettings("imu/main"), {})
         assert identify(entry, kept, than=0) == protocol
 
+    @pytest.mark.parametrize(
+        ("recording", "answers_as"),
+        [
+            ("velodyne/nebula_vlp32.pcap.gz", "velodyne-vlp32c"),
+            ("hesai/nebula_xt32.pcap.gz", "hesai-xt32"),
+            ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
+        ],
+    )
+    def test_a_head_of_another_model_is_named_though_its_second_port_is_alike(
+        self, recording: str, answers_as: str, tmp_path: Path
+    ) -> None:
+        """Velodyne's position packets are the same for all models: here they come while the data is another's."""
+        data, position = free_udp_port(), free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        packets = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz", port=8308)]
+        with (
+            udp_sender(data, lambda number: recorded[number % len(recorded)]),
+            udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b""),
+        ):
+            report = check(text, tmp_path, 0.5)["scanner/roof"]
+        assert report.problems == [f"answers as {answers_as}, configured as velodyne-vlp16"]
+
     def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
         with pty(lambda _: noise) as path:
