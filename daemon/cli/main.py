@@ -58,6 +58,7 @@ COMMANDS = (
     Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 
