@@ -59,6 +59,7 @@ COMMANDS = (
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
     Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
+    Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 
