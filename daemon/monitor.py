@@ -36,6 +36,7 @@ class Monitor:
         self._follower = LogFollower(directory, TAIL_S, every_part=False)
         self._part: PartFollower | None = None
         self._sources: dict[str, SourceWatch] = {}
+        self._inside: dict[str, list[str]] = {}  # devices by the stream that they lie in
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self._notes: list[str] = []
         self._reserve_bytes = 0
@@ -68,11 +69,17 @@ class Monitor:
         drivers, self._notes = stored_drivers(part.attachments) if self._decode else ({}, [])
         for source, make_parser in drivers.items():
             self._sources[source] = SourceWatch(source, Decoding(make_parser))
+        self._reserve_bytes, self._inside = 0, {}
         try:
             config = stored_config(part.attachments)
         except LogError:
-            config = None
-        self._reserve_bytes = 0 if config is None else int(config.session.reserve_mb * 1e6)
+            config = None  # another version's: the notes say so
+        if config is not None:
+            self._reserve_bytes = int(config.session.reserve_mb * 1e6)
+            for kind, name, table in config.device_tables():
+                if table.transport.startswith("gnss:"):
+                    stream = f"gnss/{table.transport.removeprefix('gnss:')}"
+                    self._inside.setdefault(stream, []).append(f"{kind}/{name}")
 
     def _take(self, batch: LogBatch) -> None:
         topic = batch.channel.topic
@@ -80,8 +87,8 @@ class Monitor:
         source = source_of_topic(topic)
         if source is not None:
             self._watch(source).add_units(batch)
-            if source.endswith("/aux"):
-                self._watch(source.removesuffix("/aux")).decode(batch)
+            for other in [source.removesuffix("/aux")] if source.endswith("/aux") else self._inside.get(source, ()):
+                self._watch(other).decode(batch)
         elif topic.startswith("/status/"):
             watch = self._watch(topic.removeprefix("/status/"))
             for time_ns, value in _objects(batch):
@@ -133,8 +140,14 @@ class Monitor:
         return found | {"sentence": _sentence(found)}
 
     def _plain_sources(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        watches = sorted(self._sources.items())
-        return {source: watch.plain(now_ns) for source, watch in watches if watch.status}
+        inside = {source: stream for stream, sources in self._inside.items() for source in sources}
+        found = {}
+        for source, watch in sorted(self._sources.items()):
+            if watch.status:
+                found[source] = watch.plain(now_ns)
+            elif source in inside:
+                found[source] = watch.plain(now_ns) | {"state": f"in {inside[source]}"}
+        return found
 
     def _room(self, bytes_per_s: float) -> dict[str, Any]:
         disk = os.statvfs(self._directory)
@@ -161,7 +174,8 @@ class Monitor:
     def _troubles(self, sources: dict[str, dict[str, Any]], room: dict[str, Any]) -> list[str]:
         troubles = []
         for source, values in sources.items():
-            words = [source_trouble(source, self._sources[source].status)]
+            status = self._sources[source].status
+            words = [source_trouble(source, status) if status else ""]
             if "decoded" in values and (told := decoded_trouble(values["decoded"])):
                 words.append(told if words[0] else f"{source} {told}")
             troubles.append(", ".join(filter(None, words)))

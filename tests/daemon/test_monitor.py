@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import os
@@ -29,9 +30,11 @@ from daemon.monitor_source import Decoding
 from drivers.core.parser import PacketParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from georef.records import ByteRows, Int64Array, Record
-from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+from tests.daemon.log_check import read_log
+from tests.daemon.rig import Recorder, disk_of, free_udp_port, session_table, wait_until
 from tests.daemon.test_check import nmea
 from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_info import CAPTURE
 from tests.daemon.test_log import INFO, write_part
 from tests.daemon.test_recorder_faults import Numbers, scanner
 from tests.daemon.wires import pty as serial_port
@@ -133,6 +136,26 @@ def test_gaps_in_a_sequence_and_damaged_messages_degrade(tmp_path: Path, logs: P
     assert "messages damaged" in troubles
 
 
+def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path) -> None:
+    """It has no units and no status of its own; what it is fed is its stream's."""
+    data = gzip.decompress(CAPTURE.read_bytes())[:200_000]
+    config = session_table(logs) + ROVER.replace("nmea", "novatel")
+    config += '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\n'
+    with (
+        serial_port(lambda number: data[number * 1500 : (number + 1) * 1500]) as path,
+        Recorder(tmp_path, config.format(path=path)) as recorder,
+    ):
+        recorder.wait_said("device_opened")
+        time.sleep(4.0)
+        _, found = once(logs)
+        assert recorder.stop() == 0
+    main = found["sources"]["imu/main"]
+    assert main["state"] == "in gnss/rover"
+    assert main["units"] == 0
+    assert main["decoded"]["messages"] > 10
+    assert not any("imu/main" in trouble for trouble in found["troubles"])
+
+
 def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + scanner(free_udp_port()) + ROVER.format(path=tmp_path / "nothing")
     with Recorder(tmp_path, config) as recorder:
@@ -161,6 +184,32 @@ def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
     code, found = once(logs)
     assert code == 2
     assert "is gone, and its log has no end" in found["sentence"]
+
+
+def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
+    """A note waits for room, a new part is refused."""
+    logs = tmp_path / "disk/logs"
+    with (
+        disk_of(tmp_path / "disk", 24) as disk,
+        Recorder(tmp_path / "rig", session_table(logs, reserve_mb=8)) as recorder,
+    ):
+        time.sleep(1.5)
+        (disk / "filler").write_bytes(bytes(18 << 20))
+        recorder.wait_said("disk_reserve")
+        code, found = once(logs)
+        note, split = swath("mark", "while it is full", str(logs)), swath("split", str(logs))
+        (disk / "filler").unlink()
+        recorder.wait_said("recording_resumed")
+        time.sleep(1.5)
+        again, _ = once(logs)
+        assert recorder.stop() == 0
+        notes = [event["text"] for event in read_log(logs).events("mark")]
+    assert (code, again) == (2, 0)
+    assert "last event: disk_reserve: " in found["sentence"]
+    assert (note.returncode, split.returncode) == (1, 1)
+    assert "the note waits for it" in note.stderr
+    assert "nothing is being recorded" in split.stderr
+    assert notes == ["while it is full"]
 
 
 def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from daemon.checksum_list import ChecksumList
 from daemon.offload import BLOCK_BYTES, OffloadReport, offload
-from tests.daemon.rig import Recorder, session_table, wait_until
+from tests.daemon.rig import Recorder, disk_of, session_table, wait_until
 from tests.daemon.test_cli import ROOT, swath
 from tests.daemon.test_log import INFO, write_part
 
@@ -222,15 +222,8 @@ def test_a_log_that_a_crash_left_open_is_copied_and_said(logs: Path, disk: Path)
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of its own, of 8 MB."""
-    if os.geteuid() != 0:
-        pytest.fail("this test mounts a tmpfs: run it as root")
-    folder = tmp_path / "small"
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "swath-test", str(folder)], check=True)
-    try:
+    with disk_of(tmp_path / "small", 8) as folder:
         yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def test_a_full_disk_is_one_line_and_the_same_command_goes_on(logs: Path, small_disk: Path) -> None:
