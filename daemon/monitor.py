@@ -42,6 +42,7 @@ class Monitor:
         self._reserve_bytes = 0
         self._damaged = 0
         self._newest_ns = 0
+        self._advanced_s = time.monotonic()  # when a newer message was seen
 
     def close(self) -> None:
         """Close the log."""
@@ -83,7 +84,8 @@ class Monitor:
 
     def _take(self, batch: LogBatch) -> None:
         topic = batch.channel.topic
-        self._newest_ns = max(self._newest_ns, int(batch.log_time_ns[-1]))
+        if (newest_ns := int(batch.log_time_ns[-1])) > self._newest_ns:
+            self._newest_ns, self._advanced_s = newest_ns, time.monotonic()
         source = source_of_topic(topic)
         if source is not None:
             self._watch(source).add_units(batch)
@@ -117,7 +119,7 @@ class Monitor:
 
     def snapshot(self) -> dict[str, Any]:
         """How things are now, as plain values: the form of ``--json``."""
-        now_ns = None if self._part is None else host_now_ns(self._part.info)
+        now_ns = None if self._part is None else self._now_ns(self._part.info)
         why_not = self._why_not_recording(now_ns)
         sources = {} if now_ns is None else self._plain_sources(now_ns)
         rate = sum(values["bytes_per_s"] or 0.0 for values in sources.values())
@@ -139,6 +141,11 @@ class Monitor:
         }
         return found | {"sentence": _sentence(found)}
 
+    def _now_ns(self, session: SessionInfo) -> int:
+        """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
+        own = session.boot_id == read_boot_id()
+        return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns if own else self._newest_ns
+
     def _plain_sources(self, now_ns: int) -> dict[str, dict[str, Any]]:
         inside = {source: stream for stream, sources in self._inside.items() for source in sources}
         found = {}
@@ -150,8 +157,11 @@ class Monitor:
         return found
 
     def _room(self, bytes_per_s: float) -> dict[str, Any]:
-        disk = os.statvfs(self._directory)
-        free = disk.f_bavail * disk.f_frsize
+        try:
+            disk = os.statvfs(self._directory)
+            free = disk.f_bavail * disk.f_frsize
+        except OSError:  # gone, as a disk that was pulled
+            free = 0
         left_s = max(0, free - self._reserve_bytes) / bytes_per_s if bytes_per_s > 0 else None
         hours = None if left_s is None else round(left_s / 3600, 2)
         return {"free_bytes": free, "reserve_bytes": self._reserve_bytes, "hours_left": hours}
@@ -164,9 +174,10 @@ class Monitor:
             return f"nothing is being recorded in {self._directory}{told}"
         if self._part is None or now_ns is None:
             return f"{sign.path.name} should grow and cannot be read (yet)"
-        if sign.path == self._part.path and not is_being_written(sign.path):
+        own = sign.boot_id == read_boot_id()  # locks of another computer need not be seen here
+        if own and sign.path == self._part.path and not is_being_written(sign.path):
             return f"the recorder of {sign.path.name} is gone, and its log has no end"
-        age_s = (now_ns - self._newest_ns) * 1e-9
+        age_s = (now_ns - self._newest_ns) * 1e-9 if own else time.monotonic() - self._advanced_s
         if self._newest_ns and age_s > STALE_S:
             return f"nothing has been written for {age_s:.0f} s"
         return None
@@ -183,13 +194,6 @@ class Monitor:
         if hours is not None and hours * 3600 < LITTLE_LEFT_S:
             troubles.append(f"room for {duration_text(hours * 3600)} only")
         return list(filter(None, troubles))
-
-
-def host_now_ns(session: SessionInfo) -> int:
-    """Host time of a session now, also after a step of the wall clock; of another computer's log the wall clock's."""
-    if session.boot_id == read_boot_id():
-        return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns
-    return time.time_ns()
 
 
 def _modified(path: Path) -> float:

@@ -134,6 +134,8 @@ def _taken(directory: Path, destination: Path) -> Iterator[None]:
         raise UserError(f"{destination}: no such directory; is the disk mounted?", ExitCode.IO)
     if destination.samefile(directory):
         raise UserError(f"{destination}: is where the logs are; give a folder on another disk", ExitCode.USAGE)
+    if not os.access(destination, os.R_OK | os.W_OK | os.X_OK):
+        raise UserError(f"{destination}: cannot be written: mounted read-only, or not permitted", ExitCode.IO)
     folder = os.open(destination, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with contextlib.suppress(OSError):  # a file system without locks has none to ask for

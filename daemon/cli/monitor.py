@@ -26,7 +26,10 @@ EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording":
 
 def command(
     where: Annotated[
-        Path, typer.Argument(metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.")
+        Path,
+        typer.Argument(
+            metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.", readable=False
+        ),
     ] = DEFAULT_CONFIG,
     once: Annotated[bool, typer.Option("--once", help="One line, and its verdict as exit code.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, or one a line without --once.")] = False,

@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 
 
 def command(
-    where: Annotated[Path, typer.Argument(metavar="DIR", help="Where the logs are, or the recorder's configuration.")],
-    destination: Annotated[Path, typer.Argument(metavar="DEST", help="A folder on another disk, which must be there.")],
+    where: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Where the logs are, or the recorder's configuration.", readable=False),
+    ],
+    destination: Annotated[
+        Path, typer.Argument(metavar="DEST", help="A folder on another disk, which must be there.", readable=False)
+    ],
     verify: Annotated[bool, typer.Option("--verify", help="Read copies that are there already once more.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:

@@ -14,7 +14,10 @@ from daemon.places import DEFAULT_CONFIG, log_directory
 
 def command(
     where: Annotated[
-        Path, typer.Argument(metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.")
+        Path,
+        typer.Argument(
+            metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.", readable=False
+        ),
     ] = DEFAULT_CONFIG,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:

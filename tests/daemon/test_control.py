@@ -20,7 +20,7 @@ import pytest
 from daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import Recorder, free_udp_port, session_table
-from tests.daemon.test_cli import swath
+from tests.daemon.test_cli import ROOT, swath
 from tests.daemon.test_recorder_faults import Numbers, scanner
 
 NOBODY = 65534
@@ -28,6 +28,12 @@ CONNECT_AS = """
 import os, socket, sys
 os.setgroups([]); os.setgid(int(sys.argv[2])); os.setuid(int(sys.argv[2]))
 print(socket.socket(socket.AF_UNIX).connect_ex(sys.argv[1]))
+"""
+RUN_AS = """
+import os, sys
+import daemon.cli.main, daemon.config, daemon.control_client, daemon.monitor, daemon.offload, rich.live, rich.progress
+os.setgroups([]); os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))
+sys.exit(daemon.cli.main.run_app(sys.argv[2:]))
 """
 
 
@@ -154,6 +160,19 @@ def test_only_its_owner_can_connect(tmp_path: Path, open_folder: Path) -> None:
         assert recorder.stop() == 0
 
 
+@pytest.mark.parametrize("words", [("mark", "x"), ("split",), ("monitor", "--once"), ("offload",)])
+def test_who_may_not_look_is_told_so(tmp_path: Path, open_folder: Path, words: tuple[str, ...]) -> None:
+    """Not that nothing is recorded there."""
+    logs = open_folder / "logs"
+    logs.mkdir(mode=0o750)
+    arguments = [*words, str(logs), *([str(open_folder)] if words[0] == "offload" else [])]
+    command = [sys.executable, "-c", RUN_AS, str(NOBODY), *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr.startswith(f"swath: {logs}: not permitted; ")
+    assert done.stderr.count("\n") == 1
+
+
 def test_the_unit_names_the_runtime_directory_and_the_log_directory_leads_there(
     tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,7 +186,7 @@ def test_the_unit_names_the_runtime_directory_and_the_log_directory_leads_there(
         assert recorder.stop() == 0
     assert list(runtime.iterdir()) == []
     assert not (logs / ".swath.control").is_symlink()
-    assert "RuntimeDirectory=swath" in Path("systemd/swathd.service").read_text().splitlines()
+    assert "RuntimeDirectory=swath" in (ROOT / "systemd/swathd.service").read_text().splitlines()
 
 
 def test_a_stale_socket_is_replaced(tmp_path: Path, logs: Path) -> None:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -222,6 +223,45 @@ def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path)
         assert recorder.stop() == 0
     assert code == 2
     assert "nothing has been written for" in found["sentence"]
+
+
+def test_the_log_of_another_computer_is_judged_by_its_growth(
+    tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As over a network: its clocks are others, its locks are not seen."""
+    monkeypatch.setenv("SWATH_BOOT_ID", str(uuid.UUID(int=7)))
+    port = free_udp_port()
+    with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 100.0):
+        monkeypatch.delenv("SWATH_BOOT_ID")
+        recorder.wait_said("device_opened")
+        time.sleep(2.5)
+        monitor = Monitor(logs)
+        monitor.poll()
+        found = monitor.snapshot()
+        assert found["verdict"] == "recording"
+        assert found["sources"]["scanner/left"]["age_s"] < 1.0
+        recorder.kill()
+        time.sleep(5.5)
+        monitor.poll()
+        time.sleep(0.1)
+    found = monitor.snapshot()
+    monitor.close()
+    assert (found["verdict"], found["sentence"][:33]) == ("not recording", "NOT RECORDING: nothing has been w")
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_garbage_in_a_log_never_raises(tmp_path: Path, seed: int) -> None:
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    write_part(path)
+    data = np.frombuffer(path.read_bytes(), np.uint8).copy()
+    random = np.random.default_rng(seed)
+    places = random.integers(600, len(data), random.integers(1, 200))
+    data[places] = random.integers(0, 256, len(places))
+    path.write_bytes(data[: random.integers(len(data) // 2, len(data) + 1)].tobytes())
+    for read in (PartFollower.batches, lambda part: part.tail(0.1)):
+        follower = PartFollower(path)
+        assert sum(len(batch.units) for batch in read(follower)) <= 60 * 21 + 6
+        follower.close()
 
 
 def units_of(follower: LogFollower) -> list[int]:

@@ -272,6 +272,15 @@ def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_pa
         assert said in run.stderr
 
 
+def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> None:
+    for part in range(2):
+        write_part(logs / f"flight_{part}.mcap", part=part)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    run = swath("offload", str(logs), str(small_disk))
+    assert run.returncode == 3
+    assert run.stderr == f"swath: {small_disk}: cannot be written: mounted read-only, or not permitted\n"
+
+
 def test_one_run_at_a_time(logs: Path, disk: Path) -> None:
     write_part(logs / "flight_0.mcap")
     first = offload(logs, disk)
