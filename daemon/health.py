@@ -39,6 +39,13 @@ def duration_text(seconds: float) -> str:
     return f"{int(seconds // 60)} min" if seconds >= 60 else f"{int(seconds)} s"
 
 
+def clock_text(time_ns: object) -> str:
+    """UTC of a host time as ``10:15:03``; whatever else a log holds there is a question mark."""
+    if isinstance(time_ns, int) and 0 <= time_ns < 1 << 63:
+        return time.strftime("%H:%M:%S", time.gmtime(time_ns // 1_000_000_000))
+    return "?"
+
+
 def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
     """What the operator reads in ``systemctl status``."""
     if writer.state is not Writing.RECORDING:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -149,7 +148,8 @@ def _disk(found: dict[str, Any]) -> str:
 def _event(event: dict[str, Any]) -> Any:
     from rich.text import Text
 
-    time_ns, severity = event.get("time_ns"), str(event.get("severity"))
-    when = datetime.fromtimestamp(time_ns * 1e-9, tz=UTC).strftime("%H:%M:%S") if isinstance(time_ns, int) else "?"
+    from daemon.health import clock_text
+
+    when, severity = clock_text(event.get("time_ns")), str(event.get("severity"))
     style = {"critical": "bold red", "error": "red", "warning": "yellow"}.get(severity, "")
     return Text(one_line(f"{when} {event.get('source')} {event.get('code')}: {event.get('text')}"), style=style)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import socket
 import stat
@@ -90,6 +91,8 @@ def test_a_note_is_in_the_log_with_its_time(tmp_path: Path, logs: Path) -> None:
     assert (answer["ok"], answer["recording"], answer["part"]) == (True, True, 0)
     assert logs.joinpath(f"{answer['session_id']}_0.mcap").exists()
     assert not (logs / ".swath.control").exists()
+    shown = swath("info", str(logs)).stdout
+    assert re.search(r"^  \d\d:\d\d:\d\d mark: line 4 start σ\n  \d\d:\d\d:\d\d mark: line 4 end$", shown, re.MULTILINE)
 
 
 def test_split_begins_a_part_and_loses_nothing(tmp_path: Path, logs: Path) -> None:
