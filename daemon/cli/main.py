@@ -52,9 +52,14 @@ class Listed:
 COMMANDS = (
     Listed("run", "Record every byte of the configured sensors.", "Record"),
     Listed("check", "Validate a configuration; open every device and say what it answers.", "Record"),
+    Listed("mark", "Note something in the log being recorded.", "Record"),
+    Listed("split", "Begin a new part of the log being recorded.", "Record"),
+    Listed("monitor", "Show a running recorder live: sources, rates, losses, time, disk.", "Record"),
     Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
+    Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 

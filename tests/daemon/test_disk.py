@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.rig import Recorder, disk_of, free_udp_port, one_processor, session_table, wait_until
 
 SIZE_MB = 24
 
@@ -21,15 +20,8 @@ SIZE_MB = 24
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of its own, of 24 MB."""
-    if os.geteuid() != 0:
-        pytest.fail("this test mounts a tmpfs: run it as root")
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "swath-test", str(folder)], check=True)
-    try:
+    with disk_of(tmp_path / "disk", SIZE_MB) as folder:
         yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def config_of(logs: Path, port: int, reserve_mb: float) -> str:
