@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import keyword
 import os
 import sys
 import tempfile
@@ -45,8 +46,9 @@ class Listed:
 
     @property
     def module(self) -> str:
-        """The file it is in."""
-        return f"daemon.cli.{self.name.replace('-', '_')}"
+        """The file it is in; one that Python has a word for has an underscore behind it."""
+        name = self.name.replace("-", "_")
+        return f"daemon.cli.{name}_" if keyword.iskeyword(name) else f"daemon.cli.{name}"
 
 
 COMMANDS = (
@@ -54,6 +56,8 @@ COMMANDS = (
     Listed("check", "Validate a configuration; open every device and say what it answers.", "Record"),
     Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
+    Listed("import", "Make a log of captures: pcap, candump, serial bytes.", "Logs"),
+    Listed("export", "Write a log as the files that the devices' own tools read.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
