@@ -77,7 +77,7 @@ class SignalLayout:
 
     @np.errstate(invalid="ignore", over="ignore")
     def values(self, bits: UInt64Array) -> Float64Array:
-        """Physical values of right-aligned bits; whatever float the wire holds, signalling NaN and overflow included."""
+        """Physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]
             raw = bits.astype(unsigned).view(floating).astype(np.float64)
