@@ -133,8 +133,7 @@ def _settle(capture: Capture, told: Told) -> None:
     if capture.kind != "serial" or has_times(capture.path):
         return
     assert capture.port is not None
-    assert capture.port.spec is not None
-    source, options = capture.port.source, capture.port.spec.options
+    source, options = capture.port.source, capture.port.options
     start_ns = told.start_ns.get(source, told.start_ns.get(""))
     if start_ns is None:
         raise UserError(

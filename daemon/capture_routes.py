@@ -31,6 +31,11 @@ class Port:
     channel: ChannelSpec
     edge: str = ""
 
+    @property
+    def options(self) -> dict[str, str]:
+        """Of the transport."""
+        return self.spec.options if self.spec is not None else {}
+
 
 def _port(wire: Wire, spec: TransportSpec) -> Port:
     channel = ChannelSpec(wire.topic, wire.encoding, wire.metadata, None, wire.chunk_class)
@@ -73,10 +78,12 @@ class Routes:
         """
         assert unit.source is not None
         assert unit.destination is not None
-        host, number = unit.destination
-        found = [port for port in self._udp.get(number, ()) if _accepts(port, unit.source[0])]
+        found = self._udp.get(unit.destination[1])
+        if found is None or (len(found) == 1 and "source" not in found[0].options):
+            return found[0] if found else None
+        found = [port for port in found if port.options.get("source", unit.source[0]) == unit.source[0]]
         if len(found) > 1:
-            found = [port for port in found if _bound_to(port) == host]
+            found = [port for port in found if _bound_to(port) == unit.destination[0]]
         return found[0] if found else None
 
     def of_frame(self, unit: CapturedUnit) -> Port | None:
@@ -88,11 +95,6 @@ class Routes:
         if kind == "pcap":
             return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
         return ", ".join(f"{name} ({port.source})" for name, port in self._can.items()) or "none"
-
-
-def _accepts(port: Port, sender: str) -> bool:
-    assert port.spec is not None
-    return port.spec.options.get("source", sender) == sender
 
 
 def _bound_to(port: Port) -> str:

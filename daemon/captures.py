@@ -78,7 +78,7 @@ class Capture:
             units = read_pcap(self.path, tally=self.tally, drop_copies=not self.keep_copies)
             return complete(units, self.path)
         if self.kind == "candump":
-            return complete(read_candump(self.path, tally=self.tally), self.path)
+            return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
         if self.kind == "pps":
             assert self.port is not None
             return complete(_edges(self.path, self.port.edge, self.tally), self.path)

@@ -113,8 +113,13 @@ def _row(line: str) -> SidecarRow | None:
     return row if fits and 0 <= row.length <= _MAX_UNIT_BYTES and 0 <= row.time_ns <= LATEST_NS else None
 
 
-def complete(units: Iterator[CapturedUnit], path: Path) -> Iterator[CapturedUnit]:
+def complete(units: Iterator[CapturedUnit], path: Path, within_ns: int | None = None) -> Iterator[CapturedUnit]:
     """The units of a file that has an entry a unit, completed by its sidecar.
+
+    Args:
+        units: as the file has them.
+        path: the file.
+        within_ns: how near the file's own stamps are to the true ones; None where they may be any.
 
     Raises:
         CaptureDamageError: the sidecar is not of this file.
@@ -133,8 +138,9 @@ def complete(units: Iterator[CapturedUnit], path: Path) -> Iterator[CapturedUnit
                 raise CaptureDamageError(f"{sidecar_of(path)}: speaks of unit {row.unit}, the file ends before")
             return
         if row is not None and row.unit == number:
-            if row.data is None and len(unit.data) != row.length:
-                raise CaptureDamageError(f"{sidecar_of(path)}: unit {number} has another length; not of this file")
+            near = within_ns is None or abs(row.time_ns - unit.time_ns) < within_ns
+            if not near or (row.data is None and len(unit.data) != row.length):
+                raise CaptureDamageError(f"{sidecar_of(path)}: unit {number} is another than in the file beside it")
             unit = replace(unit, time_ns=row.time_ns, data=unit.data if row.data is None else row.data)
             row = next(rows, None)
         yield unit

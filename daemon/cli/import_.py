@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import os
+import resource
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -78,6 +79,8 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     from daemon.run import take_directory
     from drivers.transports.base import TransportError
 
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # captures are merged: all are open at once
     lock = take_directory(output, "--output")
     try:
         with Console(stderr=True).status("reading") as status:
@@ -151,5 +154,10 @@ def _damage(capture: Capture) -> str:
 
 
 def _of_nobody(capture: Capture, routes: Routes) -> str:
-    there = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5)) or "nothing"
-    return f"{capture.path}: holds {there}; the configuration has {routes.described(capture.kind)}"
+    there = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
+    if not there:
+        return f"{capture.path}: holds no unit"
+    return (
+        f"{capture.path}: holds {there}, the configuration has {routes.described(capture.kind)}; "
+        "--source kind/name=FILE says whose it is"
+    )

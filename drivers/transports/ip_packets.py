@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from ipaddress import IPv6Address
 
 # https://www.tcpdump.org/linktypes.html
@@ -43,6 +44,11 @@ def ip_packet(link: int, frame: bytes) -> bytes:
     while int.from_bytes(kind, "big") in _VLAN_TAGS and at + 4 <= len(frame):  # IEEE 802.1Q: tag, then what follows
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if int.from_bytes(kind, "big") in (_IPV4, _IPV6) else b""
+
+
+@lru_cache(maxsize=4096)
+def _ipv4_text(address: bytes) -> str:
+    return ".".join(map(str, address))
 
 
 @dataclass(slots=True)
@@ -113,7 +119,7 @@ class IpPackets:
             segment = self._piece(packet[4:6] + packet[12:20], offset, packet[header:total], more)
         if segment is None:
             return None
-        return ".".join(map(str, packet[12:16])), ".".join(map(str, packet[16:20])), segment
+        return _ipv4_text(packet[12:16]), _ipv4_text(packet[16:20]), segment
 
     def _add_v6(self, packet: bytes) -> Datagram | None:
         following, end = packet[6], 40 + int.from_bytes(packet[4:6], "big")

@@ -14,6 +14,7 @@ import pytest
 
 from daemon.capture_files import Told
 from daemon.errors import UserError
+from daemon.exporting import export_session
 from daemon.log.reader import open_logs
 from daemon.replay import timed_units
 from daemon.run import take_directory
@@ -164,6 +165,32 @@ class TestWhose:
         assert len({metadata for _, _, metadata in units}) == 257
         assert "source_address" not in dict(units[-1][2])
 
+    def test_two_heads_of_a_real_capture_are_told_by_their_senders(self, tmp_path: Path) -> None:
+        """Both send to port 7502, in fragments; exported and imported again they are the same."""
+        capture = FIXTURES / "captures" / "same_ports.pcap.gz"
+        text = CONFIG.replace("udp:0.0.0.0:2368", "udp:0.0.0.0:7502")
+        config = write_config(tmp_path, text)
+        run_import(config, [capture], tmp_path / "logs")
+        units = content_of(tmp_path / "logs")["/scanner/top/raw"]
+        assert [(time_ns, data) for time_ns, data, _ in units] == [
+            (one.time_ns, one.data) for one in read_pcap(capture)
+        ]
+        assert len({metadata for _, _, metadata in units}) == 4  # each head sends from two ports
+        [session] = open_logs([tmp_path / "logs"])
+        folder = export_session(session, tmp_path / "out").folder
+        run_import(config, [folder], tmp_path / "back")
+        assert content_of(tmp_path / "back") == content_of(tmp_path / "logs")
+
+    def test_more_files_than_a_process_may_open_at_first(self, tmp_path: Path) -> None:
+        files = [write_pcap(tmp_path / f"{n:03}.pcap", [bytes([n])], first_ns=START_NS + n) for n in range(100)]
+        write_config(tmp_path)
+        words = ["import", str(tmp_path / "swath.toml"), *map(str, files), "-o", str(tmp_path / "logs")]
+        code = "import resource; most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]\n"
+        code += f"resource.setrlimit(resource.RLIMIT_NOFILE, (64, most)); sys.exit(cli.run_app({words!r}))"
+        assert run_python(code).returncode == 0
+        units = content_of(tmp_path / "logs")["/scanner/top/raw"]
+        assert [data for _, data, _ in units] == [bytes([n]) for n in range(100)]
+
     def test_rotated_captures_come_in_the_order_of_time(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         late = write_pcap(tmp_path / "a.pcap", [b"3", b"4"], first_ns=START_NS + 10**9)
@@ -246,8 +273,9 @@ class TestWrong:
     def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
-        want = f"swath: {path}: holds port 5000 (3); the configuration has 2368 (scanner/top), 8308 (scanner/top/aux)\n"
-        assert (code, error, found["log"]) == (1, want, [])
+        want = f"{path}: holds port 5000 (3), the configuration has 2368 (scanner/top), 8308 (scanner/top/aux); "
+        want += "--source kind/name=FILE says whose it is"
+        assert (code, error, found["log"]) == (1, f"swath: {want}\n", [])
         assert found["captures"][0]["of_no_device"] == {"port 5000": 3}
 
     def test_one_of_two_captures_is_cut_off(self, tmp_path: Path) -> None:

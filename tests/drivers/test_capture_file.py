@@ -56,6 +56,20 @@ def test_payloads_and_times_are_those_dpkt_reads() -> None:
     assert [(unit.time_ns, unit.data) for unit in units] == theirs
 
 
+def test_real_fragments_are_put_together_as_dpkt_reads_them() -> None:
+    """Two heads on one port, datagrams in up to a dozen pieces; the oracle joins dpkt's fragments by their offsets."""
+    pieces: dict[tuple[bytes, int], dict[int, bytes]] = {}
+    with gzip.open(FIXTURES / "captures" / "same_ports.pcap.gz") as stream:
+        for _, frame in dpkt.pcap.Reader(stream):
+            ip = dpkt.ethernet.Ethernet(frame).data
+            pieces.setdefault((ip.src, ip.id), {})[ip.offset] = bytes(ip.data)
+    theirs = sorted(b"".join(found[at] for at in sorted(found))[8:] for found in pieces.values())
+    units = list(read_pcap(FIXTURES / "captures" / "same_ports.pcap.gz", drop_copies=True))
+    assert sorted(unit.data for unit in units) == theirs
+    assert sorted(len(unit.data) for unit in units) == [48, 48, 12608, 16640]
+    assert len({unit.source for unit in units}) == 4  # each head sends from two ports
+
+
 def udp_packet(payload: bytes, to_port: int = 2368) -> bytes:
     udp = dpkt.udp.UDP(sport=4000, dport=to_port, data=payload, ulen=8 + len(payload))
     ip = dpkt.ip.IP(src=b"\x0a\0\0\1", dst=b"\x0a\0\0\2", p=dpkt.ip.IP_PROTO_UDP, id=77, data=bytes(udp))
