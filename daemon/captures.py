@@ -66,6 +66,9 @@ class Capture:
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
         """Units that belong to a device, in the file's order; what is wrong with the file stands in ``tally``."""
         for unit in until_damage(self._captured(), self.tally):
+            if not 0 <= unit.time_ns <= LATEST_NS:
+                self.tally.damaged(f"{self.path}: a unit of {len(unit.data)} bytes has no time between 1970 and 2262")
+                continue
             port = self._port_of(unit, routes)
             if port is None:
                 continue
@@ -117,8 +120,8 @@ class Capture:
 
 
 def tag_of(path: Path) -> Path:
-    """Where RTKLIB puts the time tags of a stream."""
-    return path.with_name(path.name + ".tag")
+    """Where RTKLIB put the time tags of a stream, which may have been gzipped since."""
+    return path.with_name(path.name.removesuffix(".gz") + ".tag")
 
 
 def has_times(path: Path) -> bool:

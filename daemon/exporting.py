@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from daemon.errors import ExitCode, UserError
 from daemon.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
 from daemon.log.format import LogError, safe_attachment_path
 from daemon.log.reader import LogBatch, Session
@@ -54,14 +55,14 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
 
     Raises:
         LogError: the log's name is no name of a folder.
-        FileExistsError: the folder is there.
+        UserError: the folder is there.
         OSError: it cannot be written; nothing is left of it.
     """
     target = safe_attachment_path(directory, session.session_id)
     unfinished = target.with_name(target.name + _UNFINISHED)
     for path in (target, unfinished):
         if os.path.lexists(path):
-            raise FileExistsError(f"{path}: is there already; remove it or give another directory")
+            raise UserError(f"{path}: is there already; remove it or give another directory", ExitCode.IO)
     directory.mkdir(parents=True, exist_ok=True)
     unfinished.mkdir()
     try:

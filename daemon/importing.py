@@ -35,6 +35,7 @@ from daemon.run import read_boot_id
 from drivers.transports.capture_base import Address
 
 STATUS_NS = 1_000_000_000
+_BEHIND = 1000  # units in a row so far behind the newest: its stamp was the wrong one
 _NO_DISK_FIGURES = {"queue_high_water": 0, "write_ms_max": 0.0, "sync_ms_max": 0.0}
 
 
@@ -140,7 +141,8 @@ class ImportLog:
         self._split_bytes = config.session.split_size_mb * 1e6
         self._split_ns = config.session.split_minutes * 60e9
         self._sources: dict[str, _Source] = {}
-        self._flushed_ns = self._told_ns = self._part_opened_ns = first_ns
+        self._newest_ns = self._flushed_ns = self._told_ns = self._part_opened_ns = first_ns
+        self._behind = 0
         self.paths: list[Path] = []
         self._open_part()
         self.event(Severity.INFO, "session_started", f"session {self.info.session_id}, imported from captures")
@@ -148,12 +150,7 @@ class ImportLog:
     def add(self, unit: ImportUnit) -> None:
         """One unit; raises OSError when the disk refuses a chunk."""
         self._clock.time_ns = now_ns = unit.time_ns
-        if abs(now_ns - self._flushed_ns) >= CHUNK_OPEN_NS:
-            self._flush()
-        if abs(now_ns - self._told_ns) >= STATUS_NS:
-            self._tell_status()
-            if self._split_due():
-                self._split()
+        self._advance(now_ns)
         source = self._sources.get(unit.port.source) or self._add_source(unit.port)
         channel_id = source.channel_ids.get(unit.peer) or self._channel(source, unit.peer)
         run, length = source.run, len(unit.data)
@@ -194,6 +191,22 @@ class ImportLog:
             path.unlink(missing_ok=True)
         self._parts.remove_sign()
 
+    def _advance(self, now_ns: int) -> None:
+        """What is due at a stamp. The newest counts: stamps of two clocks, years apart, must not be due each time."""
+        if now_ns < self._newest_ns - STATUS_NS:
+            self._behind += 1
+            if self._behind < _BEHIND:
+                return
+            self._flushed_ns = self._told_ns = self._part_opened_ns = now_ns
+        self._newest_ns = now_ns if self._behind >= _BEHIND else max(now_ns, self._newest_ns)
+        self._behind = 0
+        if self._newest_ns - self._flushed_ns >= CHUNK_OPEN_NS:
+            self._flush()
+        if self._newest_ns - self._told_ns >= STATUS_NS:
+            self._tell_status()
+            if self._split_due():
+                self._split()
+
     # ------------------------------------------------------------------ sources and channels
 
     def _add_source(self, port: Port) -> _Source:
@@ -231,7 +244,7 @@ class ImportLog:
             self._lay_run(source)
         assert self._parts.current is not None
         self._parts.current.flush()
-        self._flushed_ns = self._clock.time_ns
+        self._flushed_ns = self._newest_ns
 
     def _tell_status(self) -> None:
         """As the recorder: counts of written chunks, then the statuses, both in the file before anything else."""
@@ -242,14 +255,12 @@ class ImportLog:
         for block in self._account.encode(self._account.statuses(_NO_DISK_FIGURES)):
             self._parts.add(block)
         self._flush()
-        self._told_ns = now_ns
+        self._told_ns = self._newest_ns
 
     def _split_due(self) -> bool:
         part = self._parts.current
         assert part is not None
-        return (
-            part.bytes_written >= self._split_bytes or abs(self._clock.time_ns - self._part_opened_ns) >= self._split_ns
-        )
+        return part.bytes_written >= self._split_bytes or self._newest_ns - self._part_opened_ns >= self._split_ns
 
     def _split(self) -> None:
         old = self._open_part()
@@ -264,7 +275,7 @@ class ImportLog:
         old = self._parts.open_next(self._clock.time_ns)
         assert self._parts.current is not None
         self.paths.append(self._parts.current.path)
-        self._part_opened_ns = self._clock.time_ns
+        self._part_opened_ns = self._newest_ns
         return old
 
 

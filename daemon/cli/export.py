@@ -37,7 +37,7 @@ def command(
         with Console(stderr=True).status("reading"):
             for session in open_logs(logs, passed_over):
                 done.append((session, export_session(session, directory)))
-    except (LogError, FileExistsError) as error:
+    except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
         text = f"{directory}: {error.strerror or error}; nothing is left of what was begun"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from drivers.transports.capture_base import (
 )
 from drivers.transports.rtklib_tag import read_tags
 
+_LARGEST_FILE_BYTES = 2**62
 MAX_READ_BYTES = 16 << 20  # of one arrival; the recorder's own reads are far below
 _BARE_READ_BYTES = 512
 _COLUMNS = ["arrival_unix_s", "offset", "length"]
@@ -59,13 +61,22 @@ def _tabled(path: Path, given: Path | None) -> Iterator[CapturedUnit]:
     position = 0
     with open_capture(path) as stream:
         for number, time_ns, offset, length in _rows(table):
-            if offset >= 0 and offset != position:
-                stream.seek(offset)
-            data = read_bytes(stream, length, path) if 0 <= length <= MAX_READ_BYTES and offset >= 0 else None
+            data = None
+            if 0 <= length <= MAX_READ_BYTES and 0 <= offset <= _LARGEST_FILE_BYTES:
+                _seek(stream, offset, position, path)
+                data = read_bytes(stream, length, path)
             if data is None or len(data) < length:
                 raise CaptureDamageError(f"{table}: line {number}: bytes {offset}+{length} are not in {path.name}")
             position = offset + length
             yield CapturedUnit(time_ns, data, "serial")
+
+
+def _seek(stream: BinaryIO, offset: int, position: int, path: Path) -> None:
+    try:
+        if offset != position:
+            stream.seek(offset)
+    except (EOFError, OSError, zlib.error) as error:
+        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error
 
 
 def _rows(table: Path) -> Iterator[tuple[int, int, int, int]]:

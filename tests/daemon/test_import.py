@@ -200,6 +200,49 @@ class TestWhose:
         assert [data for _, data, _ in units] == [b"1", b"2", b"3", b"4"]
 
 
+class TestStamps:
+    """Whatever a capture's clock did, every unit is in the log, and parts and statuses stay few."""
+
+    def test_two_clocks_years_apart_in_turn(self, tmp_path: Path) -> None:
+        """As two interfaces of one pcapng may have them; a part and a status a unit would be absurd."""
+        data, row = FILE_HEADER, np.zeros((1, 3), np.uint8)
+        times = [START_NS // (1 + n % 2) + n * 10**6 for n in range(3000)]
+        for n, time_ns in enumerate(times):
+            data += pcap_frames(np.array([time_ns]), n, HEAD, ("10.0.0.1", 2368), row).tobytes()
+        (tmp_path / "two.pcap").write_bytes(data)
+        report, _ = run_import(write_config(tmp_path), [tmp_path / "two.pcap"], tmp_path / "logs")
+        assert len(report.paths) <= 2
+        content = read_log(tmp_path / "logs")
+        assert [time_ns for time_ns, _ in content.units["scanner/top"]] == times
+        assert len(content.messages["/status/scanner/top"]) < 10
+
+    def test_after_one_absurd_stamp_statuses_go_on(self, tmp_path: Path) -> None:
+        times = [START_NS + n * 10**7 for n in range(3000)]
+        times[10] = 4_000_000_000 * 10**9
+        data, row = FILE_HEADER, np.zeros((1, 3), np.uint8)
+        for n, time_ns in enumerate(times):
+            data += pcap_frames(np.array([time_ns]), n, HEAD, ("10.0.0.1", 2368), row).tobytes()
+        (tmp_path / "jump.pcap").write_bytes(data)
+        run_import(write_config(tmp_path), [tmp_path / "jump.pcap"], tmp_path / "logs")
+        content = read_log(tmp_path / "logs")
+        assert [time_ns for time_ns, _ in content.units["scanner/top"]] == times
+        assert len(content.messages["/status/scanner/top"]) >= 19  # the second after the jump, then one a second
+
+    def test_no_stamp_before_1970_or_after_2262(self, tmp_path: Path) -> None:
+        path = tmp_path / "rover.bin"
+        path.write_bytes(b"abcdef")
+        rows = ["-5.5,0,2", "1.5,2,2", "9999999999.0,4,2"]
+        (tmp_path / "rover.chunks.csv").write_text("\n".join(["arrival_unix_s,offset,length", *rows]) + "\n")
+        _, [capture] = run_import(write_config(tmp_path), [], tmp_path / "logs", Told([f"gnss/rover={path}"]))
+        assert [data for _, data, _ in content_of(tmp_path / "logs")["/gnss/rover/raw"]] == [b"cd"]
+        assert capture.tally.damage == 2
+        assert "no time between 1970 and 2262" in capture.tally.first_damage
+        (tmp_path / "rover.chunks.csv").unlink()
+        told = Told([f"gnss/rover={path}"], {"": 9_999_999_999 * 10**9})
+        report, [capture] = run_import(write_config(tmp_path), [], tmp_path / "none", told)
+        assert (report.units, capture.tally.damage) == ({}, 1)
+
+
 class TestSerialTimes:
     """A serial stream says its times by a table, by RTKLIB's tags, or the user does."""
 
@@ -373,7 +416,7 @@ class TestWrong:
             assert line in error
 
 
-@pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "sidecar"])
+@pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])
 def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path, kind: str) -> None:
     """Whatever is wrong, it is counted or refused in a line, and the log that is made is whole."""
     config = write_config(tmp_path)
@@ -392,6 +435,12 @@ def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path,
         tags = b"TIMETAG RTKLIB".ljust(64, b"\0") + struct.pack("<Id", 1_800_000_018, 0.5)
         target.write_bytes(tags + b"".join(struct.pack("<II", n, 10 * n + 10) for n in range(6)))
         told = Told([f"gnss/rover={folder / 'a.gps'}"])
+    elif kind in ("table", "bytes"):
+        (folder / "a.gps.gz").write_bytes(gzip.compress(bytes(range(60))))
+        rows = [f"{1_800_000_000 + n}.5,{n * 10},10" for n in (0, 1, 3, 2, 5)]  # as a table may have them: not in order
+        (folder / "a.chunks.csv").write_text("\n".join(["arrival_unix_s,offset,length", *rows]) + "\n")
+        target = folder / ("a.chunks.csv" if kind == "table" else "a.gps.gz")
+        told = Told([f"gnss/rover={folder / 'a.gps.gz'}"])
     else:
         log = write_log(
             tmp_path / "log", config, [("imu/main", START_NS + n, encode_can_frame(n, b"ab"), None) for n in range(9)]
@@ -400,8 +449,8 @@ def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path,
         [exported] = (tmp_path / "out").iterdir()
         shutil.copytree(exported, folder, dirs_exist_ok=True)
         target = folder / "imu-main.log.swath.csv.gz"
-    whole = target.read_bytes()
-    files = [] if kind == "rtklib" else [folder if kind == "sidecar" else target]
+    whole, made = target.read_bytes(), 0
+    files = [] if told.named else [folder if kind == "sidecar" else target]
     for at in range(0, len(whole), 3):
         flipped = whole[:at] + bytes([whole[at] ^ int(rng.integers(1, 256))]) + whole[at + 1 :]
         for number, data in enumerate((whole[:at], flipped, whole[:at] + rng.bytes(50) + whole[at:])):
@@ -413,5 +462,7 @@ def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path,
                 continue
             assert sum(report.units.values()) == sum(capture.units.total() for capture in captures)
             if report.paths:
+                made += 1
                 assert read_log(output).damage == 0
             shutil.rmtree(output, ignore_errors=True)
+    assert made > 0
