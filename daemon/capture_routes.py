@@ -58,7 +58,7 @@ class Routes:
 
     ports: dict[str, Port]
     _udp: dict[int, list[Port]] = field(default_factory=dict)
-    _can: dict[str, Port] = field(default_factory=dict)
+    _can: dict[str, Port | None] = field(default_factory=dict)  # None: two buses are called so
 
     @classmethod
     def of(cls, config: Config) -> Routes:
@@ -68,7 +68,7 @@ class Routes:
             if port.spec is not None and port.kind == "udp":
                 routes._udp.setdefault(port.spec.port, []).append(port)
             elif port.spec is not None and port.kind == "can":
-                routes._can[port.spec.channel] = port
+                routes._can[port.spec.channel] = None if port.spec.channel in routes._can else port
         return routes
 
     def of_datagram(self, unit: CapturedUnit) -> Port | None:
@@ -94,7 +94,7 @@ class Routes:
         """The ports or buses there are, for people."""
         if kind == "pcap":
             return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
-        return ", ".join(f"{name} ({port.source})" for name, port in self._can.items()) or "none"
+        return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"
 
 
 def _bound_to(port: Port) -> str:

@@ -124,6 +124,10 @@ def complete(units: Iterator[CapturedUnit], path: Path, within_ns: int | None = 
     Raises:
         CaptureDamageError: the sidecar is not of this file.
     """
+    return _completed(units, path, within_ns) if sidecar_of(path).exists() else units
+
+
+def _completed(units: Iterator[CapturedUnit], path: Path, within_ns: int | None) -> Iterator[CapturedUnit]:
     rows = read_sidecar(path)
     row = next(rows, None)
     number, channel = 0, ""

@@ -35,6 +35,7 @@ from tests.daemon.test_log import doctor
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
 START_NS = 1_800_000_000_123_456_789
+BUS = "239.74.163.2"
 HEAD, OTHER_HEAD = ("192.168.1.201", 2368), ("192.168.1.202", 40_000)
 EDGE = b'{"edge_time_ns":1800000000000000123,"sequence":7,"edge":"assert","realtime_ns":1800000000000000999}'
 
@@ -195,24 +196,46 @@ def test_two_heads_on_one_port_number_are_told_by_their_groups(tmp_path: Path) -
     there_and_back(tmp_path, write_config(tmp_path, text), units)
 
 
+def frame_of(number: int) -> can.Message:
+    """Frames of every kind in turn."""
+    kinds = [
+        can.Message(arbitration_id=0x100 + number, data=bytes([number]) * (number % 9), is_extended_id=False),
+        can.Message(arbitration_id=0x1000000 + number, data=bytes(8), is_extended_id=True),
+        can.Message(arbitration_id=0x200 + number, data=bytes([number]) * 48, is_extended_id=False, is_fd=True),
+        can.Message(arbitration_id=0x300 + number, is_remote_frame=True, dlc=4, is_extended_id=False),
+    ]
+    return kinds[number % len(kinds)]
+
+
+def parts_of(message: can.Message) -> tuple[int, bytes, bool, bool, bool]:
+    """What of a frame was on the bus."""
+    data = bytes(message.data)
+    return message.arbitration_id, data, message.is_extended_id, message.is_fd, message.is_remote_frame
+
+
 @pytest.mark.slow
 def test_what_was_on_the_wire_is_in_the_files_and_comes_back(tmp_path: Path) -> None:
-    """A real recorder: sentences on a pty, datagrams, edges; its log exported, imported, and all compared."""
+    """A real recorder: sentences on a pty, datagrams, frames, edges; its log exported, imported, and all compared."""
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
     pty = Pty(link)
-    config = session_table(tmp_path / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
-    sent_bytes, sent, edges = b"", [], []
+    can_port = free_udp_port()
+    bus_table = f'[imu.main]\ntransport = "can:udp_multicast:{BUS}?port={can_port}"\nprotocol = "canmod-gps"\n'
+    config = session_table(tmp_path / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo) + bus_table
+    sent_bytes, sent, edges, frames = b"", [], [], []
     with (
         Recorder(tmp_path, config) as recorder,
         fifo.open("w") as pps,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        can.Bus(interface="udp_multicast", channel=BUS, port=can_port, ignore_config=True) as bus,
         one_processor(),
     ):
-        recorder.wait_said("device_opened", times=3)
+        recorder.wait_said("device_opened", times=4)
         for number in range(40):
             sent.append(bytes([number]) * (100 + number % 3 * 700))
             sender.sendto(sent[-1], ("127.0.0.1", port))
+            frames.append(frame_of(number))
+            bus.send(frames[-1])
             sentence = nmea_zda(40_000 + number)
             sent_bytes += sentence
             pty.write(sentence)
@@ -220,7 +243,6 @@ def test_what_was_on_the_wire_is_in_the_files_and_comes_back(tmp_path: Path) -> 
             pps.write(edges[-1] + "\n")
             pps.flush()
             time.sleep(0.03)
-        recorder.wait_said("device_opened", times=3)
         time.sleep(0.5)
         assert recorder.stop() == 0, recorder.stderr()
     pty.unplug()
@@ -233,6 +255,8 @@ def test_what_was_on_the_wire_is_in_the_files_and_comes_back(tmp_path: Path) -> 
     [pcap] = folder.glob("scanner-*.pcap")
     with pcap.open("rb") as stream:
         assert [bytes(dpkt.ethernet.Ethernet(frame).data.data.data) for _, frame in dpkt.pcap.Reader(stream)] == sent
+    with can.CanutilsLogReader(str(folder / "imu-main.log")) as reader:
+        assert [parts_of(message) for message in reader] == [parts_of(message) for message in frames]
     [text] = folder.glob("pps-*.txt")
     assert [line.split()[1] for line in text.read_text().splitlines()] == [edge.split()[1] for edge in edges]
     back = swath("import", str(folder / "config/config.toml"), str(tmp_path / "out"), "-o", str(tmp_path / "back"))

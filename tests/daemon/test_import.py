@@ -151,6 +151,16 @@ class TestWhose:
         report, _ = run_import(config, [], tmp_path / "all", Told([f"imu/main={CANDUMP}"]))
         assert report.units == {"imu/main": 5588}
 
+    def test_a_name_that_two_buses_have_is_nobodys(self, tmp_path: Path) -> None:
+        text = CONFIG.replace("can:socketcan:can1?bitrate=500000", "can:udp_multicast:239.74.163.2?port=1")
+        text += '[imu.other]\ntransport = "can:udp_multicast:239.74.163.2?port=2"\nprotocol = "canmod-gps"\n'
+        config, path = write_config(tmp_path, text), tmp_path / "bus.log"
+        path.write_text("(1.000000) 239.74.163.2 123#00\n")
+        report, [capture] = run_import(config, [path], tmp_path / "none")
+        assert (report.units, capture.passed) == ({}, {"239.74.163.2": 1})
+        report, _ = run_import(config, [], tmp_path / "logs", Told([f"imu/other={path}"]))
+        assert report.units == {"imu/other": 1}
+
     def test_senders_have_channels_of_their_own(self, tmp_path: Path) -> None:
         """And those beyond 256 one together, as the recorder has it."""
         data = FILE_HEADER
