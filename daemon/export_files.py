@@ -26,7 +26,7 @@ from drivers.transports.rtklib_tag import TagWriter
 from drivers.transports.uri import TransportSpec, parse_transport
 from georef.records import Int64Array
 
-# what RTKLIB's convbin takes a file for (app/convbin/convbin.c); others as their makers call them
+# .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)
 _SERIAL_SUFFIX = {"ubx": ".ubx", "novatel": ".gps", "sbf": ".sbf", "nmea": ".nmea"}
 
 
@@ -77,7 +77,7 @@ class SerialFile(NativeFile):
     """The bytes, one after the other; beside them RTKLIB's time tags. Bounds and times of reads are in the sidecar."""
 
     kind = "serial"
-    suffix = ".bin"
+    suffix = ".raw"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -106,6 +106,9 @@ class IpPackets:
     def _add_v4(self, packet: bytes, time_ns: int) -> Datagram | None:
         header, total = (packet[0] & 15) * 4, int.from_bytes(packet[2:4], "big")
         total = total or len(packet)  # 0: segmented by the network card
+        if header < 20 or total < header:
+            self.others += 1
+            return None
         if len(packet) < total:
             self.cut += 1
             return None
@@ -122,7 +125,8 @@ class IpPackets:
         return _ipv4_text(packet[12:16]), _ipv4_text(packet[16:20]), segment
 
     def _add_v6(self, packet: bytes) -> Datagram | None:
-        following, end = packet[6], 40 + int.from_bytes(packet[4:6], "big")
+        following, length = packet[6], int.from_bytes(packet[4:6], "big")
+        end = 40 + length if length else len(packet)  # 0: segmented by the network card
         segment: bytes | None = packet[40:end]
         if following not in (_UDP, _IPV6_FRAGMENT):
             self.others += 1

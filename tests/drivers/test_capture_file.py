@@ -28,6 +28,7 @@ from drivers.transports.capture_file import (
     read_pcap,
     read_serial,
 )
+from drivers.transports.ip_packets import IpPackets, ip_packet
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"
@@ -189,6 +190,25 @@ def test_a_frame_captured_on_two_interfaces_counts_once_where_that_is_sure(tmp_p
     assert [unit.data for unit in read_pcap(path)].count(b"a") == 2
     apart = write_pcap(tmp_path / "apart.pcap", [ETHERNET + udp_packet(b"a")] * 2)  # a second between them
     assert len(list(read_pcap(apart, drop_copies=True))) == 2
+
+
+@given(
+    st.sampled_from([0, 1, 101, 108, 113, 228, 229, 276]),
+    st.lists(
+        st.tuples(st.sampled_from([b"", b"\x45", b"\x40", b"\x4f", b"\x60"]), st.binary(max_size=90)), max_size=20
+    ),
+)
+def test_whatever_is_in_a_packet_is_a_datagram_or_counted(link: int, parts: list[tuple[bytes, bytes]]) -> None:
+    packets = IpPackets(drop_copies=True)
+    heads = {0: bytes(4), 1: ETHERNET, 108: bytes(4), 113: SLL, 276: SLL2}
+    found = 0
+    for start, rest in parts:
+        udp = bytearray(start + rest)
+        udp[9:10] = udp[9:10] and b"\x11"  # UDP, so that most get that far
+        packet = ip_packet(link, heads.get(link, b"") + bytes(udp))
+        assert packet == udp
+        found += packets.add(packet) is not None
+    assert found + packets.others + packets.cut + packets.copies <= len(parts)
 
 
 def test_other_packets_are_passed_over(tmp_path: Path) -> None:
