@@ -52,10 +52,10 @@ class Listed:
 COMMANDS = (
     Listed("run", "Record every byte of the configured sensors.", "Record"),
     Listed("check", "Validate a configuration; open every device and say what it answers.", "Record"),
-    Listed("setup", "Show, or send, the messages the devices need before a survey.", "Record"),
     Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("setup", "Show, or send, the messages the devices need before a survey.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 

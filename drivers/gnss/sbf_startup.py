@@ -16,7 +16,7 @@ PORT = re.compile(r"(COM[1-4]|USB[12])")
 PROMPT = rb"(?:[^>$]*\n)?[A-Z]+[0-9]+>"
 REFUSED = re.compile(rb"\$R\? ?([^\r\n]*)\r\n" + PROMPT)
 
-PULSE = "setPPSParameters, sec1, Low2High, 0.00, GPS"
+PULSE = "setPPSParameters, sec1, Low2High, , GPS"  # an argument left out keeps its value: the delay
 EVENT_BLOCKS = "xPPSOffset+ExtEvent"
 FIX_BLOCKS = "PVTGeodetic+PosCovGeodetic+VelCovGeodetic+EndOfPVT"
 SECOND_BLOCKS = "ReceiverTime"
