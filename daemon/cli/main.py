@@ -64,6 +64,7 @@ COMMANDS = (
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
     Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
     Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
+    Listed("setup", "Show, or send, the messages the devices need before a survey.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 

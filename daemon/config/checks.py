@@ -18,6 +18,7 @@ from daemon.config.config import Config
 from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceKind, Driver, DriverSettingsError
 from drivers.core.registry import UnknownProtocolError, find_driver
+from drivers.core.startup import StartupWish
 
 if TYPE_CHECKING:
     from drivers.transports.uri import TransportSpec
@@ -102,8 +103,11 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
     needs = list(_check_needs(section, table, driver))
     yield from needs
     if not needs and not any(_unreadable(path) for path in config.files_of(table).values()):
+        settings = config.settings_of(kind, name, table)
         try:
-            driver.make_parser(config.settings_of(kind, name, table))
+            driver.make_parser(settings)
+            if driver.startup is not None:
+                driver.startup(settings, StartupWish())
         except DriverSettingsError as error:
             yield f"{section}: {error}"
 

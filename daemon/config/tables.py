@@ -62,6 +62,18 @@ class PpsConfig(Section):
     )
 
 
+class GnssSetupConfig(Section):
+    """``[gnss.<name>.setup]``: what `swath setup` asks of a receiver."""
+
+    port: Text | None = Field(
+        None,
+        description="the receiver's own name of the port that is wired to this computer: "
+        "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2 (absent: COM1)",
+    )
+    rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="of positions and velocities")
+    raw: bool = Field(True, description="raw measurements and ephemerides too, for post-processing")
+
+
 class GnssConfig(Section):
     """``[gnss.<name>]``: a receiver."""
 
@@ -84,6 +96,7 @@ class GnssConfig(Section):
         description='realisation of its positions, as "EPSG:7912"; absent: WGS 84, realisation unknown; '
         '"same": the output\'s',
     )
+    setup: GnssSetupConfig = Field(default_factory=GnssSetupConfig, description="what `swath setup` asks of it")
 
 
 class SignalsConfig(Section):

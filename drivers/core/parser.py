@@ -10,11 +10,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+
+if TYPE_CHECKING:
+    from drivers.core.startup import StartupMessage, StartupWish
 
 DeviceKind = Literal["gnss", "imu", "scanner"]
 TransportKind = Literal["serial", "can", "udp", "gnss"]
@@ -137,6 +140,8 @@ class Driver:
         names_edge: which edge its time messages name by default; None where mixed or none.
         tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
         needs: configuration keys without which it cannot work.
+        startup: builds the messages a device needs before a survey, in the order they are sent, and raises
+            `DriverSettingsError`; None where there are none.
     """
 
     protocol: str
@@ -150,3 +155,4 @@ class Driver:
     names_edge: NamesEdge | None = None
     tells_pps: bool = True
     needs: tuple[str, ...] = ()
+    startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None
