@@ -77,6 +77,7 @@ class Account:
             **common,
             "state": count.state,
             "stamp_ambiguous": count.stamp_ambiguous,
+            **count.trouble,
         }
         return status | self._time_status(source)
 

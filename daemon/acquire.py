@@ -20,6 +20,7 @@ from daemon.host_clock import HostClock, StampConverter, read_clock_pair
 from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from daemon.log.format import ChannelSpec, ChunkClass
 from daemon.threads import name_thread
+from daemon.wire_trouble import WireTrouble
 from drivers.session import Session, SessionState
 from drivers.transports.base import UnitBlock
 from georef.records import Int64Array
@@ -66,6 +67,7 @@ class _Account:
     receive_buffer_bytes: int = 0
     state: str = "opening"
     ambiguous: int = 0
+    trouble: dict[str, int] = field(default_factory=dict)
 
     def snapshot(self) -> SourceCount:
         return SourceCount(
@@ -77,6 +79,7 @@ class _Account:
             last_unit_ns=self.last_unit_ns,
             receive_buffer_bytes=self.receive_buffer_bytes,
             state=self.state,
+            trouble=self.trouble,
         )
 
 
@@ -235,6 +238,7 @@ class UnitReceiver(Receiver):
         self._channel_ids: dict[tuple[str, int] | None, int] = {}
         self._sequences: dict[int, int] = {}
         self._told_buffer = False
+        self._trouble = WireTrouble(wire.source, shared.events)
 
     @property
     def opening(self) -> bool:
@@ -334,6 +338,7 @@ class UnitReceiver(Receiver):
             self.account.units += lost
             text = f"the kernel dropped {lost} units: the receive buffer was full"
             self.shared.events.post(Severity.ERROR, self.source, "lost_kernel", text)
+        self.account.trouble = self._trouble.look(counters)
         granted = counters.receive_buffer_bytes
         self.account.receive_buffer_bytes = granted
         wanted = counters.receive_buffer_asked_bytes

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from daemon.log.encode import EncodedBlock
 
@@ -21,6 +22,7 @@ class SourceCount:
     last_unit_ns: int | None = None
     receive_buffer_bytes: int = 0
     state: str = "opening"
+    trouble: Mapping[str, int] = field(default_factory=dict)  # what the wire says of itself, where it is not zero
 
 
 @dataclass(frozen=True, slots=True)

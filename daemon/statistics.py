@@ -19,6 +19,7 @@ from georef.records import ChunkBatch, Int64Array
 USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
 GAP_MIN_NS = 100_000_000
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
+_TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
 
 
 @dataclass(slots=True)
@@ -99,6 +100,7 @@ class SourceNumbers:
             "longest_gap_at_ns": self.intervals.longest_at_ns or None,
             "gaps": self.intervals.gaps(),
             "lost": {key: _count(status, key) for key in _ACCOUNT[2:]},
+            "trouble": {key: count for key in _TROUBLE if (count := _count(status, key))},
             "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
         }

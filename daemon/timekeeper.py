@@ -18,15 +18,37 @@ from drivers.transports.base import UnitBlock
 from georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
 from georef.timescales import HostTimeline, PpsClock
 
+STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for thrice as long as ever before …
+STOPPED_LONGEST_NS = 60_000_000_000  # … or for so long
+
 
 @dataclass(slots=True)
 class _TimeSource:
-    """A GNSS stream whose time messages are read."""
+    """A GNSS stream whose time messages are read; what it says of time may stop while its bytes go on."""
 
     source: str
     clock: PpsClock
     parser: Parser
     names_edge: NamesEdge | None
+    units_ns: int = 0  # host times of the newest unit and time message
+    message_ns: int | None = None
+    longest_ns: int = 0  # between two messages
+    told: bool = False
+
+    def note_message(self, host_ns: int) -> int | None:
+        """A time message came; how long there was none, where that had been told."""
+        pause_ns = 0 if self.message_ns is None else max(0, host_ns - self.message_ns)
+        self.message_ns, self.longest_ns = host_ns, max(self.longest_ns, pause_ns)
+        told, self.told = self.told, False
+        return pause_ns if told else None
+
+    def note_stop(self) -> int | None:
+        """Data has come for so long without a time message; once, None before and after."""
+        if self.message_ns is None or self.told:
+            return None
+        pause_ns = self.units_ns - self.message_ns
+        self.told = pause_ns > min(max(STOPPED_NS, 3 * self.longest_ns), STOPPED_LONGEST_NS)
+        return pause_ns if self.told else None
 
 
 class TimeKeeper:
@@ -64,6 +86,7 @@ class TimeKeeper:
 
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
             time_source = self._sources[source]
+            time_source.units_ns = int(log_time_ns[-1])
             with self._defects_told(source):
                 self._take(time_source, time_source.parser.feed_batch(ChunkBatch(source, log_time_ns, block.units)))
 
@@ -85,6 +108,10 @@ class TimeKeeper:
         if not messages:
             return
         with self._lock:
+            pause_ns = time_source.note_message(messages[-1].host_time_ns)
+            if pause_ns is not None:
+                text = f"time messages again after {pause_ns * 1e-9:.0f} s"
+                self._events.post(Severity.INFO, time_source.source, "time_messages_back", text)
             for message in messages:
                 names = time_source.names_edge or message.names_edge
                 raw_ns = self._timeline.raw_at(message.host_time_ns)
@@ -120,11 +147,20 @@ class TimeKeeper:
         if clock is None:
             return {}
         with self._defects_told(source), self._lock:
+            if source in self._sources:
+                self._tell_stop(self._sources[source])
             status = clock.status(self._timeline.raw_at(host_ns))
             self._drain(source, clock)
             sigma_ns = round(status.sigma_ns, 1) if math.isfinite(status.sigma_ns) else None
             return {"time_state": status.state.name, "time_sigma_ns": sigma_ns}
         return {"time_state": "NO_TIME", "time_sigma_ns": None}
+
+    def _tell_stop(self, time_source: _TimeSource) -> None:
+        """Edges carry a known second on, so that no state would say that nothing confirms it any more."""
+        pause_ns = time_source.note_stop()
+        if pause_ns is not None:
+            text = f"data, but no time message for {pause_ns * 1e-9:.0f} s: has its message set or baud rate changed?"
+            self._events.post(Severity.WARNING, time_source.source, "time_messages_stopped", text)
 
     def _drain(self, source: str, clock: PpsClock) -> None:
         for event in clock.drain_events():

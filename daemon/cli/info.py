@@ -91,6 +91,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     for source, values in numbers["sources"].items():
         if "decoded" in values:
             console.print(f"{_plain(source)}: {_plain(_decoded(values['decoded']))}", highlight=False)
+    _print_trouble(console, numbers)
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
@@ -108,6 +109,14 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         console.print(f"[red]damage: {_plain(text)}[/]", highlight=False)
     for note in numbers["notes"]:
         console.print(f"note: {_plain(note)}", highlight=False)
+
+
+def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
+    """What the wires and controllers say of themselves."""
+    for source, values in numbers["sources"].items():
+        if values["trouble"]:
+            told = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
+            console.print(f"[red]{_plain(source)}: {_plain(told)}[/]", highlight=False)
 
 
 def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:

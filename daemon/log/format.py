@@ -136,7 +136,15 @@ SCHEMAS: dict[str, bytes] = {
             "sync_ms_max": "num",
             "state": "str",
         },
-        {"time_state": "str", "time_sigma_ns": "num", "stamp_ambiguous": "int"},
+        {
+            "time_state": "str",
+            "time_sigma_ns": "num",
+            "stamp_ambiguous": "int",
+            "error_frames": "int",
+            "bus_off": "int",
+            "line_errors": "int",
+            "refused": "int",
+        },
     ),
     "swath.Event": _object(
         "swath.Event", {"time_ns": "int", "severity": "str", "source": "str", "code": "str", "text": "str"}, {}

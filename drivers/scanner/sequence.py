@@ -46,6 +46,7 @@ class SequenceTracker:
         self._modulus = modulus
         self._largest_gap = largest_gap
         self._last: _Last | None = None
+        self._missing: set[int] = set()  # unwrapped numbers just behind the newest that have not come
 
     def restart(self, sequence: int, first_time_ns: int) -> None:
         """The device says itself that it began anew: the datagram of this counter will follow without a gap."""
@@ -60,8 +61,10 @@ class SequenceTracker:
 
         Returns:
             unwrapped: (n,) int64, the counter without wraps, never used twice.
-            fresh: (n,) bool, False for a datagram that repeats the one before.
+            fresh: (n,) bool, False for a datagram that has come before.
         """
+        if self._last is None and len(sequence):
+            self._missing = set(range(int(sequence[0]) - LATE_DATAGRAMS, int(sequence[0])))
         if self._regular(sequence, first_time_ns, pps_count):
             start = 0 if self._last is None else self._last.unwrapped + 1
             offset = int(sequence[0]) if self._last is None else start
@@ -101,8 +104,7 @@ class SequenceTracker:
             self._errors["duplicate"] += 1
             return last.unwrapped, False
         if 0 < behind <= LATE_DATAGRAMS and 0 < last.first_time_ns - first_time_ns < LATE_NS:
-            self._errors["out_of_order"] += 1
-            return last.unwrapped - behind, True
+            return self._late(last.unwrapped - behind)
         set_anew = self._largest_gap is not None and ahead > self._largest_gap
         if pps_count < last.pps_count or first_time_ns < last.first_time_ns or set_anew:
             self._errors["restart"] += 1
@@ -112,7 +114,20 @@ class SequenceTracker:
             ahead = 0
         elif ahead:
             self._errors["sequence_gap"] += ahead
-        return self._remember(sequence, last.unwrapped + 1 + ahead, first_time_ns, pps_count), True
+        newest = last.unwrapped + 1 + ahead
+        oldest = newest - LATE_DATAGRAMS
+        self._missing = {at for at in self._missing if at >= oldest}
+        self._missing.update(range(max(last.unwrapped + 1, oldest), newest))
+        return self._remember(sequence, newest, first_time_ns, pps_count), True
+
+    def _late(self, at: int) -> tuple[int, bool]:
+        """A datagram behind the newest: late, or come before."""
+        if at not in self._missing:
+            self._errors["duplicate"] += 1
+            return at, False
+        self._missing.discard(at)
+        self._errors["out_of_order"] += 1
+        return at, True
 
     def _remember(self, sequence: int, unwrapped: int, first_time_ns: int, pps_count: int) -> int:
         self._last = _Last(sequence, unwrapped, first_time_ns, pps_count)

@@ -17,7 +17,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
 from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
 from drivers.scanner.srep_layout import (
     CRC,
@@ -105,6 +105,7 @@ class SrepParser(PacketParser):
         self._tracker = SequenceTracker(self.counters.errors)
         self._thinner = SampleThinner() if clock_only else None
         self._last_sequence: int | None = None
+        self._newest = -LATE_DATAGRAMS - 1
         self._last_status: tuple[int, ...] | None = None
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
@@ -126,12 +127,22 @@ class SrepParser(PacketParser):
         if not len(units):
             return []
         records: list[Record] = list(self._status(host_time_ns, header))
-        records.append(DeviceClockSamples(_clock_samples(host_time_ns, header, units)))
+        forward = self._forward(unwrapped)
+        if forward.any():
+            clock = _clock_samples(host_time_ns[forward], header[forward], units[forward])
+            records.append(DeviceClockSamples(clock))
         if self._thinner is None:
             rows = self._returns(host_time_ns, header, units, unwrapped)
             if len(rows):
                 records.append(ScannerReturns(rows))
         return records
+
+    def _forward(self, unwrapped: Int64Array) -> BoolArray:
+        """(n,) True for datagrams that came in their place: a late one would look like a clock that went back."""
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], unwrapped]))
+        self._newest = int(newest[-1])
+        forward: BoolArray = unwrapped > newest[:-1]
+        return forward
 
     def _check(self, host_time_ns: Int64Array, units: ByteRows) -> tuple[BoolArray, BoolArray]:
         """Which units are whole datagrams, and which of them are decoded; the others are counted."""

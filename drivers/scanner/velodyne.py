@@ -21,6 +21,7 @@ from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
 from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
 from drivers.scanner.spinning import Firings, returns_of_packets
+from drivers.scanner.stamps import StampTracker
 from drivers.scanner.velodyne_calibration import read_calibration
 from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
@@ -85,8 +86,9 @@ class VelodyneParser(PacketParser):
     """Decodes data and position packets of one head.
 
     Counts ``bad_length``, ``bad_block_flag``, ``bad_azimuth``, ``bad_return_mode``, ``wrong_product`` (another model
-    answers), ``cadence_gap`` (packets missing by the stamps), ``stamp_jump`` (the head's clock was set),
-    ``duplicate``, and the position packets' ``bad_nmea`` and ``nmea_second_mismatch``.
+    answers), ``cadence_gap`` (packets missing by the stamps), ``out_of_order`` (late, counted as missing before),
+    ``stamp_jump`` (the head's clock was set), ``duplicate``, and the position packets' ``bad_nmea`` and
+    ``nmea_second_mismatch``.
 
     Args:
         settings: ``geometry.file`` is the head's own calibration, db.xml or YAML.
@@ -106,6 +108,7 @@ class VelodyneParser(PacketParser):
         self._flags = [head.used_block_flags(dual=dual) for dual in (False, True)]
         self._position = PositionReader(self.counters)
         self._thinner = SampleThinner() if clock_only else None
+        self._stamps = StampTracker(self.counters.errors, HOUR_US, MAX_SILENCE_US)
         self._last_stamp_us: int | None = None
         self._last_azimuth = 0
         self._last_turn = 0.0
@@ -178,30 +181,20 @@ class VelodyneParser(PacketParser):
         """Look for missing packets between the stamps; follow the rotation from packet to packet.
 
         Returns:
-            fresh: (n,) False for a packet that repeats the one before.
+            fresh: (n,) False for a packet that has come before.
             turn: (n,) rotation from group to group in 0.01°, as far as it is known.
         """
         stamps = packets["stamp_us"].astype(np.int64)
         if not len(stamps):
             return np.zeros(0, dtype=np.bool_), np.zeros(0)
-        before = np.concatenate([[stamps[0] - 1 if self._last_stamp_us is None else self._last_stamp_us], stamps[:-1]])
         first = self._last_stamp_us is None
+        before = np.concatenate([[stamps[0] - 1 if self._last_stamp_us is None else self._last_stamp_us], stamps[:-1]])
         self._last_stamp_us = int(stamps[-1])
         step_us = (stamps - before) % HOUR_US
         groups = np.where(packets["mode"] == MODE_DUAL, self._head.groups(dual=True), self._head.groups(dual=False))
-        steps = np.rint(step_us / (groups * self._head.group_ns / 1000)).astype(np.int64)
-        jumped = step_us > MAX_SILENCE_US
-        lost = (steps > 1) & ~jumped
-        if first:
-            jumped[0] = lost[0] = False
-        for code, count in (
-            ("stamp_jump", int(jumped.sum())),
-            ("cadence_gap", int((steps[lost] - 1).sum())),
-            ("duplicate", int((step_us == 0).sum())),
-        ):
-            if count:
-                self.counters.errors[code] += count
-        fresh: BoolArray = step_us != 0
+        nominal_us = groups * self._head.group_ns / 1000
+        fresh = self._stamps.follow(stamps, nominal_us)
+        steps = np.rint(step_us / nominal_us).astype(np.int64)
         return fresh, self._turn(packets["blocks"]["azimuth"][:, 0], steps * groups, step_us, known=not first)
 
     def _turn(self, azimuth: NDArray[np.uint16], groups: Int64Array, step_us: Int64Array, *, known: bool) -> FloatArray:

@@ -20,6 +20,7 @@ YOUNG_SPREAD_S = 0.02  # … that even, and …
 LEAST_AGE_S = 0.004  # … not impossibly quick
 STRADDLE_MEMORY_S = 600  # a message just before an edge makes those just after it suspect for so many edges
 LATE_AGE_S = 0.7  # a steady delay above this may be one second and a bit less or more
+LEAP_ERROR_S = 20  # a receiver that does not know GPS − UTC yet is wrong by at most all of it
 VOTER_FORGOTTEN_S = 60  # a voter silent for so many edges has no say
 
 
@@ -177,6 +178,10 @@ class Labeller:
         fresh = [v for v in sure if not v.late]
         if not doubt and fresh:
             gps_scale = any(not v.key.utc for v in fresh)
+            error_s = 0 if gps_scale else _leap_error_s(fresh, wall_offset)
+            if error_s:
+                text = f"{_name(fresh[0])} is {error_s:+d} s against the disciplined wall clock: its leap seconds?"
+                return Verdict(fresh[0].offset, text)
             if wall is None or wall == fresh[0].offset or (gps_scale and wall_leap is not LeapTrust.SAID):
                 return self._by(fresh[0], "vote")
             doubt = f"messages and the disciplined wall clock differ by {wall - (fresh[0].offset or 0)} s"
@@ -220,6 +225,18 @@ class Labeller:
         if not bound and all(v.late for v in sure):
             return f"{_name(first)} comes steadily more than {LATE_AGE_S} s after its edge"
         return ""
+
+
+def _leap_error_s(voters: list[Voter], wall_offset: int | None) -> int:
+    """By how many seconds UTC of which no receiver has said the leap count differs from the wall clock's, if by leaps.
+
+    One second less is a message that came late, which the wall clock decides; more than `LEAP_ERROR_S` is a wall clock
+    that is wrong.
+    """
+    if wall_offset is None or any(vote.leap is LeapTrust.SAID for voter in voters for vote in voter.votes):
+        return 0
+    error_s = (voters[0].offset or 0) - wall_offset
+    return error_s if error_s != -1 and abs(error_s) <= LEAP_ERROR_S else 0
 
 
 def _name(voter: Voter) -> str:

@@ -108,6 +108,7 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
     lost = {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0}
     source: dict[str, object] = {"units": 1_234_567, "bytes": 1, "rate_hz": 20000.0, "gaps": 0, "longest_gap_s": 0.0}
     source |= {"lost": lost, "account_errors": 0, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
+    source |= {"trouble": {"bus_off": 2, "error_frames": 1_500}}
     numbers: dict[str, object] = {
         "missing_parts": [],
         "last_events": [],
@@ -124,3 +125,4 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
     assert "…" not in text
     assert "57.7µs" in text
     assert "  ? mark: [x]\n" in text
+    assert "scanner/left-front/aux: 2 bus off, 1,500 error frames" in text

@@ -94,6 +94,67 @@ def test_delay_and_named_edge_of_the_configuration_are_honoured(tmp_path: Path) 
     assert abs(seconds["next"] - seconds["plain"] + 1.0) < 2e-6
 
 
+GSV = b"$GPGSV,1,1,02,02,41,106,45,05,30,200,44*7E\r\n"
+CHANGED_S, BACK_S = 15, 30
+
+
+def play_changing(assembly: Assembly, *, edges: bool, messages: bool) -> dict[str, list[str]]:
+    """The recording, of which other sentences without time take the place of all messages for 15 s; states a second."""
+    keeper, start_ns = assembly.timekeeper, assembly.clock.now_ns()
+    units_seen, edge_seen = keeper.units_seen("gnss/rover"), keeper.edge_seen("pps/main")
+    changed = (TimedUnit(at * SECOND_NS // 5, "gnss/rover", GSV) for at in range(CHANGED_S * 5, BACK_S * 5))
+    kept = (unit for unit in played() if not CHANGED_S <= unit.time_ns / SECOND_NS < BACK_S)
+    ticks = (TimedUnit(at * SECOND_NS + SECOND_NS // 2, "tick", b"") for at in range(SECONDS + 70))
+    streams = [ticks, pps_units(SECONDS) if edges else (), *([changed, kept] if messages else [])]
+    states: dict[str, list[str]] = {"gnss/rover": [], "pps/main": []}
+    for sequence, unit in enumerate(merge(*streams, key=lambda unit: unit.time_ns)):
+        host_ns = start_ns + unit.time_ns
+        if unit.source == "tick":
+            monotonic_ns = host_ns - assembly.clock.offset_ns
+            sample = {"realtime_ns": host_ns, "monotonic_ns": monotonic_ns, "monotonic_raw_ns": monotonic_ns}
+            keeper.clock_sample(sample, UNDISCIPLINED)
+            for source, found in states.items():
+                found.append(str(keeper.status(source, host_ns)["time_state"]))
+        elif unit.source == "pps/main":
+            edge_seen(host_ns, sequence)
+        else:
+            block = UnitBlock(np.frombuffer(unit.data, np.uint8)[np.newaxis, :])
+            units_seen(np.array([host_ns], dtype=np.int64), block)
+    return states
+
+
+def told_of(assembly: Assembly, *codes: str) -> list[str]:
+    return [event.code for event in assembly.shared.events.recent if event.code in codes]
+
+
+def test_a_receiver_that_changes_its_messages_is_told_and_edges_carry_the_second_on(tmp_path: Path) -> None:
+    assembly = assembled(tmp_path / "x")
+    states = play_changing(assembly, edges=True, messages=True)
+    assert set(states["gnss/rover"][12:SECONDS]) == {"LOCKED"}
+    assert set(states["gnss/rover"][SECONDS + 6 : SECONDS + 30]) == {"HOLDOVER"}  # then there are no edges any more
+    assert told_of(assembly, "time_messages_stopped", "time_messages_back", "second_ambiguous") == [
+        "time_messages_stopped",
+        "time_messages_back",
+    ]
+
+
+def test_time_without_pps_is_coarse_and_lost_a_minute_after_its_last_message(tmp_path: Path) -> None:
+    assembly = assembled(tmp_path / "x")
+    states = play_changing(assembly, edges=False, messages=True)
+    assert states["gnss/rover"][0] == "NO_TIME"
+    assert set(states["gnss/rover"][8 : SECONDS + 59]) == {"COARSE"}
+    assert states["gnss/rover"][SECONDS + 62 :] == ["LOST"] * 8
+    assert states["pps/main"] == states["gnss/rover"]  # they share the clock
+    assert told_of(assembly, "time_messages_stopped") == ["time_messages_stopped"]  # at the end no data comes at all
+
+
+def test_pps_without_time_says_no_second(tmp_path: Path) -> None:
+    assembly = assembled(tmp_path / "x")
+    states = play_changing(assembly, edges=True, messages=False)
+    assert set(states["pps/main"]) == set(states["gnss/rover"]) == {"NO_TIME"}
+    assert told_of(assembly, "second_known", "time_messages_stopped") == []
+
+
 @pytest.mark.parametrize("broken", ["parser", "clock"])
 def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(tmp_path: Path, broken: str) -> None:
     assembly = assembled(tmp_path / "x")

@@ -278,6 +278,24 @@ def test_gaps_late_and_repeated_datagrams_are_told_apart() -> None:
     assert pulses == [0, 1, 4, 3, 5, 6, 12]
 
 
+@pytest.mark.parametrize("cut", [1, 3, 100])
+def test_doubled_and_shuffled_datagrams_give_each_pulse_once_and_no_time_that_goes_back(cut: int) -> None:
+    """Neighbours swapped throughout, every fifth datagram again five places later; 70 ms apart."""
+    order = [number ^ 1 for number in range(200)]
+    for at in range(195, -1, -5):
+        order.insert(at + 5, order[at])
+    parser = make_parser()
+    records = feed_batched(parser, [line(n, 700_000 * n) for n in order], [cut])
+    assert (np.sort(returns_of(records)["pulse_id"] >> np.uint64(16)) == np.unique(order)).all()
+    errors = parser.counters.errors
+    assert errors["duplicate"] == 40
+    assert errors["out_of_order"] == 100
+    assert errors["sequence_gap"] == 100 - 1  # each late one was missed before, save the one before the very first
+    assert set(errors) == {"duplicate", "out_of_order", "sequence_gap"}
+    clock = np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
+    assert (np.diff(clock["device_time_ns"]) > 0).all()
+
+
 @pytest.mark.parametrize("cut", [1, 100])
 def test_restart_begins_a_segment_without_a_gap(cut: int) -> None:
     parser = make_parser()

@@ -197,6 +197,29 @@ def test_lost_packets_are_counted_by_the_stamps() -> None:
     assert parser.counters.errors == {"cadence_gap": 7}
 
 
+@pytest.mark.parametrize("cut", [1, 7, 1000])
+def test_late_and_repeated_packets_are_no_jumps(cut: int) -> None:
+    """Neighbours swapped in one place, a packet four places late in another, copies three places later."""
+    units = recording()[:200]
+    units[20], units[21] = units[21], units[20]
+    units.insert(64, units.pop(60))
+    units.insert(103, units[100])
+    units.insert(104, units[100])
+    parser = make_parser()
+    records: list[Record] = []
+    for at in range(0, len(units), cut):
+        records += feed(parser, units[at : at + cut])
+    assert parser.counters.errors == {"cadence_gap": 2, "out_of_order": 2, "duplicate": 2}
+    assert len(returns_of(records)) == len(returns_of(feed(make_parser(), recording()[:200])))
+
+
+def test_a_head_that_restarts_is_one_jump_and_no_gap() -> None:
+    parser = make_parser()
+    feed(parser, [packet(900_000_000 + 1_327 * number) for number in range(20)])
+    feed(parser, [packet(1_327 * number) for number in range(20)])
+    assert parser.counters.errors == {"stamp_jump": 1}
+
+
 # --- the manual's figures -------------------------------------------------------------------------------------------
 
 

@@ -263,6 +263,46 @@ def test_receiver_restart_with_wrong_time_it_vouches_for() -> None:
     assert outcome.counts(1120)[LOCKED] == len(outcome.states) - 1120
 
 
+def default_leap_count(seconds_ahead: int, wall: Callable[[int], int] | None) -> Outcome:
+    """NMEA alone, valid from the start, by a leap count that is too small until second 700."""
+    senders = nmea(error_s=lambda s: 0 if s >= 700 else seconds_ahead)
+    simulation = Simulation(START, Oscillator(1500, seed=5), Edges(), senders, seed=11)
+    clock = PpsClock(18)
+
+    def set_wall(_: int, host_ns: int) -> None:
+        if wall is not None:
+            realtime_ns = unix_ns(wall(simulation.true_gps_ns(host_ns)))
+            clock.set_wall_clock(host_ns, realtime_ns, disciplined=True, sigma_s=0.01)
+
+    return run(simulation, clock, each_second=set_wall)
+
+
+@pytest.mark.parametrize("seconds_ahead", [1, 2, 18])
+def test_a_disciplined_wall_clock_unmasks_a_default_leap_count(seconds_ahead: int) -> None:
+    """COARSE with the reason until the receiver knows; LOCKED from then on, never on a wrong second."""
+    outcome = default_leap_count(seconds_ahead, lambda gps_ns: gps_ns)
+    assert outcome.wrong_seconds == 0
+    assert outcome.counts(30, 700) == {COARSE: 670}
+    assert outcome.counts(730)[LOCKED] == len(outcome.states) - 730
+    assert outcome.codes == ["second_ambiguous", "second_confirmed", "second_known"]
+    assert f"{seconds_ahead:+d} s against the disciplined wall clock: its leap seconds?" in outcome.events[0][2]
+
+
+def test_a_default_leap_count_nobody_contradicts_is_believed_until_it_changes() -> None:
+    """What no software can see (docs/time.md); once it changes, never LOCKED again on seconds that may be wrong."""
+    outcome = default_leap_count(2, None)
+    assert outcome.counts(30, 700) == {LOCKED: 670}
+    assert outcome.counts(730) == {COARSE: len(outcome.states) - 730}
+    assert outcome.codes == ["second_known", "second_ambiguous"]
+    assert "-2 s against the second held" in outcome.events[1][2]
+
+
+def test_a_wall_clock_of_another_hour_shakes_nothing() -> None:
+    outcome = default_leap_count(0, lambda gps_ns: gps_ns - 3600 * NS)
+    assert outcome.wrong_seconds == 0
+    assert outcome.counts(30)[LOCKED] == len(outcome.states) - 30
+
+
 def test_leap_count_said_relabels_in_one_logged_step() -> None:
     """Assumed 19, said 18: two events, all seconds since lock move together, history included."""
     senders = [Sender("RMC", UTC), time_gps(silent=lambda s: s < 500)]
