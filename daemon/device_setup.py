@@ -215,9 +215,10 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish:
 
 
 def _why_not_sent(spec: TransportSpec) -> str:
-    if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options):
+    """A datagram goes to the group where there is one, and that is not the device."""
+    if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
         return ""
-    hint = "; say ?source=<its address>" if spec.kind == "udp" else ""
+    hint = "; say ?source=<its address>, and no group" if spec.kind == "udp" else ""
     return f"nothing can be sent by {spec.text}{hint}"
 
 

@@ -155,10 +155,11 @@ class TestNovatel:
         assert set(outcomes(found)) == {Outcome.ACCEPTED}
         assert commands == [step.message.data.strip() for step in found.steps]
 
-    def test_a_device_without_an_address_cannot_be_sent_to(self, tmp_path: Path) -> None:
-        text = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{free_udp_port()}"\nprotocol = "novatel"\n'
+    @pytest.mark.parametrize("options", ["", "?source=127.0.0.2&group=239.74.163.9"])
+    def test_a_device_without_an_address_of_its_own_cannot_be_sent_to(self, tmp_path: Path, options: str) -> None:
+        text = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{free_udp_port()}{options}"\nprotocol = "novatel"\n'
         found = apply(text, tmp_path)["gnss/rover"]
-        assert found.problem.endswith("say ?source=<its address>")
+        assert found.problem.endswith("say ?source=<its address>, and no group")
         assert set(outcomes(found)) == {Outcome.NOT_SENT}
 
 
