@@ -102,6 +102,13 @@ def run_recover(folder: Path) -> None:
     swath("recover", record_a_little(folder))
 
 
+def run_setup(folder: Path) -> None:
+    """Shows only: with --apply it is run against simulators in test_device_setup.py."""
+    said = swath("setup", aircraft_of_readme(folder))
+    assert "LOG TIMEB ONTIME 1" in said
+    assert "nothing was sent" in said
+
+
 def run_doctor(folder: Path) -> None:
     """This computer may well be found wanting: exit status 1, with what mends it."""
     command = [sys.executable, "-m", "daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
@@ -142,6 +149,8 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "swath devices": run_devices,
     "swath check --offline /etc/swath/swath.toml": run_check_offline,
     "swath check /etc/swath/swath.toml": run_check,
+    "swath setup /etc/swath/swath.toml": run_setup,
+    "swath setup --apply": run_setup,
     "swath doctor /etc/swath/swath.toml": run_doctor,
     "swath monitor": run_beside_a_recorder,
     'swath mark "line 4 start"': run_beside_a_recorder,
