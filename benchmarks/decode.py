@@ -22,14 +22,20 @@ from pathlib import Path
 import numpy as np
 from isal.isal_zlib import crc32
 
+from drivers.core.checksums import crc64_xz
 from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Parser, ParserCounters
 from drivers.imu.canmod_gps import CanmodGpsParser
 from drivers.imu.dbc import DbcParser
+from drivers.scanner.hesai import HesaiParser
+from drivers.scanner.hesai_heads import QT64, XT32
+from drivers.scanner.ouster import OusterParser
+from drivers.scanner.ouster_layout import LidarLayout
 from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from drivers.scanner.velodyne import DATA_BYTES, PACKET_DTYPE, VelodyneParser
+from drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
+from drivers.scanner.velodyne_heads import VLP16, VLP32C, VLS128
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
@@ -134,33 +140,109 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
         yield Figure(name, "returns", decode, 15e6, rate(least, rows, repeats), "CRC-32 + copy of the rows")
 
 
+def head_figure(name: str, make: Callable[[], Parser], units: ByteRows, target: float, repeats: int) -> Figure:
+    """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
+    batches = batches_of(units)
+    rows = decode_all(make, batches)
+    copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+
+    def least() -> None:
+        np.copyto(taken, units)
+        copy()
+
+    decode = rate(lambda: decode_all(make, batches), rows, repeats)
+    return Figure(name, "returns", decode, target, rate(least, rows, repeats), "copy of packets and rows")
+
+
+def measure_hesai(repeats: int) -> Iterator[Figure]:
+    """PandarXT-32 and PandarQT, dual return, real packets with a sequence that goes on."""
+    for name, head, recording in (
+        ("PandarXT-32, dual return", XT32, "nebula_xt32.pcap.gz"),
+        ("PandarQT, dual return", QT64, "nebula_qt64.pcap.gz"),
+    ):
+        packets = [unit.data for unit in read_pcap(FIXTURES / "hesai" / recording)]
+        units = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(len(packets), -1)
+        units = np.tile(units, (max(1, 3600 // len(units)), 1))
+        units.view(head.packet_dtype())["sequence"][:, 0] = np.arange(1, len(units) + 1)
+        settings = DeviceSettings("scanner/bench")
+        yield head_figure(name, lambda h=head, s=settings: HesaiParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
+
+
 def velodyne_units(name: str, step_us: float) -> ByteRows:
     """The data packets of a recording, several times over, with stamps that go on."""
     packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
     once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
-    units = np.tile(once, (max(1, 3600 // len(once)), 1))
+    return with_stamps(np.tile(once, (max(1, 3600 // len(once)), 1)), step_us)
+
+
+def with_stamps(units: ByteRows, step_us: float) -> ByteRows:
+    """Velodyne data packets with stamps that go on."""
     units.view(PACKET_DTYPE)["stamp_us"][:, 0] = np.rint(np.arange(len(units)) * step_us)
     return units
 
 
+def as_dual(units: ByteRows) -> ByteRows:
+    """Single-return packets of one azimuth a block as dual-return ones: each block's returns a pair with the next's."""
+    dual = units.copy()
+    packets = dual.view(PACKET_DTYPE)[:, 0]
+    packets["mode"], packets["blocks"]["azimuth"] = (
+        MODE_DUAL,
+        np.repeat(packets["blocks"]["azimuth"][:, ::2], 2, axis=1),
+    )
+    return dual
+
+
+def as_vls128(units: ByteRows) -> ByteRows:
+    """VLP-32C packets as a VLS-128's: four blocks a sequence with one azimuth."""
+    other = units.copy()
+    packets = other.view(PACKET_DTYPE)[:, 0]
+    packets["product"], packets["blocks"]["flag"] = VLS128.product_ids[0], VLS128.used_block_flags(dual=False)
+    packets["blocks"]["azimuth"] = np.repeat(packets["blocks"]["azimuth"][:, ::4], 4, axis=1)
+    return other
+
+
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
-    """VLP-16, both return modes, real packets."""
-    for name, recording, step_us in (
-        ("VLP-16, strongest return", "mrpt_vlp16_gps.pcap.gz", 1327.104),
-        ("VLP-16, dual return", "nebula_vlp16.pcap.gz", 663.552),
+    """VLP-16 in both return modes and VLP-32C, real packets; the VLP-32C's as dual ones and as a VLS-128's too."""
+    vlp32c = velodyne_units("nebula_vlp32.pcap.gz", 663.552)
+    for name, head, units in (
+        ("VLP-16, strongest return", VLP16, velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)),
+        ("VLP-16, dual return", VLP16, velodyne_units("nebula_vlp16.pcap.gz", 663.552)),
+        ("VLP-32C, strongest return", VLP32C, vlp32c),
+        ("VLP-32C, dual return", VLP32C, with_stamps(as_dual(vlp32c), 331.776)),
+        ("VLS-128, strongest return", VLS128, with_stamps(as_vls128(vlp32c), 159.9)),
     ):
-        units = velodyne_units(recording, step_us)
-        batches = batches_of(units)
-        make = lambda: VelodyneParser(DeviceSettings("scanner/bench"))  # noqa: E731
-        rows = decode_all(make, batches)
-        copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
+        settings = DeviceSettings("scanner/bench")
+        yield head_figure(name, lambda h=head, s=settings: VelodyneParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
 
-        def least(units: ByteRows = units, taken: ByteRows = taken, copy: Callable[[], object] = copy) -> None:
-            np.copyto(taken, units)
-            copy()
 
-        decode = rate(lambda m=make, b=batches: decode_all(m, b), rows, repeats)  # type: ignore[misc]
-        yield Figure(name, "returns", decode, 10e6, rate(least, rows, repeats), "copy of packets and rows")
+def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
+    """The first frame of a recording, several times over, with frame numbers, stamps and CRCs that go on."""
+    per_frame = layout.head.columns_per_frame // layout.head.columns_per_packet
+    packets = [unit.data for unit in read_pcap(FIXTURES / "ouster" / f"{recording}.pcap.gz", port=7502)][:per_frame]
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(per_frame, -1)
+    units = np.tile(once, (max(1, 8_000_000 // once.size), 1))
+    table = units.view(layout.dtype).reshape(-1)
+    frame, columns = np.arange(len(units)) // per_frame, table["columns"]
+    columns["time_ns"] = 97_656 * np.arange(columns.size).reshape(columns.shape)
+    if layout.legacy:
+        columns["frame_id"] = frame[:, np.newaxis]
+        return units
+    table["frame_id"] = frame
+    table["crc"] = crc64_xz(units[:, :-8])
+    return units
+
+
+def measure_ouster(repeats: int) -> Iterator[Figure]:
+    """Ouster heads, real packets; those with a header got the CRC that newer firmware sends."""
+    for name, recording, metadata in (
+        ("Ouster, LEGACY, 32 beams", "OS-1-32-G_v2.1.1_1024x10", "OS-1-32-G_v2.1.1_1024x10"),
+        ("Ouster, dual return, 32 beams", "OS-0-32-U1_v2.2.0_1024x10", "OS-0-32-U1_v2.2.0_1024x10"),
+        ("Ouster, low rate, 128 beams", "OS-1-128_v2.3.0_1024x10_lb_n3", "OS-1-128_v2.3.0_1024x10"),
+    ):
+        file = (FIXTURES / "ouster" / f"{metadata}.json").read_bytes()
+        settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
+        units = ouster_units(recording, OusterParser(settings).layout)
+        yield head_figure(name, lambda s=settings: OusterParser(s), units, 8e6, repeats)  # type: ignore[misc]
 
 
 # --- CAN ------------------------------------------------------------------------------------------------------------
@@ -276,7 +358,7 @@ def main() -> None:
     arguments = parser.parse_args()
     figures = []
     print(f"{'decoding, one core':<30} {'rate':>10} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
-    for measure in (measure_srep, measure_velodyne, measure_can, measure_framing):
+    for measure in (measure_srep, measure_velodyne, measure_hesai, measure_ouster, measure_can, measure_framing):
         for figure in measure(arguments.repeats):
             figures.append(figure)
             asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"

@@ -61,4 +61,5 @@ def judge(entry: DeviceEntry, kept: list[ChunkBatch]) -> str | None:
     for batch in kept:
         heard.add(parser.feed_batch(batch))
     heard.add(parser.close())
-    return not_understood(entry, heard, parser.counters.messages.total(), kept)
+    counters = parser.counters
+    return not_understood(entry, heard, counters.messages.total(), kept, refused=counters.bad_messages)

@@ -286,7 +286,7 @@ def _answer_problems(reading: Reading) -> list[str]:
     """What is wrong with what came."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     good = counters.messages.total()
-    other = not_understood(entry, heard, good, reading.kept)
+    other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
     if other is not None:
         return [other]
     found: list[str] = []
@@ -306,7 +306,7 @@ def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
             return ["no time message: the clock cannot be set by it; switch one on"]
         return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
     rate = heard.imu_clock_rate
-    if rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
+    if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
         return [f"its counter runs {rate:.3g} times as fast as time: is tick_hz right?"]
     if entry.pps is not None and heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]

@@ -55,15 +55,22 @@ class Events:
         self.recent: deque[Event] = deque(maxlen=100)
         self.channel_id = self._channel.channel_id
 
-    def post(self, severity: Severity, source: str, code: str, text: str) -> None:
+    def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
         """Report an event; ``source`` is kind/name, or what else it happened to (``recorder``, ``disk``)."""
-        item = QueueItem("events", self.make(severity, source, code, text))
-        self._queue.put(item, always=True)
+        event = self._note(severity, source, code, text)
+        self._queue.put(QueueItem("events", self._encode(event)), always=True)
+        return event
 
     def make(self, severity: Severity, source: str, code: str, text: str) -> EncodedBlock:
         """The event's block, for the writer itself, which must place it in a certain part."""
+        return self._encode(self._note(severity, source, code, text))
+
+    def _note(self, severity: Severity, source: str, code: str, text: str) -> Event:
         event = Event(self._clock.now_ns(), severity, source, code, text)
         with self._lock:
             self.recent.append(event)
         log.log(_LOG_LEVEL[severity], "%s %s: %s", source, code, text)
+        return event
+
+    def _encode(self, event: Event) -> EncodedBlock:
         return self._channel.encode(event.time_ns, asdict(event))

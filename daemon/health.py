@@ -39,11 +39,18 @@ def duration_text(seconds: float) -> str:
     return f"{int(seconds // 60)} min" if seconds >= 60 else f"{int(seconds)} s"
 
 
+def clock_text(time_ns: object) -> str:
+    """UTC of a host time as ``10:15:03``; whatever else a log holds there is a question mark."""
+    if isinstance(time_ns, int) and 0 <= time_ns < 1 << 63:
+        return time.strftime("%H:%M:%S", time.gmtime(time_ns // 1_000_000_000))
+    return "?"
+
+
 def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
     """What the operator reads in ``systemctl status``."""
     if writer.state is not Writing.RECORDING:
         return f"NOT RECORDING: {writer.reason}"
-    troubles = [text for text in map(_trouble, writer.statuses.items()) if text]
+    troubles = [text for source, status in writer.statuses.items() if (text := source_trouble(source, status))]
     sources = len(writer.statuses)
     told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in" if sources else "begins"
     room = f"{writer.free_bytes / 1e9:.1f} GB free"
@@ -52,8 +59,8 @@ def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
     return f"recording {session_id} part {part}: {told}; {room}"
 
 
-def _trouble(item: tuple[str, Mapping[str, object]]) -> str:
-    source, status = item
+def source_trouble(source: str, status: Mapping[str, object]) -> str:
+    """What is wrong with a source by its status, in a few words; nothing when all is well."""
     lost = sum(int(str(status[key])) for key in ("lost_kernel", "lost_queue", "lost_write"))
     words = []
     if status["state"] == "silent":

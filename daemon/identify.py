@@ -9,7 +9,7 @@ import numpy as np
 
 from daemon.config import DeviceEntry, GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import all_drivers
+from drivers.core.registry import all_drivers, find_driver
 from georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # one frame may be chance
@@ -87,7 +87,7 @@ def describe_time(entry: DeviceEntry, heard: Heard) -> str:
         return f"{describe_tag(heard.valid_time.time)} ({heard.valid_time.message})"
     if heard.time_messages:
         return "not valid"
-    if heard.sees_pps is not None:
+    if heard.sees_pps is not None and find_driver(entry.kind, entry.protocol).tells_pps:
         return "PPS seen" if heard.sees_pps else "no PPS"
     return "none" if entry.kind == "gnss" else ""
 
@@ -107,14 +107,14 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
 
     A parser that decodes records is before one that only finds messages (receivers mix protocols on a port, and
     their parsers frame each other's); the latter must find more than ``than``, what the configured one found. A
-    driver that cannot work without settings that only the right configuration has is left out.
+    driver that cannot work without settings that only the right configuration has is asked by its probe, or left out.
     """
     best, most = None, (0, max(than, LEAST_MESSAGES - 1))
     for protocol, driver in all_drivers(entry.kind).items():
         if protocol == entry.protocol:
             continue
         try:
-            parser = driver.make_parser(_default_settings(entry, protocol))
+            parser = (driver.make_probe or driver.make_parser)(_default_settings(entry, protocol))
         except DriverSettingsError:
             continue
         heard = Heard()
@@ -127,7 +127,9 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     return best
 
 
-def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch]) -> str | None:
+def not_understood(
+    entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch], *, refused: int = 0
+) -> str | None:
     """What a device is instead of what it was configured as, or that nothing of it is known; None: it is understood.
 
     Args:
@@ -135,8 +137,10 @@ def not_understood(entry: DeviceEntry, heard: Heard, messages: int, kept: list[C
         heard: what the configured parser made of its bytes.
         messages: how many the configured parser found in them.
         kept: the bytes, or the first of them.
+        refused: messages it could make nothing of. More than good ones: a head's second port may say the same in
+            another model, while its own port is not understood.
     """
-    if messages and heard.counts:
+    if messages and heard.counts and refused <= messages:
         return None
     other = identify(entry, kept, than=messages)
     if other is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -31,22 +32,37 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
         raise LogError(f"config.toml in the log: {str(error).splitlines()[0]}") from error
 
 
-def stored_parsers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Parser], list[str]]:
-    """A parser a source (``kind/name``), and a line for every source that has none."""
+def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable[[], Parser]], list[str]]:
+    """What makes a source's parser, by source (``kind/name``), and a line for what cannot be known.
+
+    The callables raise DriverSettingsError where the settings are none that the driver can work with.
+    """
     try:
         config = stored_config(attachments)
     except LogError as error:  # another version's: what is in the log still counts
         return {}, [f"{error}; units are counted, not decoded"]
-    parsers: dict[str, Parser] = {}
-    troubles: list[str] = []
     if config is None:
-        return parsers, ["the log holds no configuration: units are counted, not decoded"]
+        return {}, ["the log holds no configuration: units are counted, not decoded"]
+    makers: dict[str, Callable[[], Parser]] = {}
+    troubles: list[str] = []
     for kind, name, table in config.device_tables():
         files = {key: attachments.get(attachment_name(key, name, path)) for key, path in config.files_of(table).items()}
         contents: dict[str, bytes] = {key: data for key, data in files.items() if data is not None}
         settings = DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
         try:
-            parsers[settings.source] = find_driver(kind, table.protocol).make_parser(settings)
-        except (UnknownProtocolError, DriverSettingsError) as error:
+            makers[settings.source] = partial(find_driver(kind, table.protocol).make_parser, settings)
+        except UnknownProtocolError as error:
             troubles.append(f"{settings.source}: {error}")
+    return makers, troubles
+
+
+def stored_parsers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Parser], list[str]]:
+    """A parser a source (``kind/name``), and a line for every source that has none."""
+    makers, troubles = stored_drivers(attachments)
+    parsers: dict[str, Parser] = {}
+    for source, make in makers.items():
+        try:
+            parsers[source] = make()
+        except DriverSettingsError as error:
+            troubles.append(f"{source}: {error}")
     return parsers, troubles

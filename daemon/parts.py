@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from daemon.channels import ChannelTable
 from daemon.log.durable import sync_directory
@@ -28,6 +28,26 @@ class Attachment:
     name: str
     media_type: str
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Sign:
+    """What ``recording.json`` says: which file of a directory is growing."""
+
+    session_id: str
+    part: int
+    path: Path
+    boot_id: str
+
+
+def read_sign(directory: Path) -> Sign | None:
+    """The sign of a directory; None where nothing is being recorded, or it is none of ours."""
+    try:
+        said = json.loads((directory / RECORDING_SIGN).read_text())
+        name = PurePath(said["path"]).name
+        return Sign(str(said["session_id"]), int(said["part"]), directory / name, str(said["boot_id"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 @dataclass(slots=True)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from daemon.answers import judge
 from daemon.block_queue import QueueItem
+from daemon.control import Control
 from daemon.errors import ExitCode, UserError
 from daemon.events import Severity
 from daemon.health import sentence, stuck_threads
@@ -43,6 +44,7 @@ class RecorderProcess:
         self._assembly = assembly
         self._service = service
         self._stop = asyncio.Event()
+        self._control = Control(assembly)
         self._stuck: list[str] = []
         self._failed = False
 
@@ -96,6 +98,7 @@ class RecorderProcess:
         assembly.recorder.start()
         for receiver in assembly.receivers:
             receiver.start()
+        self._control.open()
         gc.collect()
         gc.freeze()
         gc.disable()  # a collection stops every thread: `_watch` has them, each second
@@ -103,6 +106,7 @@ class RecorderProcess:
     def _end(self) -> None:
         """Receivers first, then the writer with all they gave; a thread that does not end is left behind."""
         assembly = self._assembly
+        self._control.close()
         assembly.shared.stop.set()
         deadline_s = time.monotonic() + RECEIVERS_END_S
         for receiver in assembly.receivers:

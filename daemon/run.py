@@ -59,8 +59,12 @@ def make_session_info(name: str, clock: HostClock) -> SessionInfo:
     )
 
 
-def take_directory(directory: Path) -> int:
+def take_directory(directory: Path, key: str = "session.directory") -> int:
     """Create the log directory if need be and lock it; returns the lock's descriptor, which must stay open.
+
+    Args:
+        directory: of logs.
+        key: what says so, for people.
 
     Raises:
         UserError: it cannot be written, or another recorder is at work in it.
@@ -69,13 +73,13 @@ def take_directory(directory: Path) -> int:
         directory.mkdir(parents=True, exist_ok=True)
         lock = os.open(directory / ".swath.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
     except OSError as error:
-        text = f"session.directory {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
+        text = f"{key} {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
         raise UserError(text, exit_code=ExitCode.IO) from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(lock)
-        text = f"session.directory {directory}: another recorder is at work there; stop it or give another directory"
+        text = f"{key} {directory}: another recorder is at work there; stop it or give another directory"
         raise UserError(text, exit_code=ExitCode.IO) from error
     return lock
 
@@ -155,13 +159,13 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
     if device.kind == "gnss":
         _add_gnss_time(assembly, device)
         units_seen.append(assembly.timekeeper.units_seen(device.source))
-    main = _wire(device, device.transport, "")
+    main = make_wire(device, device.transport, "")
     session = Session(lambda: open_transport(device.transport))
     assembly.receivers.append(UnitReceiver(main, session, assembly.shared, units_seen))
     if device.auxiliary is not None:
         auxiliary = device.auxiliary
         aux_session = Session(lambda: open_transport(auxiliary))
-        aux = _wire(device, auxiliary, "/aux")
+        aux = make_wire(device, auxiliary, "/aux")
         assembly.receivers.append(UnitReceiver(aux, aux_session, assembly.shared))
 
 
@@ -175,7 +179,8 @@ def _add_gnss_time(assembly: Assembly, device: DeviceEntry) -> None:
     assembly.timekeeper.add_gnss(device.source, pps_source, parser, names, gnss.leap_seconds)
 
 
-def _wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
+def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
+    """Where the units of a device's port go in a log; ``suffix`` is ``/aux`` for a second port."""
     metadata = {"protocol": device.protocol, "transport": transport.text}
     if transport.kind == "udp":
         metadata["port"] = str(transport.port)

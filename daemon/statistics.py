@@ -162,6 +162,7 @@ def session_statistics(
         "attachments": sorted(attachments),
         "sources": {source: numbers.plain(complete=complete) for source, numbers in sorted(sources.items())},
         "events": dict(Counter(str(event.get("severity")) for event in events)),
+        "marks": [event for event in events if event.get("code") == "mark"],
         "last_events": [event for event in events if event.get("severity") != "info"][-10:],
         "damage": [
             {

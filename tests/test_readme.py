@@ -14,6 +14,7 @@ from typer.main import get_command
 
 from daemon.cli.main import app
 from daemon.config import load_config
+from tests.daemon.rig import Recorder, session_table
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -101,6 +102,40 @@ def run_recover(folder: Path) -> None:
     swath("recover", record_a_little(folder))
 
 
+def run_setup(folder: Path) -> None:
+    """Shows only: with --apply it is run against simulators in test_device_setup.py."""
+    said = swath("setup", aircraft_of_readme(folder))
+    assert "LOG TIMEB ONTIME 1" in said
+    assert "nothing was sent" in said
+
+
+def run_doctor(folder: Path) -> None:
+    """This computer may well be found wanting: exit status 1, with what mends it."""
+    command = [sys.executable, "-m", "daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode in (0, 1), done.stderr
+    assert "receive buffers" in done.stdout
+
+
+def run_offload(folder: Path) -> None:
+    (folder / "usb").mkdir()
+    said = swath("offload", record_a_little(folder), folder / "usb")
+    assert "may be deleted, 1 of the logs" in said
+    assert (folder / "usb/SHA256SUMS").exists()
+
+
+def run_beside_a_recorder(folder: Path) -> None:
+    with Recorder(folder, session_table(folder / "logs")) as recorder:
+        assert "recording" in swath("monitor", "--once", recorder.config)
+        assert "line 4 start" in swath("mark", "line 4 start", recorder.config)
+        assert recorder.stop() == 0
+
+
+def point_to_the_page(_: Path) -> None:
+    """Named in the text only; what they do is proven in test_import.py and test_export.py."""
+    assert {"import", "export"} <= set(getattr(get_command(app), "commands", {}))
+
+
 def unit_is_there(_: Path) -> None:
     """systemctl would act on a service of this computer; that the unit is right is proven in test_systemd.py."""
     assert (ROOT / "systemd/swathd.service").read_text().count("[Install]\nWantedBy=multi-user.target") == 1
@@ -114,6 +149,14 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "swath devices": run_devices,
     "swath check --offline /etc/swath/swath.toml": run_check_offline,
     "swath check /etc/swath/swath.toml": run_check,
+    "swath setup /etc/swath/swath.toml": run_setup,
+    "swath setup --apply": run_setup,
+    "swath doctor /etc/swath/swath.toml": run_doctor,
+    "swath monitor": run_beside_a_recorder,
+    'swath mark "line 4 start"': run_beside_a_recorder,
+    "swath import": point_to_the_page,
+    "swath export": point_to_the_page,
+    "swath offload /var/lib/swath /mnt/usb": run_offload,
     "swath info /var/lib/swath": run_info,
     "swath recover /var/lib/swath": run_recover,
     "sudo systemctl enable --now swathd": unit_is_there,

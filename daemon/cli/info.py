@@ -65,6 +65,8 @@ def _unaccounted(numbers: dict[str, Any]) -> int:
 def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     from rich.table import Table
 
+    from daemon.health import clock_text
+
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
     console.print(
         f"[bold]{_plain(numbers['session_id'])}[/]  {start:%Y-%m-%d %H:%M:%S} UTC, {numbers['duration_s']:.1f} s"
@@ -95,6 +97,9 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
     else:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
+    for event in numbers["marks"]:
+        told = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"
+        console.print(f"  {told}", highlight=False)
     for event in numbers["last_events"]:
         severity, origin, code, text = (_plain(event.get(key, "?")) for key in ("severity", "source", "code", "text"))
         console.print(f"  {severity}: {origin} {code}: {text}", highlight=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import keyword
 import os
 import sys
 import tempfile
@@ -45,16 +46,25 @@ class Listed:
 
     @property
     def module(self) -> str:
-        """The file it is in."""
-        return f"daemon.cli.{self.name.replace('-', '_')}"
+        """The file it is in; one that Python has a word for has an underscore behind it."""
+        name = self.name.replace("-", "_")
+        return f"daemon.cli.{name}_" if keyword.iskeyword(name) else f"daemon.cli.{name}"
 
 
 COMMANDS = (
     Listed("run", "Record every byte of the configured sensors.", "Record"),
     Listed("check", "Validate a configuration; open every device and say what it answers.", "Record"),
+    Listed("mark", "Note something in the log being recorded.", "Record"),
+    Listed("split", "Begin a new part of the log being recorded.", "Record"),
+    Listed("monitor", "Show a running recorder live: sources, rates, losses, time, disk.", "Record"),
     Listed("info", "Say what logs hold: duration, counts, rates, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
+    Listed("import", "Make a log of captures: pcap, candump, serial bytes.", "Logs"),
+    Listed("export", "Write a log as the files that the devices' own tools read.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
+    Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
+    Listed("setup", "Show, or send, the messages the devices need before a survey.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
 )
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,10 +12,6 @@ from daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
     from daemon.log.recover import RecoveryReport
-
-_IOPRIO_WHO_PROCESS = 1
-_IOPRIO_IDLE = 3 << 13  # class idle, linux/ioprio.h
-_SYS_IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
 
 
 def command(
@@ -36,9 +30,10 @@ def command(
     """
     from daemon.log.format import LogError
     from daemon.log.recover import recover
+    from daemon.priority import give_way
 
     if background:
-        _at_idle_priority()
+        give_way()
     reports = []
     refused: list[str] = []
     for path in _files(logs, output):
@@ -94,16 +89,3 @@ def _print_report(report: RecoveryReport) -> None:
     for item in report.damage:
         messages = "" if item.messages is None else f", {item.messages} messages lost"
         print(f"  at byte {item.offset}: {item.length} bytes, {item.what}{messages}")
-
-
-def _at_idle_priority() -> None:
-    """Give way to everything else on this computer; where it is not permitted, go on as it is."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(19)
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    except OSError:
-        pass
-    number = _SYS_IOPRIO_SET.get(os.uname().machine)
-    if number is not None:
-        ctypes.CDLL(None, use_errno=True).syscall(number, _IOPRIO_WHO_PROCESS, 0, _IOPRIO_IDLE)

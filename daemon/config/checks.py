@@ -8,15 +8,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
+from pydantic import BaseModel
 
 from daemon.config.calibration_file import check_calibration
 from daemon.config.config import Config
 from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceKind, Driver, DriverSettingsError
 from drivers.core.registry import UnknownProtocolError, find_driver
+from drivers.core.startup import StartupWish
 
 if TYPE_CHECKING:
     from drivers.transports.uri import TransportSpec
@@ -101,8 +103,11 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
     needs = list(_check_needs(section, table, driver))
     yield from needs
     if not needs and not any(_unreadable(path) for path in config.files_of(table).values()):
+        settings = config.settings_of(kind, name, table)
         try:
-            driver.make_parser(config.settings_of(kind, name, table))
+            driver.make_parser(settings)
+            if driver.startup is not None:
+                driver.startup(settings, StartupWish())
         except DriverSettingsError as error:
             yield f"{section}: {error}"
 
@@ -113,9 +118,17 @@ def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[s
         for part in need.split("."):
             value = getattr(value, part, None)
         if value is None:
-            key = need.split(".")
-            described = type(table).model_fields[key[0]].description if key[0] in type(table).model_fields else ""
-            yield f"{section}.{need}: missing; protocol {driver.protocol} needs it: {described}"
+            yield f"{section}.{need}: missing; protocol {driver.protocol} needs it: {_described(type(table), need)}"
+
+
+def _described(model: type[BaseModel], key: str) -> str | None:
+    """What is said of a key, ``geometry.file`` of an inner table's."""
+    first, _, rest = key.partition(".")
+    field = model.model_fields[first]
+    if not rest:
+        return field.description
+    (inner,) = [one for one in get_args(field.annotation) if isinstance(one, type) and issubclass(one, BaseModel)]
+    return _described(inner, rest)
 
 
 def _check_transport(config: Config, section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:

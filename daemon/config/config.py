@@ -132,13 +132,7 @@ class Config:
 
     def files_of(self, table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, Path]:
         """The files a device's table names, by key."""
-        named: dict[FileKey, str | None] = {}
-        if isinstance(table, ImuConfig):
-            named["dbc"] = table.dbc
-        if isinstance(table, ScannerConfig):
-            named["calibration"] = table.calibration
-            named["geometry"] = table.geometry.file if table.geometry else None
-        return {key: self.resolve(name) for key, name in named.items() if name is not None}
+        return {key: self.resolve(name) for key, name in _names_of(table).items()}
 
     def settings_of(self, kind: DeviceKind, name: str, table: GnssConfig | ImuConfig | ScannerConfig) -> DeviceSettings:
         """What the parser of a device is made with; reads its files.
@@ -176,6 +170,24 @@ class Config:
                 if all(attachment != other for other, _, _ in found):
                     found.append((attachment, _media_type(path), path.read_bytes()))
         return found
+
+    def attachment_names(self) -> list[tuple[str, str]]:
+        """Name in a log, and as it stands in the configuration, of every file that the devices' tables name."""
+        return [
+            (attachment_name(key, name, self.resolve(named)), named)
+            for _, name, table in self.device_tables()
+            for key, named in _names_of(table).items()
+        ]
+
+
+def _names_of(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, str]:
+    named: dict[FileKey, str | None] = {}
+    if isinstance(table, ImuConfig):
+        named["dbc"] = table.dbc
+    if isinstance(table, ScannerConfig):
+        named["calibration"] = table.calibration
+        named["geometry"] = table.geometry.file if table.geometry else None
+    return {key: name for key, name in named.items() if name is not None}
 
 
 def plain_table(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[str, Any]:

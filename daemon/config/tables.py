@@ -6,6 +6,7 @@ docs/configuration.md prints.
 
 from __future__ import annotations
 
+import datetime as dt
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -61,6 +62,18 @@ class PpsConfig(Section):
     )
 
 
+class GnssSetupConfig(Section):
+    """``[gnss.<name>.setup]``: what `swath setup` asks of a receiver."""
+
+    port: Text | None = Field(
+        None,
+        description="the receiver's own name of the port that is wired to this computer: "
+        "ubx: UART1, UART2, USB (absent: UART1); sbf: COM1 to COM4, USB1, USB2 (absent: COM1)",
+    )
+    rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="of positions and velocities")
+    raw: bool = Field(True, description="raw measurements and ephemerides too, for post-processing")
+
+
 class GnssConfig(Section):
     """``[gnss.<name>]``: a receiver."""
 
@@ -73,12 +86,17 @@ class GnssConfig(Section):
     lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre x_a^b")
     secondary_lever_arm_m: Vector | None = Field(None, description="second antenna, for dual-antenna heading")
     leap_seconds: int = Field(18, ge=0, le=60, description="GPS − UTC, only used until the receiver says, for NMEA")
+    date_floor: dt.date | None = Field(
+        None,
+        description="oldest date believed, for week numbers of ten bits; absent: 2009-01-01",
+    )
     datum: str | None = Field(
         None,
         min_length=1,
         description='realisation of its positions, as "EPSG:7912"; absent: WGS 84, realisation unknown; '
         '"same": the output\'s',
     )
+    setup: GnssSetupConfig = Field(default_factory=GnssSetupConfig, description="what `swath setup` asks of it")
 
 
 class SignalsConfig(Section):
@@ -155,7 +173,9 @@ class GeometryConfig(Section):
         None, description="srep: the kind of deflection"
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
-    file: Text | None = Field(None, description="the device's own table (beam angles, metadata), relative to this file")
+    file: Text | None = Field(
+        None, description="the device's own table (beam angles; ouster: its metadata, JSON), relative to this file"
+    )
 
     @model_validator(mode="after")
     def _polygon_has_facets(self) -> Self:

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
+import time
 from pathlib import Path
+
+_TRIES, _PAUSE_S = 20, 0.001
 
 
 def claim(fd: int) -> None:
-    """Lock a file for as long as it is open. Where a file system has no locks, nobody can ask either."""
-    with contextlib.suppress(OSError):
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    """Lock a file for as long as it is open. Where a file system has no locks, nobody can ask either.
+
+    Somebody who asks at this moment holds it for an instant himself, so it is tried again, for 20 ms at most.
+    """
+    for _ in range(_TRIES):
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(_PAUSE_S)
+        except OSError:
+            return
+        else:
+            return
 
 
 def is_being_written(path: Path) -> bool:

@@ -33,7 +33,7 @@ _MESSAGE_FIXED_BYTES = 22  # channel, sequence, log time, publish time
 
 OP_HEADER, OP_FOOTER, OP_SCHEMA, OP_CHANNEL, OP_MESSAGE = 1, 2, 3, 4, 5
 OP_CHUNK, OP_MESSAGE_INDEX, OP_ATTACHMENT, OP_STATISTICS, OP_METADATA, OP_DATA_END = 6, 7, 9, 11, 12, 15
-_OPCODES = frozenset(range(1, 16))
+OPCODES = frozenset(range(1, 16))
 # From 0x80 on opcodes are anybody's and passed over. One that is a bit away from the specification's is rather damage.
 _FIRST_PRIVATE_OPCODE = 0x90
 _FOOTER_BYTES = 20
@@ -117,7 +117,7 @@ def _scan(file: BinaryIO, size: int, *, chunks: bool) -> Iterator[Record | Damag
     while offset < size:
         found = _read_record(file, offset, size, chunks=chunks)
         if isinstance(found, Damage) and not found.length:
-            resumed = _resync(file, offset + 1, size)
+            resumed = next_chunk(file, offset + 1, size)
             if resumed is None:
                 cut = _is_cut(file, offset, size)
                 what = "the file ends within a record" if cut else "unreadable bytes up to the end"
@@ -132,7 +132,7 @@ def _scan(file: BinaryIO, size: int, *, chunks: bool) -> Iterator[Record | Damag
         if isinstance(found, Record) and found.opcode == OP_DATA_END:
             if _end_is_whole(file, offset, size):
                 return
-            resumed = _resync(file, offset, size)
+            resumed = next_chunk(file, offset, size)
             if resumed is None:
                 yield Damage(offset, size - offset, "index and footer are missing, cut off or wrong")
                 return
@@ -185,7 +185,7 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
         return True
     opcode, length = _HEAD.unpack(head)
     beyond: bool = offset + _HEAD.size + length > size
-    return opcode in _OPCODES and length <= MAX_RECORD_BYTES and beyond
+    return opcode in OPCODES and length <= MAX_RECORD_BYTES and beyond
 
 
 def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True) -> Record | Damage:
@@ -199,7 +199,7 @@ def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True)
     total = _HEAD.size + length
     if opcode == 0 or length > MAX_RECORD_BYTES or offset + total > size:
         return nothing
-    if opcode not in _OPCODES:
+    if opcode not in OPCODES:
         if not _may_begin(file, offset + total, size):
             return nothing
         private = opcode >= _FIRST_PRIVATE_OPCODE
@@ -225,7 +225,7 @@ def _may_begin(file: BinaryIO, offset: int, size: int) -> bool:
     if len(head) < _HEAD.size:
         return offset + len(head) == size
     opcode, length = _HEAD.unpack(head)
-    return opcode in _OPCODES and length <= MAX_RECORD_BYTES
+    return opcode in OPCODES and length <= MAX_RECORD_BYTES
 
 
 def _outside_chunks(file: BinaryIO, opcode: int, offset: int, total: int, size: int) -> Record | Damage:
@@ -343,7 +343,7 @@ def _indexed_messages(file: BinaryIO, offset: int, size: int) -> int | None:
     return total
 
 
-def _resync(file: BinaryIO, offset: int, size: int) -> int | None:
+def next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
     """The next place where a chunk begins that can be unpacked."""
     while offset < size:
         file.seek(offset)

@@ -10,11 +10,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+
+if TYPE_CHECKING:
+    from drivers.core.startup import StartupMessage, StartupWish
 
 DeviceKind = Literal["gnss", "imu", "scanner"]
 TransportKind = Literal["serial", "can", "udp", "gnss"]
@@ -132,8 +135,13 @@ class Driver:
         make_parser: builds the parser of everything.
         make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
             where the device says no time.
+        make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
+            defaults; it is asked when another protocol was configured.
         names_edge: which edge its time messages name by default; None where mixed or none.
+        tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
         needs: configuration keys without which it cannot work.
+        startup: builds the messages a device needs before a survey, in the order they are sent, and raises
+            `DriverSettingsError`; None where there are none.
     """
 
     protocol: str
@@ -143,5 +151,8 @@ class Driver:
     summary: str
     make_parser: Callable[[DeviceSettings], Parser]
     make_time_parser: Callable[[DeviceSettings], Parser] | None = None
+    make_probe: Callable[[DeviceSettings], Parser] | None = None
     names_edge: NamesEdge | None = None
+    tells_pps: bool = True
     needs: tuple[str, ...] = ()
+    startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None

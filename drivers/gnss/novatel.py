@@ -25,6 +25,7 @@ from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Str
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
 from drivers.gnss.novatel_records import DECODERS, Header, State
+from drivers.gnss.novatel_startup import startup_messages
 from drivers.gnss.rows import Row, join_rows
 from georef.records import (
     Chunk,
@@ -179,5 +180,6 @@ DRIVERS = (
         make_parser=NovatelParser,
         make_time_parser=make_time_parser,
         names_edge=NamesEdge.PREVIOUS,
+        startup=startup_messages,
     ),
 )

@@ -29,6 +29,7 @@ from drivers.gnss.date_floor import read_date_floor, week_of
 from drivers.gnss.epochs import EpochGatherer
 from drivers.gnss.rows import Row, join_rows
 from drivers.gnss.sbf_records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
+from drivers.gnss.sbf_startup import startup_messages
 from georef.records import (
     Chunk,
     EventMark,
@@ -298,5 +299,6 @@ DRIVERS = (
         make_parser=SbfParser,
         make_time_parser=make_time_parser,
         names_edge=NamesEdge.PREVIOUS,
+        startup=startup_messages,
     ),
 )

@@ -30,6 +30,7 @@ from drivers.gnss import ubx_messages as ubx
 from drivers.gnss.date_floor import GPS_EPOCH, read_date_floor, week_of
 from drivers.gnss.epochs import EpochGatherer
 from drivers.gnss.ubx_fix import NavMessage, merge_epoch
+from drivers.gnss.ubx_startup import startup_messages
 from georef.records import (
     Chunk,
     EventMark,
@@ -309,5 +310,6 @@ DRIVERS = (
         summary="u-blox binary (NAV-PVT HPPOSLLH COV TIMEGPS TIMELS, TIM-TP TM2), NMEA and RTCM3 beside it",
         make_parser=UbxParser,
         make_time_parser=lambda settings: UbxParser(settings, time_only=True),
+        startup=startup_messages,
     ),
 )

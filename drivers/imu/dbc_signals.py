@@ -75,12 +75,12 @@ class SignalLayout:
         low = WORD_BITS - (self.length - over)
         return (word >> np.uint64(low)) | (ninth << np.uint64(WORD_BITS - low))
 
+    @np.errstate(invalid="ignore", over="ignore")
     def values(self, bits: UInt64Array) -> Float64Array:
-        """Physical values of right-aligned bits."""
+        """Physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]
-            with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is a NaN like any other
-                raw = bits.astype(unsigned).view(floating).astype(np.float64)
+            raw = bits.astype(unsigned).view(floating).astype(np.float64)
         elif self.signed:
             up = np.uint64(WORD_BITS - self.length)
             raw = ((bits << up).view(np.int64) >> np.int64(up)).astype(np.float64)

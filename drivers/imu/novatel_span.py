@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.core.parser import DeviceSettings, Driver
 from drivers.gnss.novatel import NovatelParser
+from drivers.gnss.novatel_startup import imu_startup_messages
 from georef.records import ImuSamples, InsSolution
 
 
@@ -20,5 +21,6 @@ DRIVERS = (
         yields=(ImuSamples, InsSolution),
         summary="IMU and INS of a NovAtel SPAN receiver, inside its GNSS stream",
         make_parser=make_imu_parser,
+        startup=imu_startup_messages,
     ),
 )

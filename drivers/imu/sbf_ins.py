@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.core.parser import DeviceSettings, Driver
 from drivers.gnss.sbf import SbfParser
+from drivers.gnss.sbf_startup import imu_startup_messages
 from georef.records import ImuSamples, InsSolution
 
 
@@ -20,5 +21,6 @@ DRIVERS = (
         yields=(ImuSamples, InsSolution),
         summary="IMU and INS of a Septentrio INS receiver, inside its GNSS stream",
         make_parser=make_imu_parser,
+        startup=imu_startup_messages,
     ),
 )

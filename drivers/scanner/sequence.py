@@ -29,7 +29,7 @@ class _Last:
 
 
 class SequenceTracker:
-    """Unwraps a u32 datagram counter and tells gaps from restarts.
+    """Unwraps a datagram counter and tells gaps from restarts.
 
     Counted in ``errors``: ``sequence_gap`` (datagrams missing), ``out_of_order`` (datagrams that came late, each
     counted as missing before), ``duplicate``, ``restart`` (pps_count fell, or first_ticks went back: a new clock
@@ -37,15 +37,25 @@ class SequenceTracker:
 
     Args:
         errors: the parser's ``counters.errors``.
+        modulus: where the counter wraps.
+        largest_gap: a longer step is a counter that was set anew, a restart; None: half the modulus, out of order.
     """
 
-    def __init__(self, errors: Counter[str]) -> None:
+    def __init__(self, errors: Counter[str], modulus: int = _U32, largest_gap: int | None = None) -> None:
         self._errors = errors
+        self._modulus = modulus
+        self._largest_gap = largest_gap
         self._last: _Last | None = None
         self._missing: set[int] = set()  # unwrapped numbers just behind the newest that have not come
 
+    def restart(self, sequence: int, first_time_ns: int) -> None:
+        """The device says itself that it began anew: the datagram of this counter will follow without a gap."""
+        if self._last is not None:
+            self._errors["restart"] += 1
+            self._remember((sequence - 1) % self._modulus, self._last.unwrapped, first_time_ns, 0)
+
     def follow(
-        self, sequence: NDArray[np.uint32], first_time_ns: Int64Array, pps_count: NDArray[np.uint32]
+        self, sequence: NDArray[np.integer], first_time_ns: Int64Array, pps_count: NDArray[np.integer]
     ) -> tuple[Int64Array, BoolArray]:
         """Take consecutive datagrams, all arrays (n,); ``first_time_ns`` is the device time of their first pulse.
 
@@ -66,11 +76,13 @@ class SequenceTracker:
         ]
         return np.array([at for at, _ in steps], dtype=np.int64), np.array([new for _, new in steps], dtype=np.bool_)
 
-    def _regular(self, sequence: NDArray[np.uint32], first_time_ns: Int64Array, pps_count: NDArray[np.uint32]) -> bool:
+    def _regular(
+        self, sequence: NDArray[np.integer], first_time_ns: Int64Array, pps_count: NDArray[np.integer]
+    ) -> bool:
         """Whether every datagram simply follows the one before."""
         last = self._last
         if last is not None and (
-            int(sequence[0]) != (last.sequence + 1) % _U32
+            int(sequence[0]) != (last.sequence + 1) % self._modulus
             or int(first_time_ns[0]) < last.first_time_ns
             or int(pps_count[0]) < last.pps_count
         ):
@@ -86,17 +98,18 @@ class SequenceTracker:
         last = self._last
         if last is None:
             return self._remember(sequence, sequence, first_time_ns, pps_count), True
-        ahead = (sequence - last.sequence - 1) % _U32
-        behind = _U32 - 1 - ahead
+        ahead = (sequence - last.sequence - 1) % self._modulus
+        behind = self._modulus - 1 - ahead
         if behind == 0 and first_time_ns == last.first_time_ns:
             self._errors["duplicate"] += 1
             return last.unwrapped, False
         if 0 < behind <= LATE_DATAGRAMS and 0 < last.first_time_ns - first_time_ns < LATE_NS:
             return self._late(last.unwrapped - behind)
-        if pps_count < last.pps_count or first_time_ns < last.first_time_ns:
+        set_anew = self._largest_gap is not None and ahead > self._largest_gap
+        if pps_count < last.pps_count or first_time_ns < last.first_time_ns or set_anew:
             self._errors["restart"] += 1
             ahead = 0
-        elif ahead >= _U32 // 2:
+        elif ahead >= self._modulus // 2:
             self._errors["out_of_order"] += 1
             ahead = 0
         elif ahead:

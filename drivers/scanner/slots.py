@@ -13,6 +13,33 @@ from georef.records import RETURN_DTYPE, StructArray
 BLOCK_SLOTS = 32768  # slots worked on at once, so that the temporaries stay in the processor's second-level cache
 
 
+@dataclass(frozen=True, slots=True)
+class BeamColumns:
+    """Columns of beams that are fired together, as the pulses of `ReturnSlots`: column by column, beam by beam.
+
+    Attributes:
+        beams: of a column.
+        first_pulse_id: (columns,) of each column's first beam.
+        per_column: further fields of `RETURN_DTYPE` that are the column's, each (columns,).
+        chosen: (pulses,) which of the columns' beams the slots are of; None: all, in order.
+    """
+
+    beams: int
+    first_pulse_id: NDArray[Any]
+    per_column: dict[str, NDArray[Any]]
+    chosen: NDArray[np.intp] | None = None
+
+    def fill(self, rows: StructArray, pulse: NDArray[np.intp]) -> None:
+        """Write what columns and beams say of the returns of these pulses; the beam is the channel."""
+        place = pulse if self.chosen is None else self.chosen[pulse]
+        column = place // self.beams
+        beam = place - column * self.beams
+        rows["channel"] = beam
+        rows["pulse_id"] = self.first_pulse_id[column] + beam
+        for name, values in self.per_column.items():
+            rows[name] = values[column]
+
+
 @dataclass(slots=True)
 class ReturnSlots:
     """The places for returns of consecutive pulses, in the order of emission.
@@ -23,6 +50,7 @@ class ReturnSlots:
         intensity: (pulses, slots).
         per_pulse: fields of `RETURN_DTYPE` that are the pulse's, each (pulses,) or one number for all.
         per_slot: further fields of the return itself, each (pulses, slots).
+        columns: what columns of beams say of their pulses, in place of `per_pulse`.
     """
 
     range_raw: NDArray[Any]
@@ -30,6 +58,7 @@ class ReturnSlots:
     intensity: NDArray[Any]
     per_pulse: dict[str, NDArray[Any] | int]
     per_slot: dict[str, NDArray[Any]]
+    columns: BeamColumns | None = None
 
     def fill(self, table: StructArray) -> int:
         """Write the returns there are, ordered by pulse, then by slot, to the head of ``table``; returns their number.
@@ -53,6 +82,8 @@ class ReturnSlots:
         for name, per_pulse in self.per_pulse.items():
             scalar = isinstance(per_pulse, int) or whole
             rows[name] = per_pulse if scalar else per_pulse[pulse]  # type: ignore[index]
+        if self.columns is not None:
+            self.columns.fill(rows, pulse)
         self._number(rows, index, pulse, pulses, slots)
         return len(index)
 

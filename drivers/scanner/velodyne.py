@@ -12,17 +12,18 @@ not say which case it is.
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.parser import DeviceSettings, Driver, PacketParser
+from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
+from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.spinning import Firings, returns_of_packets
 from drivers.scanner.stamps import StampTracker
-from drivers.scanner.velodyne_heads import VLP16, FloatArray, SpinningHead
+from drivers.scanner.velodyne_calibration import read_calibration
+from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
 from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -40,14 +41,13 @@ from georef.records import (
 )
 
 DATA_BYTES = 1206
-BLOCKS = 12
-PLACES = 32
-BLOCK_FLAG = 0xEEFF  # FF EE on the wire, 9.3.1.5
 MODE_STRONGEST, MODE_LAST, MODE_DUAL = 0x37, 0x38, 0x39  # first factory byte, table 9-2
 RETURN_MODES = (MODE_STRONGEST, MODE_LAST, MODE_DUAL)
+SINGLE_FLAGS = {MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
 FULL_CIRCLE = 36_000  # azimuth in 0.01°, 9.3.1.4
-MAX_GAP = 200  # 0.01° between blocks: 20 rev/s make 79.6; more is a step of the field of view, not rotation
+MAX_GAP = 200  # 0.01° between groups: 20 rev/s make 79.6; more is a step of the field of view, not rotation
 HOUR_NS = 3_600_000_000_000
+MAX_TURN_US = 5_000  # a longer step of the stamps may hide a field of view's edge
 MAX_SILENCE_US = 10_000_000  # a longer step of the stamps is a clock that was set, not packets that were lost
 
 _RETURN = np.dtype([("range", "<u2"), ("reflectivity", "u1")])
@@ -61,23 +61,24 @@ def encode_data_packet(
     range_raw: ArrayLike,
     reflectivity: ArrayLike,
     mode: int = MODE_STRONGEST,
-    product_id: int = VLP16.product_id,
+    head: SpinningHead = VLP16,
 ) -> bytes:
     """One data packet (9.3.2).
 
     Args:
         stamp_us: time of the first firing, microseconds past the hour.
-        azimuth_0p01deg: (12,) at the first firing of each block; in dual return pairs of equal ones.
+        azimuth_0p01deg: (12,) at the first firing of each block's group; in dual return pairs of equal ones.
         range_raw: (12, 32) in the head's unit, 0 = no return.
         reflectivity: (12, 32) or one value for all.
         mode: `MODE_STRONGEST`, `MODE_LAST` or `MODE_DUAL`.
-        product_id: the model's factory byte.
+        head: the model.
     """
     packet = np.zeros(1, dtype=PACKET_DTYPE)
     blocks = packet["blocks"][0]
-    blocks["flag"], blocks["azimuth"] = BLOCK_FLAG, azimuth_0p01deg
+    flags = head.used_block_flags(dual=mode == MODE_DUAL)
+    blocks["flag"][: len(flags)], blocks["azimuth"] = flags, azimuth_0p01deg
     blocks["returns"]["range"], blocks["returns"]["reflectivity"] = range_raw, reflectivity
-    packet["stamp_us"], packet["mode"], packet["product"] = stamp_us, mode, product_id
+    packet["stamp_us"], packet["mode"], packet["product"] = stamp_us, mode, head.product_ids[0]
     return packet.tobytes()
 
 
@@ -90,17 +91,27 @@ class VelodyneParser(PacketParser):
     ``nmea_second_mismatch``.
 
     Args:
-        settings: no key is needed.
+        settings: ``geometry.file`` is the head's own calibration, db.xml or YAML.
         head: the model.
         clock_only: no returns, and the clock of one data packet in 50 ms of host time.
+
+    Attributes:
+        beams: by the head's own calibration where it is given, else the design values.
     """
 
     def __init__(self, settings: DeviceSettings, head: SpinningHead = VLP16, *, clock_only: bool = False) -> None:
         super().__init__()
         self._head = head
+        self.beams: BeamTable = head.beams
+        if "geometry" in settings.files:
+            self.beams = read_calibration(settings.files["geometry"], head)
+        self._flags = [head.used_block_flags(dual=dual) for dual in (False, True)]
         self._position = PositionReader(self.counters)
         self._thinner = SampleThinner() if clock_only else None
         self._stamps = StampTracker(self.counters.errors, HOUR_US, MAX_SILENCE_US)
+        self._last_stamp_us: int | None = None
+        self._last_azimuth = 0
+        self._last_turn = 0.0
         self._packets = 0
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
@@ -117,19 +128,24 @@ class VelodyneParser(PacketParser):
         self.counters.bytes_framed += int(good.sum()) * DATA_BYTES
         if not good.all():
             host_time_ns, packets = host_time_ns[good], packets[good]
-        fresh = self._follow(packets)
+        fresh, turn = self._follow(packets)
         if not fresh.all():
-            host_time_ns, packets = host_time_ns[fresh], packets[fresh]
-        return self._decode(host_time_ns, packets) if len(packets) else []
+            host_time_ns, packets, turn = host_time_ns[fresh], packets[fresh], turn[fresh]
+        return self._decode(host_time_ns, packets, turn) if len(packets) else []
 
-    def _decode(self, host_time_ns: Int64Array, packets: StructArray) -> list[Record]:
+    def _decode(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray) -> list[Record]:
         clock = _clock_samples(host_time_ns, packets["stamp_us"], packets["mode"], self._head)
         clock["locked"] = self._position.locked
         if self._thinner is not None:
             clock = clock[self._thinner.choose(host_time_ns)]
         records: list[Record] = [DeviceClockSamples(clock)] if len(clock) else []
         if self._thinner is None:
-            rows = self._returns(host_time_ns, packets)
+            number = self._packets + np.arange(len(packets), dtype=np.int64)
+            rows = returns_of_packets(
+                packets["mode"],
+                BLOCKS * PLACES,
+                lambda part: self._firings(host_time_ns[part], packets[part], turn[part], number[part]),
+            )
             if len(rows):
                 records.append(ScannerReturns(rows))
         self._packets += len(packets)
@@ -137,13 +153,19 @@ class VelodyneParser(PacketParser):
 
     def _check(self, packets: StructArray) -> BoolArray:
         """(n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""
-        blocks = packets["blocks"]
+        flag, azimuth = packets["blocks"]["flag"], packets["blocks"]["azimuth"]
+        dual, mode = packets["mode"] == MODE_DUAL, packets["mode"]
+        flags_right, azimuths_right = np.empty((2, len(packets)), dtype=np.bool_)
+        for rows, flags in ((~dual, self._flags[0]), (dual, self._flags[1])):
+            used = slice(0, len(flags))
+            flags_right[rows] = (flag[rows, used] == flags).all(axis=1)
+            azimuths_right[rows] = (azimuth[rows, used] < FULL_CIRCLE).all(axis=1)
         good = np.ones(len(packets), dtype=np.bool_)
         for code, passes in (
-            ("bad_block_flag", (blocks["flag"] == BLOCK_FLAG).all(axis=1)),
-            ("wrong_product", packets["product"] == self._head.product_id),
-            ("bad_return_mode", np.isin(packets["mode"], RETURN_MODES)),
-            ("bad_azimuth", (blocks["azimuth"] < FULL_CIRCLE).all(axis=1)),
+            ("bad_block_flag", flags_right),
+            ("wrong_product", np.isin(packets["product"], self._head.product_ids)),
+            ("bad_return_mode", np.isin(mode, RETURN_MODES)),
+            ("bad_azimuth", azimuths_right),
         ):
             self._refuse(code, int((good & ~passes).sum()), DATA_BYTES)
             good &= passes
@@ -155,113 +177,95 @@ class VelodyneParser(PacketParser):
             self.counters.bad_messages += count
             self.counters.bytes_skipped += count * length
 
-    def _follow(self, packets: StructArray) -> BoolArray:
-        """Look for missing packets between the stamps; (n,) False for a packet that has come before."""
-        blocks = np.where(packets["mode"] == MODE_DUAL, BLOCKS // 2, BLOCKS)
-        return self._stamps.follow(packets["stamp_us"].astype(np.int64), blocks * self._head.block_ns / 1000)
+    def _follow(self, packets: StructArray) -> tuple[BoolArray, FloatArray]:
+        """Look for missing packets between the stamps; follow the rotation from packet to packet.
 
-    def _returns(self, host_time_ns: Int64Array, packets: StructArray) -> StructArray:
-        """Returns of all packets in order, in blocks of one return mode."""
-        mode = packets["mode"]
-        edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(packets)]
-        step = BLOCK_SLOTS // (BLOCKS * PLACES)
-        table = returns_table(len(packets) * BLOCKS * PLACES)
-        filled = 0
-        for start, stop in pairwise(edges):
-            for at in range(start, stop, step):
-                part = slice(at, min(at + step, stop))
-                block = self._block(host_time_ns[part], packets[part], self._packets + at)
-                filled += block.fill(table[filled:])
-        return table[:filled]
+        Returns:
+            fresh: (n,) False for a packet that has come before.
+            turn: (n,) rotation from group to group in 0.01°, as far as it is known.
+        """
+        stamps = packets["stamp_us"].astype(np.int64)
+        if not len(stamps):
+            return np.zeros(0, dtype=np.bool_), np.zeros(0)
+        first = self._last_stamp_us is None
+        before = np.concatenate([[stamps[0] - 1 if self._last_stamp_us is None else self._last_stamp_us], stamps[:-1]])
+        self._last_stamp_us = int(stamps[-1])
+        step_us = (stamps - before) % HOUR_US
+        groups = np.where(packets["mode"] == MODE_DUAL, self._head.groups(dual=True), self._head.groups(dual=False))
+        nominal_us = groups * self._head.group_ns / 1000
+        fresh = self._stamps.follow(stamps, nominal_us)
+        steps = np.rint(step_us / nominal_us).astype(np.int64)
+        return fresh, self._turn(packets["blocks"]["azimuth"][:, 0], steps * groups, step_us, known=not first)
 
-    def _block(self, host_time_ns: Int64Array, packets: StructArray, number: int) -> ReturnSlots:
-        """The slots of packets of one return mode, the first of which is the parser's ``number``-th."""
+    def _turn(self, azimuth: NDArray[np.uint16], groups: Int64Array, step_us: Int64Array, *, known: bool) -> FloatArray:
+        """Rotation a group (n,), from each packet's predecessor; the last one known where that does not tell it."""
+        before = np.concatenate([[self._last_azimuth], azimuth[:-1]])
+        gap = (azimuth - before) % FULL_CIRCLE / np.maximum(groups, 1)
+        tells = (groups > 0) & (step_us < MAX_TURN_US) & (gap <= MAX_GAP)
+        tells[0] &= known
+        place = np.maximum.accumulate(np.where(tells, np.arange(len(gap)), -1))
+        turn: FloatArray = np.where(place < 0, self._last_turn, gap[place])
+        self._last_azimuth, self._last_turn = int(azimuth[-1]), float(turn[-1])
+        return turn
+
+    def _firings(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray, number: Int64Array) -> Firings:
+        """The firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
-        locked = RETURN_FLAG_PPS_LOCKED if self._position.locked == 1 else 0
-        per_slot: dict[str, NDArray[Any]] = {}
-        flags: dict[str, NDArray[Any] | int] = {}
-        azimuth = packets["blocks"]["azimuth"]
-        if mode == MODE_DUAL:
-            azimuth = azimuth[:, ::2]
-            range_raw, reflectivity, of_pair = _pair_returns(packets["blocks"]["returns"])
-            per_slot["flags"] = of_pair | np.uint8(locked)
-        else:
-            returns = packets["blocks"]["returns"]
-            range_raw, reflectivity = returns["range"].reshape(-1, 1), returns["reflectivity"].reshape(-1, 1)
-            flags["flags"] = locked | (RETURN_FLAG_STRONGEST if mode == MODE_STRONGEST else RETURN_FLAG_LAST)
-        firings = azimuth.shape[1] * PLACES
-        shape = (len(packets), firings)
-        serial = (number + np.arange(len(packets)))[:, np.newaxis] * (BLOCKS * PLACES) + np.arange(firings)
-        return ReturnSlots(
-            range_raw=range_raw,
+        dual = mode == MODE_DUAL
+        used, groups = len(self._flags[dual]), head.groups(dual=dual)
+        azimuth = packets["blocks"]["azimuth"][:, : used : used // groups]
+        return Firings(
+            returns=packets["blocks"]["returns"][:, :used],
             range_unit_m=head.range_unit_m,
-            intensity=reflectivity,
-            per_slot=per_slot,
-            per_pulse={
-                "host_time_ns": np.broadcast_to(host_time_ns[:, np.newaxis], shape).reshape(-1),
-                "device_time_ns": _firing_times(packets["stamp_us"], head, azimuth.shape[1]).reshape(-1),
-                "encoder_rad": _firing_azimuths(azimuth, head).reshape(-1),
-                "pulse_id": serial.reshape(-1),
-                "channel": np.broadcast_to(head.channel, (len(packets) * azimuth.shape[1], PLACES)).reshape(-1),
-                "pulse_width_ns": 0,
-                "mta_zone": 0,
-                **flags,
-            },
+            host_time_ns=host_time_ns,
+            number=number,
+            most=BLOCKS * PLACES,
+            device_time_ns=_firing_times(packets["stamp_us"], head, groups),
+            azimuth_rad=_firing_azimuths(azimuth, turn, head),
+            channel=head.channel,
+            flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._position.locked == 1 else 0),
+            pair=(True, True) if dual else None,
         )
 
 
-def _pair_returns(
-    returns: StructArray,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Dual returns (n, 12, 32) as slots (pulses, 2): range, reflectivity and flags, by the module's rule."""
-    (last, odd), (last_light, odd_light) = (
-        (returns[field][:, ::2].reshape(-1), returns[field][:, 1::2].reshape(-1)) for field in ("range", "reflectivity")
-    )
-    odd_is_far = odd > last
-    near, far = np.minimum(last, odd), np.maximum(last, odd)
-    near_light = np.where(odd_is_far, last_light, odd_light)
-    far_light = np.where(odd_is_far, odd_light, last_light)
-    two = (near > 0) & (near != far)
-    near_strongest = (near_light > far_light) | ((near_light == far_light) & ~odd_is_far)
-    alone = RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST
-    range_raw = np.stack([np.where(two, near, far), np.where(two, far, 0)], axis=1)
-    reflectivity = np.stack([np.where(two, near_light, far_light), far_light], axis=1)
-    first_flags = np.where(two, near_strongest * np.uint8(RETURN_FLAG_STRONGEST), np.uint8(alone))
-    last_flags = RETURN_FLAG_LAST + ~near_strongest * np.uint8(RETURN_FLAG_STRONGEST)
-    return range_raw, reflectivity, np.stack([first_flags, last_flags], axis=1).astype(np.uint8)
-
-
-def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, blocks: int) -> Int64Array:
-    """Device times (n, blocks · 32) of firings (9.4)."""
-    offset = (np.arange(blocks)[:, np.newaxis] * head.block_ns + head.offset_ns).reshape(-1)
+def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> Int64Array:
+    """Device times (n, groups · places) of firings (9.4)."""
+    offset = (np.arange(groups)[:, np.newaxis] * head.group_ns + head.offset_ns).reshape(-1) + head.stamp_ns
     times: Int64Array = (stamp_us.astype(np.int64) * 1000)[:, np.newaxis] + offset
-    if len(times) and times.max() >= HOUR_NS:
+    if len(times) and (times.max() >= HOUR_NS or times.min() < 0):
         times %= HOUR_NS
     return times
 
 
-def _firing_azimuths(azimuth: NDArray[np.uint16], head: SpinningHead) -> FloatArray:
-    """Azimuths (n, blocks, 32) in radians, 0 … 2π, turned on from the blocks' own (n, blocks) (9.5)."""
+def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead) -> FloatArray:
+    """Azimuths (n, groups, places) in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
+
+    The rotation is that to the packet's next group, of the last group that to it; of a packet's only group it is
+    ``turn`` (n,).
+    """
     start = azimuth.astype(np.int32)
-    gap = np.empty_like(start)
-    gap[:, :-1] = (start[:, 1:] - start[:, :-1]) % FULL_CIRCLE
-    gap[:, -1] = gap[:, -2]
+    gap = np.empty(start.shape)
+    if start.shape[1] == 1:
+        gap[:, 0] = turn
+    else:
+        gap[:, :-1] = (start[:, 1:] - start[:, :-1]) % FULL_CIRCLE
+        gap[:, -1] = gap[:, -2]
     odd = gap > MAX_GAP
     if odd.any():
         usual = np.where(odd, 0, gap).sum(axis=1) // np.maximum(1, (~odd).sum(axis=1))
         gap = np.where(odd, usual[:, np.newaxis], gap)
-    turn = gap[:, :, np.newaxis] * (head.offset_ns / head.block_ns) + start[:, :, np.newaxis]
-    turn -= FULL_CIRCLE * (turn >= FULL_CIRCLE)
-    turn *= 2 * np.pi / FULL_CIRCLE
-    return turn
+    firing: FloatArray = gap[:, :, np.newaxis] * (head.offset_ns / head.group_ns) + start[:, :, np.newaxis]
+    firing -= FULL_CIRCLE * (firing >= FULL_CIRCLE)
+    firing *= 2 * np.pi / FULL_CIRCLE
+    return firing
 
 
 def _clock_samples(
     host_time_ns: Int64Array, stamp_us: NDArray[np.uint32], mode: NDArray[np.uint8], head: SpinningHead
 ) -> StructArray:
     """One `DEVICE_CLOCK_DTYPE` row a packet: device time of its last firing; it has no latch to tell of."""
-    blocks = np.where(mode == MODE_DUAL, BLOCKS // 2, BLOCKS)
-    last_ns = (blocks - 1) * head.block_ns + int(head.offset_ns.max())
+    groups = np.where(mode == MODE_DUAL, head.groups(dual=True), head.groups(dual=False))
+    last_ns = (groups - 1) * head.group_ns + int(head.offset_ns.max()) + head.stamp_ns
     rows = np.empty(len(stamp_us), dtype=DEVICE_CLOCK_DTYPE)
     rows["host_time_ns"] = host_time_ns
     rows["device_time_ns"] = (stamp_us.astype(np.int64) * 1000 + last_ns) % HOUR_NS
@@ -269,19 +273,26 @@ def _clock_samples(
     return rows
 
 
-def _clock_parser(settings: DeviceSettings) -> VelodyneParser:
-    return VelodyneParser(settings, clock_only=True)
+def _maker(head: SpinningHead, *, clock_only: bool) -> Callable[[DeviceSettings], Parser]:
+    return lambda settings: VelodyneParser(settings, head, clock_only=clock_only)
 
 
-DRIVERS = (
-    Driver(
-        protocol="velodyne-vlp16",
+def _driver(protocol: str, head: SpinningHead) -> Driver:
+    return Driver(
+        protocol=protocol,
         kind="scanner",
         transports=("udp",),
         yields=(ScannerReturns, DeviceClockSamples, TimeMessage, DeviceStatus),
-        summary="Velodyne VLP-16: single and dual return, position packets with NMEA and PPS status",
-        make_parser=VelodyneParser,
-        make_time_parser=_clock_parser,
+        summary=f"Velodyne {head.name}: single and dual return, position packets with NMEA and PPS status",
+        make_parser=_maker(head, clock_only=False),
+        make_time_parser=_maker(head, clock_only=True),
         needs=("installation",),
-    ),
+    )
+
+
+DRIVERS = (
+    _driver("velodyne-hdl32e", HDL32E),
+    _driver("velodyne-vlp16", VLP16),
+    _driver("velodyne-vlp32c", VLP32C),
+    _driver("velodyne-vls128", VLS128),
 )

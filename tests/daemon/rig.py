@@ -14,6 +14,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import pytest
+
 START_S = 30.0
 
 
@@ -194,3 +196,16 @@ def session_table(directory: Path, **keys: object) -> str:
     """[session] with small defaults."""
     values: Mapping[str, object] = {"name": '"test"', "directory": f'"{directory}"', "reserve_mb": 1, **keys}
     return "[session]\n" + "".join(f"{key} = {value}\n" for key, value in values.items())
+
+
+@contextlib.contextmanager
+def disk_of(folder: Path, size_mb: int) -> Iterator[Path]:
+    """A file system of its own and of that size, at a folder that is made."""
+    if os.geteuid() != 0:
+        pytest.fail("this test mounts a tmpfs: run it as root")
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "swath-test", str(folder)], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)

@@ -131,6 +131,28 @@ class TestAllWell:
         assert reports["scanner/roof"].problems == []
         assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
 
+    def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
+        """An OS0 and its own IMU, on two ports."""
+        lidar, imu = free_udp_port(), free_udp_port()
+        capture = ROOT / "fixtures/ouster/crc_test.pcap.gz"
+        metadata = (ROOT / "fixtures/ouster/crc_test.json").read_text()
+        (tmp_path / "os0.json").write_text(metadata.replace("TIME_FROM_INTERNAL_OSC", "TIME_FROM_SYNC_PULSE_IN"))
+        streams = [[unit.data for unit in read_pcap(capture, port=port)] for port in (7502, 7503)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{lidar}?buffer_mb=1"\nprotocol = "ouster"\n'
+            f'auxiliary = "udp:127.0.0.1:{imu}?buffer_mb=1"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+            'pps = "main"\n[scanner.roof.geometry]\nfile = "os0.json"\n[pps.main]\nsource = "/dev/pps0"\n'
+        )
+        with (
+            udp_sender(lidar, lambda n: streams[0][n % len(streams[0])]),
+            udp_sender(imu, lambda n: streams[1][n % len(streams[1])]),
+        ):
+            reports = check(text, tmp_path, 0.5)
+        assert reports["scanner/roof"].problems == []
+        assert reports["scanner/roof"].records["ScannerReturns"] > 0
+        assert reports["scanner/roof"].time == ""  # its packets do not say whether pulses come
+        assert reports["scanner/roof"].records["ImuSamples"] == reports["scanner/roof/aux"].units > 0
+
     def test_an_imu_inside_a_gnss_stream_reads_along(self, tmp_path: Path) -> None:
         """A NovAtel SPAN recording: one wire, two devices."""
         data = (ROOT / "fixtures/novatel/ins1.gps").read_bytes()
@@ -236,6 +258,13 @@ class TestSomethingElse:
             report = check(srep(port), tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["answers as velodyne-vlp16, configured as srep"]
 
+    def test_a_head_that_needs_its_metadata_is_named_by_the_form_of_its_packets(self, tmp_path: Path) -> None:
+        port = free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures/ouster/crc_test.pcap.gz", port=7502)]
+        with udp_sender(port, lambda number: recorded[number % len(recorded)]):
+            report = check(srep(port), tmp_path, 0.5)["scanner/left"]
+        assert report.problems == ["answers as ouster, configured as srep"]
+
     @pytest.mark.parametrize(
         ("unit", "frames", "protocol"),
         [
@@ -252,6 +281,33 @@ class TestSomethingElse:
         spec = parse_transport("serial:/dev/ttyUSB0")
         entry = DeviceEntry("imu", "main", spec, None, "nmea2000", None, DeviceSettings("imu/main"), {})
         assert identify(entry, kept, than=0) == protocol
+
+    @pytest.mark.parametrize(
+        ("recording", "answers_as"),
+        [
+            ("velodyne/nebula_vlp32.pcap.gz", "velodyne-vlp32c"),
+            ("hesai/nebula_xt32.pcap.gz", "hesai-xt32"),
+            ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
+        ],
+    )
+    def test_a_head_of_another_model_is_named_though_its_second_port_is_alike(
+        self, recording: str, answers_as: str, tmp_path: Path
+    ) -> None:
+        """Velodyne's position packets are the same for all models: here they come while the data is another's."""
+        data, position = free_udp_port(), free_udp_port()
+        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        packets = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz", port=8308)]
+        with (
+            udp_sender(data, lambda number: recorded[number % len(recorded)]),
+            udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b""),
+        ):
+            report = check(text, tmp_path, 0.5)["scanner/roof"]
+        assert report.problems == [f"answers as {answers_as}, configured as velodyne-vlp16"]
 
     def test_garbage_is_no_protocol_and_asks_for_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()

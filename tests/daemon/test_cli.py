@@ -185,6 +185,7 @@ class TestErrors:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job's is ignored
         )
         with process:
             deadline_s = time.monotonic() + 30

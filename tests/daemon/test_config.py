@@ -19,6 +19,7 @@ from daemon.config import Config, Tables, load_config, parse_config
 from daemon.config.checks import rotation_problem, same_wire
 from daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
 from daemon.errors import ConfigError, ExitCode, UserError
+from daemon.log_parsers import stored_parsers
 from drivers.core.registry import all_drivers
 from drivers.transports.uri import parse_transport
 
@@ -65,6 +66,7 @@ class TestWholeFile:
     def test_the_example_names_every_key_there_is(self) -> None:
         table = tomllib.loads(AIRCRAFT.read_text())
         assert set(_absent_keys(Tables, table, "")) == {  # each excludes something that stands there
+            "gnss.*.setup.port",
             "imu.*.imu_type",
             "imu.*.source_address",
             "imu.*.ids",
@@ -276,6 +278,24 @@ class TestDevices:
         config = parse_config(text, tmp_path / "a.toml")
         assert ("geometry/left.json", "application/json", b"{}") in config.attachments()
         assert next(config.devices()).settings.files == {"geometry": b"{}"}
+
+    def test_a_parser_can_be_made_of_what_a_log_keeps(self, tmp_path: Path) -> None:
+        """An Ouster head's metadata goes into every log."""
+        metadata = (ROOT / "fixtures/ouster/crc_test.json").read_bytes()
+        (tmp_path / "os0.json").write_bytes(metadata)
+        text = with_session(
+            '[scanner.roof]\ntransport = "udp:0.0.0.0:7502"\nprotocol = "ouster"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+            '[scanner.roof.geometry]\nfile = "os0.json"\n'
+        )
+        attachments = {name: data for name, _, data in parse_config(text, tmp_path / "a.toml").attachments()}
+        assert attachments["geometry/roof.json"] == metadata
+        parsers, troubles = stored_parsers(attachments)
+        assert (list(parsers), troubles) == (["scanner/roof"], [])
+        del attachments["geometry/roof.json"]
+        assert stored_parsers(attachments)[1] == [
+            "scanner/roof: geometry.file: missing; want the head's metadata, a JSON file"
+        ]
 
 
 class TestPage:

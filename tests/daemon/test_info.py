@@ -109,7 +109,13 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
     source: dict[str, object] = {"units": 1_234_567, "bytes": 1, "rate_hz": 20000.0, "gaps": 0, "longest_gap_s": 0.0}
     source |= {"lost": lost, "account_errors": 0, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
     source |= {"trouble": {"bus_off": 2, "error_frames": 1_500}}
-    numbers: dict[str, object] = {"missing_parts": [], "last_events": [], "damage": [], "notes": []}
+    numbers: dict[str, object] = {
+        "missing_parts": [],
+        "last_events": [],
+        "marks": [{"time_ns": "soon", "text": "[x]"}],
+        "damage": [],
+        "notes": [],
+    }
     numbers |= {"session_id": "s", "start_ns": 0, "duration_s": 1.0, "parts": [0], "bytes": 0, "software": "swath 1"}
     numbers |= {"host": "h", "origin": origin, "growing": None, "sources": {"scanner/left-front/aux": source}}
     page = io.StringIO()
@@ -118,4 +124,5 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
     assert told in text
     assert "…" not in text
     assert "57.7µs" in text
+    assert "  ? mark: [x]\n" in text
     assert "scanner/left-front/aux: 2 bus off, 1,500 error frames" in text

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import resource
 import shutil
 import struct
 import subprocess
 import sys
+import threading
 import zlib
 from collections import Counter
 from pathlib import Path
@@ -20,6 +22,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
+from daemon.log.claim import claim, is_being_written
 from daemon.log.encode import encode_block, encode_json
 from daemon.log.format import ChannelSpec, LogError, SessionInfo, safe_attachment_path
 from daemon.log.reader import Session, open_logs
@@ -388,3 +391,14 @@ def test_refused_chunk_is_counted_cut_back_and_the_writer_goes_on(tmp_path: Path
     writer.finish()
     assert {topic: len(rows) for topic, rows in official(path).items()} == {SCANNER.topic: 400, ROVER.topic: 3}
     assert doctor(path).returncode == 0
+
+
+def test_a_claim_is_got_although_somebody_asks_at_this_moment(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"")
+    with path.open("rb") as asking, path.open("ab") as writing:
+        fcntl.flock(asking, fcntl.LOCK_SH)
+        threading.Timer(0.005, fcntl.flock, (asking, fcntl.LOCK_UN)).start()
+        claim(writing.fileno())
+        assert is_being_written(path)
+    assert not is_being_written(path)

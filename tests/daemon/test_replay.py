@@ -13,6 +13,7 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
+import can
 import pytest
 
 from daemon.wire_player import PtyOutput
@@ -22,6 +23,7 @@ from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
 SECONDS = 18
+BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
 
 
 def record_first(folder: Path) -> LogContent:
@@ -30,13 +32,15 @@ def record_first(folder: Path) -> LogContent:
     folder.mkdir()
     os.mkfifo(fifo)
     pty = Pty(link)
+    can_port = free_udp_port()
     config = session_table(folder / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
     with (
-        Recorder(folder, config) as recorder,
+        Recorder(folder, config + BUS.format(port=can_port)) as recorder,
         fifo.open("w") as edges,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        can.Bus(interface="udp_multicast", channel="239.74.163.2", port=can_port) as bus,
     ):
-        recorder.wait_said("device_opened", times=3)
+        recorder.wait_said("device_opened", times=4)
         start = time.time_ns() + 200_000_000
         with one_processor():
             for second in range(SECONDS):
@@ -48,6 +52,10 @@ def record_first(folder: Path) -> LogContent:
                 pty.write(nmea_zda(40_000 + second))
                 for _ in range(50):
                     sender.sendto(os.urandom(400), ("127.0.0.1", port))
+                for number in range(10):
+                    bus.send(
+                        can.Message(arbitration_id=second, data=bytes([number] * 8), is_extended_id=second % 2 > 0)
+                    )
                 if second == SECONDS // 2:
                     recorder.process.send_signal(signal.SIGHUP)
         time.sleep(0.5)
@@ -67,11 +75,13 @@ def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogCont
     """Play logs to a second recorder that was there first; what it recorded, and what replay said."""
     port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
     config = session_table(folder / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+    config += BUS.format(port=free_udp_port())
     config += (
         f'[scanner.right]\ntransport = "udp:127.0.0.1:{free_udp_port()}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
     )
     with Recorder(folder, config) as recorder:
         recorder.wait_said("scanner/left device_opened")
+        recorder.wait_said("imu/main device_opened")
         command = [sys.executable, "-m", "daemon.cli.main", "replay", "--pace", pace, "--wire", str(recorder.config)]
         played = subprocess.run(
             [*command, "--wait", "30", str(logs)], cwd=ROOT, capture_output=True, text=True, timeout=90, check=False
@@ -84,8 +94,10 @@ def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogCont
 
 def same_bytes(one: LogContent, other: LogContent) -> None:
     assert other.data("gnss/rover") == one.data("gnss/rover")
-    datagrams = [[data for _, data in log.units["scanner/left"]] for log in (one, other)]
-    assert datagrams[0] == datagrams[1]
+    for source, count in (("scanner/left", 50 * SECONDS), ("imu/main", 10 * SECONDS)):
+        units = [[data for _, data in log.units[source]] for log in (one, other)]
+        assert units[0] == units[1]
+        assert len(units[0]) == count
 
 
 def time_states(content: LogContent) -> list[str]:

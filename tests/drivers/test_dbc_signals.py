@@ -82,6 +82,7 @@ def assert_like_cantools(message: Any, signal: Any, data: np.ndarray[Any, np.dty
 
 
 @example(DbcSignal(17, 32, False, True, True, 1.0, 0.0, 8), [b"\0\0\0\0\1\xff" + bytes(58)])  # a signalling NaN
+@example(DbcSignal(0, 64, False, True, True, 12.0, 0.0, 8), [bytes(6) + b"\xef\x7f" + bytes(56)])  # overflows
 @settings(max_examples=300, deadline=None)
 @given(dbc_signals(), st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=4))
 def test_any_signal_reads_as_cantools_reads_it(signal: DbcSignal, payloads: list[bytes]) -> None:

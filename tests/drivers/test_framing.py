@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import lzma
 import operator
 import random
 import zlib
 from collections import Counter
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,6 +23,8 @@ from drivers.core.checksums import (
     crc16_ccitt,
     crc24q,
     crc32_novatel,
+    crc64_xz,
+    crc64_xz_holds,
     nmea_xor,
     ubx_fletcher,
 )
@@ -102,6 +106,35 @@ def test_crc24q_of_long_data_joins_its_steps(length: int) -> None:
 def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
+
+
+def crc64_reference(data: bytes) -> int:
+    """The check of a block as liblzma writes it (The .xz File Format, 2.1.2 and 3.4)."""
+    packed = lzma.compress(data, check=lzma.CHECK_CRC64)
+    index_bytes = 4 * (int.from_bytes(packed[-8:-4], "little") + 1)
+    end = len(packed) - 12 - index_bytes
+    return int.from_bytes(packed[end - 8 : end], "little")
+
+
+@pytest.mark.parametrize("length", [8, 9, 15, 16, 17, 23, 24, 25, 444, 8440, 24_824])
+def test_crc64_of_rows_joins_their_words(length: int) -> None:
+    rows = np.frombuffer(random.Random(length).randbytes(5 * length), dtype=np.uint8).reshape(5, length)
+    assert crc64_xz(rows).tolist() == [crc64_reference(row.tobytes()) for row in rows]
+    assert crc64_xz(rows[::2]).tolist() == [crc64_reference(row.tobytes()) for row in rows[::2]]
+    assert crc64_xz(rows[:0]).tolist() == []
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 6, 444, 8440, 65_536])
+def test_crc64_holds_of_whole_data_only(length: int) -> None:
+    data = random.Random(length).randbytes(length)
+    crc = crc64_reference(data).to_bytes(8, "little")
+    assert crc64_xz_holds(data, crc)
+    for bit in random.Random(1).sample(range(8 * length), min(8 * length, 40)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        assert not crc64_xz_holds(bytes(flipped), crc)
+    for bit in range(64):
+        assert not crc64_xz_holds(data, (int.from_bytes(crc, "little") ^ 1 << bit).to_bytes(8, "little"))
 
 
 def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:

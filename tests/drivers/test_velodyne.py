@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings
 from drivers.core.registry import find_driver
+from drivers.scanner.beams import beam_points
 from drivers.scanner.velodyne import (
     MODE_DUAL,
     MODE_LAST,
@@ -21,9 +21,8 @@ from drivers.scanner.velodyne import (
     VelodyneParser,
     encode_data_packet,
 )
-from drivers.scanner.velodyne_heads import VLP16, beam_points
+from drivers.scanner.velodyne_heads import VLP16
 from drivers.scanner.velodyne_position import encode_position_packet, rmc_time
-from drivers.transports.capture_file import read_pcap
 from georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
@@ -38,10 +37,11 @@ from georef.records import (
     TimeMessage,
 )
 from tests.drivers.harness import check_packet_damage, check_packets
+from tests.drivers.spinning import feed, payloads, read_pcd, returns_of, ros_points, xyz
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "velodyne"
 SETTINGS = DeviceSettings("scanner/left", {})
-RING = np.argsort(np.argsort(VLP16.elevation_deg))  # other decoders number lasers from the lowest
+RING = np.argsort(np.argsort(VLP16.beams.elevation_deg))  # other decoders number lasers from the lowest
 _XYZ, _ANGLES = [("x", "f4"), ("y", "f4"), ("z", "f4")], [("azimuth", "f4"), ("elevation", "f4"), ("distance", "f4")]
 GOLDEN_DTYPE = np.dtype(
     [*_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "u2"), *_ANGLES, ("time_stamp", "u4")]
@@ -52,41 +52,9 @@ def make_parser() -> VelodyneParser:
     return VelodyneParser(SETTINGS)
 
 
-def payloads(name: str) -> list[bytes]:
-    return [unit.data for unit in read_pcap(FIXTURES / name)]
-
-
 def recording() -> list[bytes]:
     data = gzip.decompress((FIXTURES / "vlp16-go_recording.bin.gz").read_bytes())
     return [data[at : at + 1206] for at in range(0, len(data), 1206)]
-
-
-def feed(parser: VelodyneParser, units: list[bytes]) -> list[Record]:
-    """Runs of equal length as one batch each, one millisecond a unit."""
-    records: list[Record] = []
-    at = 0
-    while at < len(units):
-        stop = at + 1
-        while stop < len(units) and len(units[stop]) == len(units[at]):
-            stop += 1
-        rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
-        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
-        at = stop
-    return records
-
-
-def returns_of(records: list[Record]) -> StructArray:
-    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
-
-
-def ros_points(rows: StructArray) -> NDArray[np.float64]:
-    """The maker's frame turned as ROS decoders publish it: x forward, y left."""
-    x, y, z = beam_points(rows).T
-    return np.stack([y, -x, z], axis=1)
-
-
-def xyz(points: StructArray) -> NDArray[np.float64]:
-    return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
 
 
 # --- real recordings ------------------------------------------------------------------------------------------------
@@ -94,7 +62,7 @@ def xyz(points: StructArray) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(("name", "total"), [("mrpt_vlp16_gps", 73486), ("nebula_vlp16", 59414)])
 def test_points_agree_with_velodyne_decoder(name: str, total: int) -> None:
-    rows = returns_of(feed(make_parser(), [p for p in payloads(f"{name}.pcap.gz") if len(p) == 1206]))
+    rows = returns_of(feed(make_parser(), [p for p in payloads(f"velodyne/{name}.pcap.gz") if len(p) == 1206]))
     assert len(rows) == total
     with np.load(FIXTURES / f"{name}.velodyne_decoder.npz") as archive:
         theirs = archive["points"]
@@ -106,7 +74,7 @@ def test_points_agree_with_velodyne_decoder(name: str, total: int) -> None:
     ours = ours[np.lexsort([ours["range_m"], RING[ours["channel"]], column])]
     np.testing.assert_array_equal(RING[ours["channel"]], theirs["ring"])
     np.testing.assert_array_equal(ours["intensity"], theirs["intensity"])
-    points = ros_points(ours)
+    points = ros_points(ours, VLP16.beams)
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.linalg.norm(xyz(theirs), axis=1), atol=2e-5)
     np.testing.assert_allclose(points[:, 2], theirs["z"], atol=1e-4)
     azimuth = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(theirs["y"], theirs["x"])
@@ -116,15 +84,13 @@ def test_points_agree_with_velodyne_decoder(name: str, total: int) -> None:
 
 
 def golden() -> StructArray:
-    data = gzip.decompress((FIXTURES / "nebula_vlp16_golden_1673400472138016708.pcd.gz").read_bytes())
-    start = data.index(b"DATA binary\n") + len(b"DATA binary\n")
-    return np.frombuffer(data[start:], dtype=GOLDEN_DTYPE, count=14831)
+    return read_pcd(FIXTURES / "nebula_vlp16_golden_1673400472138016708.pcd.gz", GOLDEN_DTYPE)
 
 
 def test_dual_returns_agree_with_the_golden_cloud_of_nebula() -> None:
     cloud = golden()
-    rows = returns_of(feed(make_parser(), payloads("nebula_vlp16.pcap.gz")[450:]))
-    points = ros_points(rows)
+    rows = returns_of(feed(make_parser(), payloads("velodyne/nebula_vlp16.pcap.gz")[450:]))
+    points = ros_points(rows, VLP16.beams)
     distance, nearest = np.empty(len(cloud)), np.empty(len(cloud), dtype=np.intp)
     for ring in range(16):
         theirs, ours = np.flatnonzero(cloud["channel"] == ring), np.flatnonzero(RING[rows["channel"]] == ring)
@@ -143,8 +109,8 @@ def test_dual_returns_agree_with_the_golden_cloud_of_nebula() -> None:
 
 
 def test_dual_returns_are_numbered_by_range() -> None:
-    rows = returns_of(feed(make_parser(), payloads("nebula_vlp16.pcap.gz")))
-    assert {0x39, 0x22} == set(payloads("nebula_vlp16.pcap.gz")[0][-2:])
+    rows = returns_of(feed(make_parser(), payloads("velodyne/nebula_vlp16.pcap.gz")))
+    assert {0x39, 0x22} == set(payloads("velodyne/nebula_vlp16.pcap.gz")[0][-2:])
     two = rows["number_of_returns"] == 2
     first, last = rows[two & (rows["return_number"] == 1)], rows[two & (rows["return_number"] == 2)]
     assert len(first) == len(last) == 708
@@ -160,7 +126,7 @@ def test_dual_returns_are_numbered_by_range() -> None:
 
 
 def test_gps_capture_gives_time_and_status() -> None:
-    units = payloads("mrpt_vlp16_gps.pcap.gz")
+    units = payloads("velodyne/mrpt_vlp16_gps.pcap.gz")
     parser = make_parser()
     records = feed(parser, units)
     assert parser.counters.messages == {"data": 293, "position": 57}
@@ -213,7 +179,7 @@ def test_recording_without_gps() -> None:
 
 @pytest.mark.parametrize("name", ["mrpt_vlp16_gps.pcap.gz", "nebula_vlp16.pcap.gz"])
 def test_batches_may_be_cut_anywhere(name: str) -> None:
-    units = payloads(name)
+    units = payloads(f"velodyne/{name}")
     check_packets(make_parser, units)
     check_packet_damage(make_parser, units[:20])
     check_packets(lambda: VelodyneParser(SETTINGS, clock_only=True), units)
@@ -224,7 +190,7 @@ def test_lost_packets_are_counted_by_the_stamps() -> None:
     parser = make_parser()
     feed(parser, units[:50] + units[53:120] + units[119:120] + units[160:])
     assert parser.counters.errors == {"cadence_gap": 3 + 40, "duplicate": 1}
-    dual = payloads("nebula_vlp16.pcap.gz")
+    dual = payloads("velodyne/nebula_vlp16.pcap.gz")
     parser = make_parser()
     feed(parser, dual[:100])
     feed(parser, dual[107:])
@@ -325,8 +291,10 @@ def test_beam_points_of_the_formula_sheet() -> None:
     """FORMULAS 2.2: 50 m at azimuth 123° and elevation −9° without the vertical correction of its laser (8.1 mm)."""
     rows = decode(packet())[:1].copy()
     rows["channel"], rows["encoder_rad"], rows["range_m"] = 6, np.radians(123.0), 50.0
-    assert VLP16.elevation_deg[6] == -9.0
-    np.testing.assert_allclose(beam_points(rows)[0] - [0, 0, 6.6e-3], [41.417257, -26.896681, -7.821723], atol=1e-6)
+    assert VLP16.beams.elevation_deg[6] == -9.0
+    np.testing.assert_allclose(
+        beam_points(rows, VLP16.beams)[0] - [0, 0, 6.6e-3], [41.417257, -26.896681, -7.821723], atol=1e-6
+    )
 
 
 @given(
@@ -505,7 +473,7 @@ def test_driver_declares_what_it_gives() -> None:
     driver = find_driver("scanner", "velodyne-vlp16")
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None
-    units = payloads("mrpt_vlp16_gps.pcap.gz")
+    units = payloads("velodyne/mrpt_vlp16_gps.pcap.gz")
     parser = driver.make_time_parser(SETTINGS)
     assert isinstance(parser, VelodyneParser)
     records = feed(parser, units)

@@ -1,0 +1,86 @@
+"""``swath export``: the devices' own files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+
+if TYPE_CHECKING:
+    from daemon.exporting import ExportReport
+    from daemon.log.reader import Session
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…")],
+    directory: Annotated[Path, typer.Argument(help="Where to; a folder a session is made in it.", metavar="DIR")],
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
+
+    What such a file cannot hold goes into a small file beside it, by which `swath import` makes the same log again.
+    Exit code 4 when the log is damaged: what could be read is written.
+    """
+    from rich.console import Console
+
+    from daemon.exporting import export_session
+    from daemon.log.format import LogError
+    from daemon.log.reader import open_logs
+
+    passed_over: list[str] = []
+    done: list[tuple[Session, ExportReport]] = []
+    try:
+        with Console(stderr=True).status("reading"):
+            for session in open_logs(logs, passed_over):
+                done.append((session, export_session(session, directory)))
+    except LogError as error:
+        raise UserError(one_line(str(error)), ExitCode.IO) from error
+    except OSError as error:
+        text = f"{directory}: {error.strerror or error}; nothing is left of what was begun"
+        raise UserError(one_line(text), ExitCode.IO) from error
+    if as_json:
+        print(json.dumps({"sessions": [_plain(*one) for one in done], "passed_over": passed_over}, indent=2))
+    else:
+        for session, report in done:
+            _print(session, report)
+    lines = [f"passed over: {line}" for line in passed_over]
+    lines += [_damage(session) for session, _ in done if session.damage]
+    if lines:
+        raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE)
+    if any(session.missing_parts for session, _ in done):
+        raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _plain(session: Session, report: ExportReport) -> dict[str, object]:
+    return {
+        "session_id": session.session_id,
+        "folder": str(report.folder),
+        "files": report.files,
+        "units": dict(report.units),
+        "notes": report.notes,
+        "missing_parts": session.missing_parts,
+        "growing": None if session.growing is None else session.growing.name,
+        "damage": [f"{one.path.name} at byte {one.damage.offset}: {one.damage.what}" for one in session.damage],
+    }
+
+
+def _print(session: Session, report: ExportReport) -> None:
+    print(one_line(str(report.folder)))
+    for name, entry in report.files.items():
+        print(f"  {name}: {entry['kind']}, {entry['units']} units")
+    for note in report.notes:
+        print(one_line(f"  note: {note}"))
+    for number in session.missing_parts:
+        print(f"  part {number} is missing")
+    if session.growing is not None:
+        print(one_line(f"  {session.growing.name} is being recorded: what it held so far"))
+
+
+def _damage(session: Session) -> str:
+    first = session.damage[0]
+    more = f" ({len(session.damage)} such places)" if len(session.damage) > 1 else ""
+    return f"{first.path} at byte {first.damage.offset}: {first.damage.what}{more}; what could be read is written"

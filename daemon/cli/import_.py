@@ -1,0 +1,163 @@
+"""``swath import``: a log of captures."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import resource
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+
+if TYPE_CHECKING:
+    from daemon.capture_routes import Routes
+    from daemon.captures import Capture
+    from daemon.config import Config
+    from daemon.importing import ImportReport
+
+ValueT = TypeVar("ValueT")
+
+
+def command(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration that says what the devices are.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Directory of the log.")],
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="FILE…", help="pcap, pcapng, candump -L; the folder of an export.")
+    ] = None,
+    source: Annotated[
+        list[str] | None, typer.Option(metavar="KIND/NAME[:WHICH]=FILE", help="Whose bytes a file holds; repeatable.")
+    ] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[SOURCE=]TIME", help="When a serial file without times begins: 2026-11-21T10:15:00Z."),
+    ] = None,
+    baud: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[SOURCE=]N", help="How fast its bytes came; 0: all at once. Else the configuration's."),
+    ] = None,
+    keep_copies: Annotated[bool, typer.Option("--keep-copies", help="Keep packets that were captured twice.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Make a log of captures made with tcpdump, candump or str2str, or of what `swath export` wrote.
+
+    UDP ports and CAN interfaces of CONFIG say whose the units of a pcap file or candump log are; `--source` says it of
+    a serial stream. Exit code 4 when a capture is damaged, 1 when one holds nothing of CONFIG's devices.
+    """
+    from daemon.capture_files import Told, find_captures
+    from daemon.capture_routes import Routes
+    from daemon.config import load_config
+
+    logging.getLogger("swath").addHandler(logging.NullHandler())  # what is told of captures stands below
+    told = Told(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
+    loaded = load_config(config)
+    routes = Routes.of(loaded)
+    captures = find_captures(routes, files or (), told)
+    report = _import(loaded, routes, captures, output)
+    if as_json:
+        found = {"session_id": report.session_id, "log": [str(path) for path in report.paths], "units": report.units}
+        print(json.dumps(found | {"captures": [capture.plain() for capture in captures]}, indent=2))
+    else:
+        _print(report, captures)
+    damaged = [capture for capture in captures if capture.tally.damage]
+    lines = [_damage(capture) for capture in damaged]
+    lines += [_of_nobody(capture, routes) for capture in captures if not capture.units and not capture.tally.damage]
+    if lines:
+        raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE if damaged else ExitCode.PROBLEM)
+
+
+def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
+    from rich.console import Console
+
+    from daemon.importing import import_captures
+    from daemon.run import take_directory
+    from drivers.transports.base import TransportError
+
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # captures are merged: all are open at once
+    lock = take_directory(output, "--output")
+    try:
+        with Console(stderr=True).status("reading") as status:
+            return import_captures(
+                config, routes, captures, output, lambda units: status.update(f"reading: {units} units")
+            )
+    except TransportError as error:
+        raise UserError(one_line(str(error)), ExitCode.IO) from error
+    except OSError as error:
+        raise UserError(one_line(f"{output}: {error.strerror or error}; nothing is left of it"), ExitCode.IO) from error
+    finally:
+        os.close(lock)
+
+
+def _by_source(texts: Sequence[str] | None, parse: Callable[[str], ValueT]) -> dict[str, ValueT]:
+    """``SOURCE=value`` or ``value`` for all."""
+    found: dict[str, ValueT] = {}
+    for text in texts or ():
+        source, _, value = text.rpartition("=")
+        try:
+            found[source] = parse(value)
+        except ValueError as error:
+            raise UserError(f"{text}: {error}", ExitCode.USAGE) from error
+    return found
+
+
+def _time_ns(text: str) -> int:
+    """ISO 8601 with Z or an offset, or seconds since 1970 with up to nine decimals."""
+    whole, _, fraction = text.partition(".")
+    if whole.isdecimal() and len(whole) <= 10 and (not fraction or (fraction.isdecimal() and len(fraction) <= 9)):
+        return int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0"))
+    want = "want a time such as 2026-11-21T10:15:00Z, or seconds since 1970"
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ValueError(want) from error
+    if time.tzinfo is None:
+        raise ValueError(f"{want}: with Z or an offset from UTC")
+    since = time - datetime(1970, 1, 1, tzinfo=UTC)
+    if since.days < 0:
+        raise ValueError(f"{want}: after 1970")
+    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
+
+
+def _baud(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value == 0 or 1 <= value <= 1e9):
+        raise ValueError("want bits per second, or 0 for all bytes at once")
+    return value
+
+
+def _print(report: ImportReport, captures: list[Capture]) -> None:
+    for capture in captures:
+        told = [f"{count} units of {source}" for source, count in sorted(capture.units.items())] or ["no unit"]
+        told += [f"{count} {what} passed over" for what, count in capture.tally.passed.items() if count]
+        if capture.passed:
+            most = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
+            told.append(f"{capture.passed.total()} of no device: {most}")
+        print(one_line(f"{capture.path}: {capture.kind}, {', '.join(told)}"))
+    for path in report.paths:
+        print(path)
+
+
+def _damage(capture: Capture) -> str:
+    tally = capture.tally
+    more = f" ({tally.damage} such places)" if tally.damage > 1 else ""
+    return f"{tally.first_damage}{more}; what could be read is in the log"
+
+
+def _of_nobody(capture: Capture, routes: Routes) -> str:
+    there = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
+    if not there:
+        return f"{capture.path}: holds no unit"
+    return (
+        f"{capture.path}: holds {there}, the configuration has {routes.described(capture.kind)}; "
+        "--source kind/name=FILE says whose it is"
+    )

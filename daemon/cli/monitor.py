@@ -1,0 +1,155 @@
+"""``swath monitor``: a running recorder on the terminal."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, one_line
+from daemon.places import DEFAULT_CONFIG, log_directory
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+    from daemon.monitor import Monitor
+
+EVENTS_SHOWN = 8
+FIRST_STATUS_S = 3.0  # a recorder that has just begun tells its first status after a second
+STATE_STYLE = {"receiving": "green", "silent": "red", "absent": "red", "opening": "yellow"}
+EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording": 2}
+
+
+def command(
+    where: Annotated[
+        Path,
+        typer.Argument(
+            metavar="[CONFIG|DIR]", help="Which recorder: its configuration or log directory.", readable=False
+        ),
+    ] = DEFAULT_CONFIG,
+    once: Annotated[bool, typer.Option("--once", help="One line, and its verdict as exit code.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, or one a line without --once.")] = False,
+    every: Annotated[float, typer.Option(help="Seconds between two looks.", min=0.1, max=60.0)] = 0.5,
+    decode: Annotated[bool, typer.Option(help="Look into the bytes: damaged messages, gaps, rates of records.")] = True,
+) -> None:
+    """Show how each source does: state, rate, age, losses, time status; the disk; the last events.
+
+    Reads the growing log and never asks the recorder. With --once the exit code is 0 recording, 1 degraded, 2 not
+    recording.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    from daemon.monitor import Monitor
+
+    monitor = Monitor(log_directory(where), decode=decode)
+    if once:
+        raise typer.Exit(int(EXIT[_once(monitor, as_json)]))
+    console = Console()
+    if as_json or not console.is_terminal:
+        while True:
+            monitor.poll()
+            found = monitor.snapshot()
+            print(json.dumps(found) if as_json else one_line(found["sentence"]), flush=True)
+            time.sleep(every)
+    with Live(console=console, auto_refresh=False, screen=True) as live:
+        while True:
+            monitor.poll()
+            live.update(page(monitor.snapshot()), refresh=True)
+            time.sleep(every)
+
+
+def _once(monitor: Monitor, as_json: bool) -> str:
+    deadline_s = time.monotonic() + FIRST_STATUS_S
+    monitor.poll()
+    found = monitor.snapshot()
+    while found["verdict"] != "not recording" and not found["sources"] and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+        monitor.poll()
+        found = monitor.snapshot()
+    monitor.close()
+    print(json.dumps(found, indent=2) if as_json else one_line(found["sentence"]))
+    return str(found["verdict"])
+
+
+def page(found: dict[str, Any]) -> Group:
+    """What stands on the terminal."""
+    from rich.console import Group, RenderableType
+    from rich.table import Table
+    from rich.text import Text
+
+    style = {"recording": "bold green", "degraded": "bold yellow"}.get(found["verdict"], "bold red")
+    parts: list[RenderableType] = [Text(one_line(found["sentence"]), style=style), Text("")]
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("source", "state", "per s", "age", "lost k/q/w", "time"):
+        words = column in ("source", "state", "time")
+        table.add_column(column, justify="left" if words else "right", overflow="fold", no_wrap=not words)
+    for source, values in found["sources"].items():
+        table.add_row(*_row(source, values))
+    parts.append(table)
+    for source, values in found["sources"].items():
+        if (told := _decoded(values.get("decoded"))) is not None:
+            parts.append(Text(one_line(f"{source}: {told}"), style="dim"))
+    parts += [Text(one_line(note), style="yellow") for note in found["notes"]]
+    parts.append(Text(f"\n{_disk(found)}\n"))
+    for event in found["events"][-EVENTS_SHOWN:]:
+        parts.append(_event(event))
+    return Group(*parts)
+
+
+def _row(source: str, values: dict[str, Any]) -> tuple[Any, ...]:
+    from rich.text import Text
+
+    lost = "/".join(str(count) for count in values["lost"].values())
+    state = str(values["state"])
+    return (
+        Text(one_line(source)),
+        Text(one_line(state), style=STATE_STYLE.get(state, "")),
+        "" if values["rate_hz"] is None else f"{values['rate_hz']:,.1f}",
+        "never" if values["age_s"] is None else f"{values['age_s']:.1f} s",
+        Text(lost, style="" if lost == "0/0/0" else "red"),
+        Text(time_text(values)),
+    )
+
+
+def time_text(values: dict[str, Any]) -> str:
+    """``LOCKED ±0.3 µs``; nothing for a source without a clock."""
+    state, sigma_ns = values.get("time_state"), values.get("time_sigma_ns")
+    if state is None:
+        return ""
+    if not isinstance(sigma_ns, (int, float)):
+        return one_line(str(state))
+    sigma = f"{sigma_ns * 1e-3:.1f} µs" if sigma_ns < 1e6 else f"{sigma_ns * 1e-6:.0f} ms"
+    return one_line(f"{state} ±{sigma}")
+
+
+def _decoded(decoded: dict[str, Any] | None) -> str | None:
+    if decoded is None:
+        return None
+    told = [f"{rate:,.1f} {name}/s" for name, rate in decoded["records_hz"].items()]
+    if decoded["bad"]:
+        told.append(f"{decoded['bad']} messages damaged")
+    told += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    text = ", ".join(told) or "nothing decoded"
+    share = decoded["share"]
+    return text if share == 1.0 else f"{text} (of {share:.0%} of the seconds)"
+
+
+def _disk(found: dict[str, Any]) -> str:
+    rate, hours = found["bytes_per_s"] / 1e6, found["hours_left"]
+    left = "" if hours is None else f", {hours:,.1f} h left at this rate"
+    reserve = f", {found['reserve_bytes'] / 1e9:.1f} of them the reserve" if found["reserve_bytes"] else ""
+    return f"{rate:,.2f} MB/s; {found['free_bytes'] / 1e9:,.1f} GB free{reserve}{left}"
+
+
+def _event(event: dict[str, Any]) -> Any:
+    from rich.text import Text
+
+    from daemon.health import clock_text
+
+    when, severity = clock_text(event.get("time_ns")), str(event.get("severity"))
+    style = {"critical": "bold red", "error": "red", "warning": "yellow"}.get(severity, "")
+    return Text(one_line(f"{when} {event.get('source')} {event.get('code')}: {event.get('text')}"), style=style)

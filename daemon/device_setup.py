@@ -1,0 +1,260 @@
+"""Sends the devices the messages they need before a survey, and hears what they say to each.
+
+One message at a time: the next is sent when the device has answered the one before. Without an answer nothing more is
+sent by that wire, since a late answer would be taken for that of another message.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Any
+
+from daemon.config import Config, DeviceEntry
+from daemon.errors import ExitCode, UserError, one_line
+from drivers.core.parser import DeviceSettings
+from drivers.core.registry import find_driver
+from drivers.core.startup import Answer, StartupMessage, StartupWish
+from drivers.transports.base import TransportError
+from drivers.transports.uri import TransportSpec, open_transport
+
+SLICE_S = 0.1
+SETTLE_S = 0.3  # for a device to change the rate of its line
+
+
+class Outcome(StrEnum):
+    """What became of a message."""
+
+    PLANNED = "planned"
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    NO_ANSWER = "no answer"
+    NOT_SENT = "not sent"
+
+
+@dataclass(slots=True)
+class Step:
+    """One message, what became of it, and what the device said."""
+
+    message: StartupMessage
+    outcome: Outcome = Outcome.PLANNED
+    answer: str = ""
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, the form of ``--json``."""
+        return {
+            "lines": list(self.message.lines),
+            "hex": self.message.data.hex(),
+            "outcome": str(self.outcome),
+            "answer": self.answer,
+        }
+
+
+@dataclass(slots=True)
+class DeviceSetup:
+    """One device and its messages.
+
+    Attributes:
+        source: ``kind/name``.
+        transport: as configured; ``gnss:<name>`` where its bytes lie inside that receiver's stream.
+        steps: its messages; empty where it has none.
+        problem: why nothing can be sent to it, or what went wrong; one line.
+    """
+
+    source: str
+    protocol: str
+    transport: str
+    steps: list[Step] = field(default_factory=list)
+    problem: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing went wrong so far."""
+        return not self.problem and all(step.outcome in (Outcome.PLANNED, Outcome.ACCEPTED) for step in self.steps)
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, the form of ``--json``."""
+        return {
+            "source": self.source,
+            "protocol": self.protocol,
+            "transport": self.transport,
+            "messages": [step.plain() for step in self.steps],
+            "problem": self.problem,
+            "ok": self.ok,
+        }
+
+
+@dataclass(slots=True)
+class WireSetup:
+    """One wire and the devices that are asked by it: a receiver and the IMUs inside its stream.
+
+    Attributes:
+        spec: the transport.
+        present_baud: the rate the device speaks at before it is told the configured one; None: that one.
+    """
+
+    spec: TransportSpec
+    devices: list[DeviceSetup] = field(default_factory=list)
+    present_baud: int | None = None
+
+    def steps(self) -> list[Step]:
+        """All messages in the order they are sent."""
+        steps = [step for device in self.devices for step in device.steps]
+        return sorted(steps, key=lambda step: step.message.last)
+
+
+class Line:
+    """An open wire: one message out, its answer in.
+
+    Args:
+        spec: the transport.
+        baud: its rate at first; None: as configured.
+    """
+
+    def __init__(self, spec: TransportSpec, baud: int | None) -> None:
+        self._spec = spec
+        self._transport = open_transport(spec if baud is None else _at_baud(spec, baud))
+        self._transport.open()
+
+    def ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
+        """Send a message and wait for its answer; None: there was none.
+
+        Where it changes the rate, it is sent again at the new one, and that answer counts: what a device says while it
+        changes may be lost.
+
+        Raises:
+            TransportError: the device has gone.
+        """
+        answer = self._ask(message, timeout_s)
+        if message.baud is None or (answer is not None and not answer.accepted):
+            return answer
+        self._transport.close()
+        time.sleep(SETTLE_S)
+        self._transport = open_transport(_at_baud(self._spec, message.baud))
+        self._transport.open()
+        return self._ask(message, timeout_s)
+
+    def _ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
+        listener = message.listen()
+        self._transport.receive(0.0)  # what was said before is no answer
+        self._transport.send(message.data)
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            for block in self._transport.receive(min(SLICE_S, left_s)):
+                answer = listener.hear(block.units.tobytes())
+                if answer is not None:
+                    return answer
+        return listener.close()
+
+    def close(self) -> None:
+        """Release the wire."""
+        self._transport.close()
+
+
+def plan_setup(
+    config: Config, only: Collection[str] = (), *, save: bool = False, present_baud: int | None = None
+) -> list[WireSetup]:
+    """What would be sent, wire by wire.
+
+    Args:
+        config: the configuration.
+        only: sources (``gnss/rover``); none: all.
+        save: let the devices keep it without power.
+        present_baud: the rate that the one device asked for speaks at now.
+
+    Raises:
+        UserError: a source that there is not, or a rate for more or less than one serial device.
+    """
+    entries = {entry.source: entry for entry in config.devices()}
+    if unknown := [source for source in only if source not in entries]:
+        raise UserError(f"no device {unknown[0]}; there are: {', '.join(entries) or 'none'}", ExitCode.USAGE)
+    wires: dict[str, WireSetup] = {}
+    for entry in entries.values():
+        if not only or entry.source in only:
+            carrier = entries[f"gnss/{entry.transport.address}"] if entry.transport.kind == "gnss" else entry
+            wire = wires.setdefault(carrier.source, WireSetup(carrier.transport))
+            _add_device(wire, entry, carrier, StartupWish(save, present_baud and _configured_baud(carrier)))
+    if present_baud is not None:
+        _change_rate(wires, present_baud)
+    return list(wires.values())
+
+
+def _configured_baud(entry: DeviceEntry) -> int | None:
+    baud = entry.transport.options.get("baud")
+    return int(baud) if baud is not None and entry.transport.kind == "serial" else None
+
+
+def _change_rate(wires: dict[str, WireSetup], present_baud: int) -> None:
+    """Begin at another rate on the one wire whose device is told the configured one."""
+    changing = [
+        (source, wire) for source, wire in wires.items() if any(step.message.baud is not None for step in wire.steps())
+    ]
+    if len(changing) != 1:
+        names = ", ".join(source for source, _ in changing)
+        found = f"there are: {names}; choose one with --device" if changing else "none has one that can be set"
+        raise UserError(f"--from-baud is for one serial device with ?baud=…; {found}", ExitCode.USAGE)
+    changing[0][1].present_baud = present_baud
+
+
+def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish: StartupWish) -> None:
+    device = DeviceSetup(entry.source, entry.protocol, entry.transport.text)
+    wire.devices.append(device)
+    startup = find_driver(entry.kind, entry.protocol).startup
+    if startup is None:
+        return
+    settings = entry.settings
+    if entry is not carrier:  # the port is the receiver's
+        setup = carrier.settings.config.get("setup")
+        settings = DeviceSettings(settings.source, {**settings.config, "setup": setup}, settings.files)
+    known = {step.message.data for step in wire.steps()}
+    device.steps = [Step(message) for message in startup(settings, wish) if message.data not in known]
+    device.problem = _why_not_sent(wire.spec)
+
+
+def _why_not_sent(spec: TransportSpec) -> str:
+    """A datagram goes to the group where there is one, and that is not the device."""
+    if spec.kind == "serial" or (spec.kind == "udp" and "source" in spec.options and "group" not in spec.options):
+        return ""
+    hint = "; say ?source=<its address>, and no group" if spec.kind == "udp" else ""
+    return f"nothing can be sent by {spec.text}{hint}"
+
+
+def _at_baud(spec: TransportSpec, baud: int) -> TransportSpec:
+    return replace(spec, options={**spec.options, "baud": str(baud)})
+
+
+def apply_setup(wire: WireSetup, timeout_s: float) -> None:
+    """Send a wire's messages and keep what the devices say in its steps."""
+    steps = wire.steps()
+    if steps and not any(device.problem for device in wire.devices):
+        try:
+            with closing(Line(wire.spec, wire.present_baud)) as line:
+                _send_all(line, steps, timeout_s)
+        except TransportError as error:
+            for device in wire.devices:
+                device.problem = str(error) if device.steps else ""
+    for step in steps:
+        if step.outcome is Outcome.PLANNED:
+            step.outcome = Outcome.NOT_SENT
+
+
+def _send_all(line: Line, steps: list[Step], timeout_s: float) -> None:
+    for step in steps:
+        if step.message.last and not _all_accepted(steps):
+            step.outcome, step.answer = Outcome.NOT_SENT, "not everything was accepted"
+            continue
+        step.outcome = Outcome.NO_ANSWER  # until there is one
+        answer = line.ask(step.message, timeout_s)
+        if answer is None:
+            return
+        step.outcome = Outcome.ACCEPTED if answer.accepted else Outcome.REFUSED
+        step.answer = one_line(answer.text)
+        if step.message.baud is not None and not answer.accepted:
+            return
+
+
+def _all_accepted(steps: Iterable[Step]) -> bool:
+    return all(step.outcome is Outcome.ACCEPTED for step in steps if not step.message.last)

@@ -1,0 +1,124 @@
+"""What on this computer would cost data, and what mends it.
+
+`examine` asks everything of this computer; each question is a small function over the files it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import disk_usage
+
+from daemon.config import Config
+from daemon.doctor import clock, devices, disk, host
+from daemon.doctor.finding import Finding, Tree, Verdict
+from daemon.host_clock import read_clock_discipline
+from daemon.log.claim import is_being_written
+from daemon.parts import read_sign
+from drivers.transports.can_link import interface_bitrate
+from drivers.transports.udp_socket import DEFAULT_BUFFER_MB
+from drivers.transports.uri import TransportSpec
+
+DEFAULT_DIRECTORY = Path("/var/lib/swath")
+DEFAULT_RESERVE_BYTES = 512e6
+DEFAULT_SPLIT_BYTES = 2048e6
+
+__all__ = ["Finding", "Tree", "Verdict", "examine"]
+
+
+def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
+    """Look at this computer.
+
+    Args:
+        config: what is wired to it; None: what holds without knowing that.
+        write: measure the log directory's disk by writing to it.
+    """
+    tree = Tree()
+    specs = _specs(config)
+    yield from host.receive_buffers(tree, _asked_bytes(specs))
+    yield from host.dropped_datagrams(tree)
+    yield from host.governor(tree)
+    yield from host.idle_states(tree)
+    yield from host.memory(tree)
+    yield from host.modules(tree, needed_modules(config, specs))
+    yield from _clock(tree)
+    yield from _disk(tree, config, specs, write)
+    yield from _devices(tree, config, specs)
+
+
+def _specs(config: Config | None) -> list[TransportSpec]:
+    entries = [] if config is None else list(config.devices())
+    wires = [spec for entry in entries for spec in (entry.transport, entry.auxiliary) if spec is not None]
+    return [spec for spec in wires if spec.kind != "gnss"]
+
+
+def _asked_bytes(specs: list[TransportSpec]) -> int:
+    udp = [int(spec.options.get("buffer_mb", DEFAULT_BUFFER_MB)) for spec in specs if spec.kind == "udp"]
+    return max(udp, default=DEFAULT_BUFFER_MB) << 20
+
+
+def needed_modules(config: Config | None, specs: list[TransportSpec]) -> list[str]:
+    """Drivers that a configuration cannot do without, as modprobe names them."""
+    needed = ["can_raw"] if any(spec.kind == "can" and spec.interface == "socketcan" for spec in specs) else []
+    paths = [spec.address for spec in specs if spec.kind == "serial"]
+    if any(path.startswith("/dev/ttyUSB") for path in paths):
+        needed.append("usbserial")
+    if any(path.startswith("/dev/ttyACM") for path in paths):
+        needed.append("cdc_acm")
+    if config is not None and any(pps.source.startswith("/dev/") for pps in config.pps.values()):
+        needed.append("pps_core")
+    return needed
+
+
+def _clock(tree: Tree) -> Iterator[Finding]:
+    yield from clock.keepers(tree, read_clock_discipline())
+    yield from clock.movement(*clock.watch())
+
+
+def _disk(tree: Tree, config: Config | None, specs: list[TransportSpec], write: bool) -> Iterator[Finding]:
+    directory = DEFAULT_DIRECTORY if config is None else Path(config.session.directory)
+    reserve = DEFAULT_RESERVE_BYTES if config is None else config.session.reserve_mb * 1e6
+    split = DEFAULT_SPLIT_BYTES if config is None else config.session.split_size_mb * 1e6
+    scanners = 1 if config is None else sum(spec.kind == "udp" for spec in specs)
+    rate = scanners * disk.SCANNER_BYTES_PER_S + disk.OTHER_BYTES_PER_S
+    existing = next(path for path in (directory, *directory.parents) if path.is_dir())
+    yield from disk.file_system(disk.mount_of(tree, existing.resolve()), split)
+    yield from disk.writable(tree, directory, devices.recording_user(tree))
+    free = disk_usage(existing).free
+    yield from disk.room(free, reserve, rate)
+    sign = read_sign(directory)
+    if not write or (sign is not None and is_being_written(sign.path)) or free < reserve + 2 * disk.TEST_BYTES:
+        why = "a recorder is at work there" if sign is not None else "no room to try" if write else "as asked"
+        yield Finding("disk speed", Verdict.NOTE, f"not measured: {why}")
+        return
+    try:
+        yield from disk.speed(*disk.measure(existing), rate)
+    except OSError as error:
+        yield Finding("disk speed", Verdict.NOTE, f"not measured: {existing}: {error.strerror}", "sudo swath doctor")
+
+
+def _devices(tree: Tree, config: Config | None, specs: list[TransportSpec]) -> Iterator[Finding]:
+    user = devices.recording_user(tree)
+    yield from devices.port_grabbers(tree)
+    for spec in specs:
+        if spec.kind == "serial":
+            yield from _device_file(tree, spec.address, user)
+            yield from devices.serial_port(tree, spec.address)
+        elif spec.kind == "can" and spec.interface == "socketcan":
+            wanted = spec.options.get("bitrate")
+            bitrate = None if wanted is None else int(wanted)
+            yield from devices.can_interface(tree, spec.channel, bitrate, interface_bitrate)
+        elif spec.kind == "udp" and "interface" in spec.options:
+            yield from devices.network_interface(tree, spec.options["interface"])
+    for pps in {} if config is None else config.pps.values():
+        if pps.source.startswith("/dev/"):
+            yield from _device_file(tree, pps.source, user)
+            yield from devices.pps_device(tree, pps.source, pps.edge)
+        elif pps.source.startswith("serial-dcd:"):
+            yield from _device_file(tree, pps.source.removeprefix("serial-dcd:"), user)
+
+
+def _device_file(tree: Tree, path: str, user: devices.User) -> Iterator[Finding]:
+    yield from devices.device_file(tree, path, user)
+    if tree.at(path).exists():
+        yield from devices.device_policy(tree, path)

@@ -1,0 +1,83 @@
+"""The wall clock: who keeps it, whether he may step it in flight, and whether it is being pushed about now."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+
+from daemon.doctor.finding import Finding, Tree, Verdict
+from daemon.host_clock import STEP_NOTICED_NS, ClockDiscipline, read_clock_pair, read_clock_sample
+
+KEEPERS = {"chronyd": "chrony", "ntpd": "ntpd", "systemd-timesyn": "systemd-timesyncd", "openntpd": "openntpd"}
+STEPPERS = ("systemd-timesyncd", "openntpd", "ntpd")  # step whenever they find the clock far off
+SLEWED_PPM = 150.0  # beyond an oscillator's own error and chrony's drop-in of 100
+WATCH_S = 0.5
+_CHRONY = "sudo apt-get install chrony  # with /etc/chrony/conf.d/swath.conf it steps at its start only"
+_MAKESTEP = re.compile(r"^\s*makestep\s+\S+\s+(-?\d+)", re.MULTILINE)
+
+
+def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
+    """Who keeps the wall clock, and whether he may step it while a flight is recorded."""
+    check = "wall clock"
+    found = sorted(KEEPERS[name] for name in tree.processes() & set(KEEPERS))
+    if len(found) > 1:
+        text = f"{' and '.join(found)} both keep the clock, against each other"
+        yield Finding(check, Verdict.WRONG, text, f"sudo systemctl disable --now {found[-1]}")
+    for name in found:
+        if name in STEPPERS:
+            yield Finding(check, Verdict.WRONG, f"{name} may step the clock in flight", _CHRONY)
+    if "chrony" in found:
+        yield from chrony_steps(tree)
+    if not discipline.disciplined:
+        nobody = "nobody keeps it" if not found else f"{found[0]} has not got it right (yet)"
+        text = f"{nobody}: it cannot help to tell the second of a PPS, and may be stepped once somebody does"
+        yield Finding(check, Verdict.NOTE, text, _CHRONY if not found else "chronyc tracking; chronyc sources")
+    elif not found:
+        yield Finding(check, Verdict.OK, f"kept to {discipline.max_error_s * 1e3:.1f} ms, by whom is not to be seen")
+    else:
+        yield Finding(check, Verdict.OK, f"{found[0]} keeps it to {discipline.max_error_s * 1e3:.1f} ms")
+
+
+def chrony_steps(tree: Tree) -> Iterator[Finding]:
+    """Whether chrony's configuration lets it step the clock at any time (``makestep … -1``); the last line holds."""
+    files = [tree.at("/etc/chrony/chrony.conf"), tree.at("/etc/chrony.conf")]
+    files += sorted(tree.at("/etc/chrony/conf.d").glob("*.conf"))
+    said = [(file, int(limit)) for file in files if file.exists() for limit in _MAKESTEP.findall(file.read_text())]
+    if said and said[-1][1] < 0:
+        text = f"{said[-1][0].name} lets chrony step the clock at any time (makestep … -1)"
+        mend = "echo 'makestep 1 3' | sudo tee /etc/chrony/conf.d/swath.conf && sudo systemctl restart chrony"
+        yield Finding("wall clock", Verdict.WRONG, text, mend)
+
+
+def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:
+    """What the clocks did while they were watched.
+
+    Args:
+        step_ns: how far CLOCK_REALTIME moved against CLOCK_MONOTONIC.
+        slew_ppm: how much faster than its oscillator CLOCK_MONOTONIC went.
+    """
+    check = "clock movement"
+    if abs(step_ns) > STEP_NOTICED_NS:
+        text = f"the wall clock was stepped by {step_ns * 1e-9:+.6f} s while it was watched"
+        yield Finding(
+            check, Verdict.WRONG, text, "end what sets the clock: ps aux | grep -E 'ntp|chrony|timesync|gpsd'"
+        )
+    elif abs(slew_ppm) > SLEWED_PPM:
+        text = f"the clock is being turned by {slew_ppm:+.0f} ppm; wait until it is right before a flight"
+        yield Finding(check, Verdict.NOTE, text, "chronyc tracking")
+    else:
+        yield Finding(check, Verdict.OK, f"no step, {slew_ppm:+.1f} ppm against its oscillator")
+
+
+def watch(seconds: float = WATCH_S) -> tuple[int, float]:
+    """Step in nanoseconds and slew in ppm over some time, of this computer."""
+    quiet = ClockDiscipline(0.0, 0, 0.0)
+    pair, sample = read_clock_pair(), read_clock_sample(quiet)
+    time.sleep(seconds)
+    later_pair, later = read_clock_pair(), read_clock_sample(quiet)
+    raw = int(later["monotonic_raw_ns"]) - int(sample["monotonic_raw_ns"])
+    mono = int(later["monotonic_ns"]) - int(sample["monotonic_ns"])
+    step_ns = later_pair.offset_ns - pair.offset_ns
+    seen = abs(step_ns) > pair.width_ns + later_pair.width_ns  # a reading that was interrupted is no step
+    return step_ns if seen else 0, (mono - raw) / raw * 1e6

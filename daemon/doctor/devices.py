@@ -1,0 +1,196 @@
+"""The configured devices, as far as the system knows them without opening any: that is `swath check`'s business."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.doctor.finding import Finding, Tree, Verdict, read_text
+
+SERVICE_USER = "swath"
+EDGE_S = 3.0  # without an edge for so long no pulse comes
+TEST_PPS = ("ktimer",)  # Documentation/driver-api/pps.rst: a kernel timer, for tests
+SERIAL_LATENCY_MS = 1
+CAN_QUEUE_FRAMES = 100
+_IFF_UP = 0x1
+_UNIT = "/usr/lib/systemd/system/swathd.service"
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """Somebody who opens devices."""
+
+    name: str
+    uid: int
+    gids: frozenset[int]
+
+    def may(self, status: os.stat_result, bits: int) -> bool:
+        """Whether the mode of a file lets him do what ``bits`` (of 7) say."""
+        if self.uid == 0:
+            return True
+        if status.st_uid == self.uid:
+            granted = status.st_mode >> 6
+        elif status.st_gid in self.gids:
+            granted = status.st_mode >> 3
+        else:
+            granted = status.st_mode
+        return granted & bits == bits
+
+
+def recording_user(tree: Tree) -> User:
+    """The service's user where there is one, else who runs this."""
+    for line in (tree.read("/etc/passwd") or "").splitlines():
+        fields = line.split(":")
+        if fields[0] == SERVICE_USER and len(fields) > 3:
+            groups = {int(fields[3])}
+            for group in (tree.read("/etc/group") or "").splitlines():
+                parts = group.split(":")
+                if len(parts) > 3 and SERVICE_USER in parts[3].split(","):
+                    groups.add(int(parts[2]))
+            return User(SERVICE_USER, int(fields[2]), frozenset(groups))
+    return User(f"user {os.geteuid()}", os.geteuid(), frozenset({os.getegid(), *os.getgroups()}))
+
+
+def group_name(tree: Tree, gid: int) -> str:
+    """Name of a group, or its number."""
+    for line in (tree.read("/etc/group") or "").splitlines():
+        fields = line.split(":")
+        if len(fields) > 2 and fields[2] == str(gid):
+            return fields[0]
+    return str(gid)
+
+
+def device_file(tree: Tree, path: str, user: User) -> Iterator[Finding]:
+    """Whether a device is there, and its user may read and write it."""
+    check = "devices"
+    try:
+        status = tree.at(path).stat()
+    except OSError:
+        yield Finding(check, Verdict.WRONG, f"{path} is not there", f"ls -l {Path(path).parent} /dev/serial/by-id")
+        return
+    if user.may(status, 6):
+        yield Finding(check, Verdict.OK, f"{user.name} may read and write {path}")
+        return
+    group, mode = group_name(tree, status.st_gid), stat.filemode(status.st_mode)
+    text = f"{user.name} may not read and write {path} ({mode}, group {group})"
+    mend = f"sudo chgrp dialout {path} && sudo chmod g+rw {path}  # for good: a udev rule as in 90-swath.rules"
+    if status.st_mode & 0o060 == 0o060 and status.st_gid != 0:
+        mend = f"sudo usermod -aG {group} {user.name}  # then restart the service, or log in anew"
+    yield Finding(check, Verdict.WRONG, text, mend)
+
+
+def device_policy(tree: Tree, path: str) -> Iterator[Finding]:
+    """Whether the unit lets its service open this class of devices (DeviceAllow)."""
+    files = [tree.at(_UNIT), *sorted(tree.at("/etc/systemd/system/swathd.service.d").glob("*.conf"))]
+    said = [value for file in files for value in re.findall(r"^DeviceAllow=(\S+)", read_text(file) or "", re.MULTILINE)]
+    if not said or path in said:
+        return
+    kind = re.sub(r"\d+$", "", tree.at(path).resolve().name)
+    if f"char-{kind}" not in said:
+        text = f"swathd.service is not allowed devices of the class char-{kind} ({path})"
+        mend = f"sudo systemctl edit swathd  # [Service] DeviceAllow=char-{kind} rw"
+        yield Finding("devices", Verdict.WRONG, text, mend)
+
+
+def serial_port(tree: Tree, path: str) -> Iterator[Finding]:
+    """What else is on a serial port: the kernel's console, an adapter that holds bytes back."""
+    name = tree.at(path).resolve().name
+    if name in (tree.read("/sys/class/tty/console/active") or "").split():
+        text = f"{path} is the kernel's console: its messages are mixed into the device's"
+        mend = f"remove console={name} from the kernel's command line; sudo systemctl disable --now serial-getty@{name}"
+        yield Finding("serial ports", Verdict.WRONG, text, mend)
+    latency = tree.number(f"/sys/bus/usb-serial/devices/{name}/latency_timer")
+    if latency is not None and latency > SERIAL_LATENCY_MS:
+        text = f"the adapter of {path} holds bytes back for {latency} ms: times of messages are late by as much"
+        mend = f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer  # for good: 90-swath.rules"
+        yield Finding("serial ports", Verdict.NOTE, text, mend)
+
+
+def port_grabbers(tree: Tree) -> Iterator[Finding]:
+    """Programs that open any serial port they find."""
+    for name, unit in (("ModemManager", "ModemManager"), ("brltty", "brltty"), ("gpsd", "gpsd.socket gpsd")):
+        if name in tree.processes():
+            text = f"{name} runs: it opens serial ports and talks to receivers, in the middle of a flight too"
+            yield Finding("serial ports", Verdict.WRONG, text, f"sudo systemctl disable --now {unit}")
+
+
+def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> Iterator[Finding]:
+    """Whether edges come at a PPS device.
+
+    Args:
+        edge: assert or clear.
+        now_s: CLOCK_REALTIME.
+    """
+    check = "PPS"
+    folder = tree.at("/sys/class/pps") / tree.at(path).resolve().name
+    if not folder.exists():
+        mend = "sudo ldattach PPS /dev/ttyS0  # or: sudo modprobe pps-gpio, with the board's overlay"
+        yield Finding(check, Verdict.WRONG, f"{path}: the kernel knows no such PPS source", mend)
+        return
+    if read_text(folder / "name") in TEST_PPS:
+        text = f"{path} is the kernel's test source: it is no receiver's second"
+        yield Finding(check, Verdict.WRONG, text, "sudo modprobe -r pps-ktimer")
+    last = re.match(r"(\d+\.\d+)#(\d+)", read_text(folder / edge) or "")
+    age_s = None if last is None else (time.time() if now_s is None else now_s) - float(last.group(1))
+    if last is None or last.group(2) == "0":
+        text = f"{path} has never seen an edge ({edge}): wiring, the receiver's settings, or the other edge?"
+        yield Finding(check, Verdict.WRONG, text, f"sudo ppstest {path}")
+    elif age_s is not None and abs(age_s) > EDGE_S:
+        text = f"the last edge at {path} came {age_s:.0f} s ago"
+        yield Finding(check, Verdict.WRONG, text, f"sudo ppstest {path}")
+    else:
+        yield Finding(check, Verdict.OK, f"{path} sees edges")
+
+
+def can_interface(
+    tree: Tree, name: str, wanted_bitrate: int | None, bitrate_of: Callable[[str], int | None]
+) -> Iterator[Finding]:
+    """Whether a CAN interface is there, up, at the right bit rate, and has lost nothing.
+
+    Args:
+        wanted_bitrate: of the configuration, if it says one.
+        bitrate_of: asks the kernel (`interface_bitrate`).
+    """
+    check, folder = "CAN", tree.at(f"/sys/class/net/{name}")
+    set_up = f"sudo ip link set {name} up type can bitrate {wanted_bitrate or 1_000_000} restart-ms 100"
+    if not folder.exists():
+        mend = "ip -details link show type can; dmesg | grep -i can"
+        yield Finding(check, Verdict.WRONG, f"there is no interface {name}", mend)
+        return
+    if not int(read_text(folder / "flags") or "0", 16) & _IFF_UP:
+        yield Finding(check, Verdict.WRONG, f"{name} is down", set_up)
+    actual = bitrate_of(name)
+    if wanted_bitrate is not None and actual is not None and actual != wanted_bitrate:
+        text = f"{name} runs at {actual} bit/s, configured is {wanted_bitrate}: no frame is understood"
+        yield Finding(check, Verdict.WRONG, text, f"sudo ip link set {name} down && {set_up}")
+    lost = {
+        key: tree.number(f"/sys/class/net/{name}/statistics/{key}") or 0 for key in ("rx_dropped", "rx_over_errors")
+    }
+    if any(lost.values()):
+        told = ", ".join(f"{key} {count}" for key, count in lost.items() if count)
+        yield Finding(
+            check, Verdict.NOTE, f"{name} has lost frames since it came up: {told}", f"ip -s link show {name}"
+        )
+    queue = tree.number(f"/sys/class/net/{name}/tx_queue_len")
+    if queue is not None and queue < CAN_QUEUE_FRAMES:
+        text = f"{name} queues {queue} frames for sending: enough to record, little for swath replay"
+        yield Finding(check, Verdict.NOTE, text, f"sudo ip link set {name} txqueuelen 1000")
+    if actual is not None and actual == wanted_bitrate:
+        yield Finding(check, Verdict.OK, f"{name} runs at {actual} bit/s")
+
+
+def network_interface(tree: Tree, name: str) -> Iterator[Finding]:
+    """Whether the interface that a scanner is listened to on has a link."""
+    folder = tree.at(f"/sys/class/net/{name}")
+    if not folder.exists():
+        yield Finding("network", Verdict.WRONG, f"there is no interface {name}", "ip link")
+    elif read_text(folder / "operstate") == "down":
+        text = f"{name} is down, or has no link"
+        yield Finding("network", Verdict.WRONG, text, f"sudo ip link set {name} up; ethtool {name} | grep Link")
+    else:
+        yield Finding("network", Verdict.OK, f"{name} has a link")

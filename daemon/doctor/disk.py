@@ -1,0 +1,127 @@
+"""The disk that logs go to: its file system, its room, its speed."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.doctor.devices import User
+from daemon.doctor.finding import Finding, Tree, Verdict
+from daemon.health import duration_text
+
+SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
+OTHER_BYTES_PER_S = 0.2e6
+LITTLE_ROOM_S = 3600.0
+TEST_BYTES = 64 << 20
+SYNC_WRONG_S = 2.0  # the queue holds 2.6 s of such a scanner
+SYNC_NOTE_S = 0.5
+FAT_FILE_BYTES = 4 << 30
+_FAT = ("vfat", "msdos", "exfat")
+_NETWORK = ("nfs", "nfs4", "cifs", "smb3", "9p", "fuse.sshfs", "ceph", "glusterfs")
+_MEMORY = ("tmpfs", "ramfs")
+_UNSAFE_OPTIONS = ("nobarrier", "barrier=0", "data=writeback")
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """A line of /proc/mounts."""
+
+    device: str
+    point: str
+    kind: str
+    options: tuple[str, ...]
+
+
+def mount_of(tree: Tree, directory: Path) -> Mount | None:
+    """The mounted file system that a directory is on."""
+    best: Mount | None = None
+    for line in (tree.read("/proc/mounts") or "").splitlines():
+        device, point, kind, options, *_ = [*line.split(), "", "", "", ""]
+        point = point.replace("\\040", " ")
+        if directory.is_relative_to(point) and (best is None or len(point) >= len(best.point)):
+            best = Mount(device, point, kind, tuple(options.split(",")))
+    return best
+
+
+def file_system(mount: Mount | None, split_bytes: float) -> Iterator[Finding]:
+    """Whether a file system is one to trust a recording to.
+
+    Args:
+        split_bytes: the largest part.
+    """
+    check = "file system"
+    if mount is None:
+        return
+    where = f"{mount.point} ({mount.kind} on {mount.device})"
+    move = "mount a disk of its own there, ext4 or XFS; or say another session.directory"
+    if "ro" in mount.options:
+        yield Finding(check, Verdict.WRONG, f"{where} is mounted read-only", f"sudo mount -o remount,rw {mount.point}")
+    if mount.kind in _MEMORY:
+        yield Finding(check, Verdict.WRONG, f"{where} is in memory: gone with the power", move)
+    elif mount.kind in _NETWORK:
+        yield Finding(check, Verdict.WRONG, f"{where} is another computer's: the recording waits for the network", move)
+    elif mount.kind in _FAT:
+        text = f"{where} has no journal: a power cut may cost whole logs"
+        too_large = mount.kind != "exfat" and split_bytes > FAT_FILE_BYTES
+        text += ", and a part of more than 4 GB cannot be written" if too_large else ""
+        yield Finding(check, Verdict.WRONG, text, move)
+    elif unsafe := [option for option in mount.options if option in _UNSAFE_OPTIONS]:
+        text = f"{where} is mounted {','.join(unsafe)}: what is said to be written may not survive a power cut"
+        yield Finding(check, Verdict.WRONG, text, f"take {','.join(unsafe)} out of /etc/fstab, then mount it anew")
+    else:
+        yield Finding(check, Verdict.OK, where)
+
+
+def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterator[Finding]:
+    """Whether there is room, down to the reserve, at the rate that the configured sensors may have."""
+    left_s = max(0.0, free_bytes - reserve_bytes) / bytes_per_s
+    text = f"{free_bytes / 1e9:.1f} GB free, {duration_text(left_s)} at {bytes_per_s / 1e6:.1f} MB/s"
+    few = left_s < LITTLE_ROOM_S
+    mend = "swath offload copies logs away and says which may be deleted" if few else ""
+    yield Finding("disk space", Verdict.WRONG if few else Verdict.OK, text, mend)
+
+
+def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
+    """Whether logs can be made in a directory."""
+    existing = next(path for path in (directory, *directory.parents) if tree.at(path).exists())
+    if user.may(tree.at(existing).stat(), 3):
+        yield Finding("log directory", Verdict.OK, f"{user.name} may write to {existing}")
+    else:
+        mend = f"sudo install -d -o {user.name} -g {user.name} -m 0750 {directory}"
+        yield Finding("log directory", Verdict.WRONG, f"{user.name} may not write to {existing}", mend)
+
+
+def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:
+    """Bytes a second and the longest sync in seconds of writing as a recorder does; nothing is left behind.
+
+    Raises:
+        OSError: it cannot be written there.
+    """
+    block, longest_s, written = os.urandom(1 << 20), 0.0, 0
+    with tempfile.TemporaryFile(dir=folder) as file:
+        began_s = time.monotonic()
+        while written < size:
+            written += os.write(file.fileno(), block)
+            if written % (16 << 20) == 0 or written >= size:
+                sync_s = time.monotonic()
+                os.fdatasync(file.fileno())
+                longest_s = max(longest_s, time.monotonic() - sync_s)
+        return written / (time.monotonic() - began_s), longest_s
+
+
+def speed(bytes_per_s: float, longest_sync_s: float, needed_bytes_per_s: float) -> Iterator[Finding]:
+    """Whether the disk keeps up."""
+    check = "disk speed"
+    told = f"writes {bytes_per_s / 1e6:.0f} MB/s, longest sync {longest_sync_s * 1e3:.0f} ms"
+    text = f"{told}; the sensors may send {needed_bytes_per_s / 1e6:.1f} MB/s"
+    mend = "another disk, or another file system; what else writes to it: sudo iotop -oa"
+    if bytes_per_s < 2 * needed_bytes_per_s or longest_sync_s > SYNC_WRONG_S:
+        yield Finding(check, Verdict.WRONG, text, mend)
+    elif longest_sync_s > SYNC_NOTE_S:
+        yield Finding(check, Verdict.NOTE, text, mend)
+    else:
+        yield Finding(check, Verdict.OK, text)

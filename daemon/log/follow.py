@@ -1,0 +1,229 @@
+"""Follows a log that is being written: its chunks as they become whole, then the next part, then the next session.
+
+Only files are read, a chunk in memory at a time; the recorder does not notice.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections import Counter, deque
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap import records
+
+from daemon.log.format import MAGIC, SESSION_METADATA, ChannelSpec, LogError, SessionInfo
+from daemon.log.reader import LogBatch, chunk_batches
+from daemon.log.scan import (
+    MAX_RECORD_BYTES,
+    OP_ATTACHMENT,
+    OP_CHUNK,
+    OP_DATA_END,
+    OP_MESSAGE_INDEX,
+    OP_METADATA,
+    OPCODES,
+    next_chunk,
+    parse_record,
+    unpack_chunk,
+)
+from daemon.parts import Sign, read_sign
+
+EVENT_CHUNKS = 100  # of a part, the latest: what is shown of the time before the following began
+_HEAD = struct.Struct("<BQ")
+_PEEK_BYTES = _HEAD.size + 16  # of a chunk: first and last time; of an index: its channel
+_EVENTS = "/events"
+
+
+class PartFollower:
+    """One file, growing or not: gives the messages of every chunk that has become whole, once.
+
+    Attributes:
+        info, number: of its session.
+        attachments: those that stand before its first chunk: the recorder writes them all there.
+        ended: its data has come to its end, nothing more will be written.
+        damaged: chunks that could not be read.
+        newest_ns: log time of the newest message so far.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open it and read what stands before the first chunk.
+
+        Raises:
+            LogError: it does not begin as a log of ours, or not yet.
+            OSError: it cannot be read.
+        """
+        self.path = path
+        self.attachments: dict[str, bytes] = {}
+        self.ended = False
+        self.damaged = 0
+        self.newest_ns: int | None = None
+        self._channels: dict[int, ChannelSpec] = {}
+        self._schemas: dict[int, str] = {}
+        self._file = path.open("rb")
+        self._at = len(MAGIC)
+        try:
+            self.info, self.number = self._read_head()
+        except (LogError, OSError):
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read_head(self) -> tuple[SessionInfo, int]:
+        if self._pread(0, len(MAGIC)) != MAGIC:
+            raise LogError(f"{self.path}: is no MCAP file")
+        session: tuple[SessionInfo, int] | None = None
+        while (head := self._whole_record()) is not None and head[0] not in (OP_CHUNK, OP_DATA_END):
+            opcode, length = head
+            if opcode == OP_METADATA:
+                metadata = parse_record(records.Metadata, self._pread(self._at + _HEAD.size, length))
+                if metadata.name == SESSION_METADATA:
+                    session = SessionInfo.from_metadata(metadata.metadata)
+            elif opcode == OP_ATTACHMENT:
+                attachment = parse_record(records.Attachment, self._pread(self._at + _HEAD.size, length))
+                self.attachments[attachment.name] = attachment.data
+            self._at += _HEAD.size + length
+        if session is None:
+            raise LogError(f"{self.path}: no {SESSION_METADATA} at its beginning")
+        return session
+
+    # ------------------------------------------------------------------ records
+
+    def _pread(self, at: int, length: int) -> bytes:
+        return os.pread(self._file.fileno(), length, at)
+
+    def _size(self) -> int:
+        return os.fstat(self._file.fileno()).st_size
+
+    def _whole_record(self) -> tuple[int, int] | None:
+        """Opcode and length of the record to come, once all of it is there; what cannot be one is passed over."""
+        head = self._pread(self._at, _HEAD.size)
+        if len(head) < _HEAD.size:
+            return None
+        opcode, length = _HEAD.unpack(head)
+        size = self._size()
+        if opcode not in OPCODES or length > MAX_RECORD_BYTES:
+            resumed = next_chunk(self._file, self._at + 1, size)
+            if resumed is None:
+                return None
+            self.damaged += 1
+            self._at = resumed
+            return self._whole_record()
+        return (opcode, length) if self._at + _HEAD.size + length <= size else None
+
+    # ------------------------------------------------------------------ messages
+
+    def batches(self) -> Iterator[LogBatch]:
+        """The messages that have become readable since the last call, in the file's order."""
+        while not self.ended and (head := self._whole_record()) is not None:
+            opcode, length = head
+            at, self._at = self._at, self._at + _HEAD.size + length
+            if opcode == OP_CHUNK:
+                yield from self._chunk(at, length)
+            elif opcode == OP_DATA_END:
+                self.ended = True
+
+    def _chunk(self, at: int, length: int) -> Iterator[LogBatch]:
+        try:
+            data = unpack_chunk(self._pread(at + _HEAD.size, length))
+            for batch in chunk_batches(data, self._channels, self._schemas, None, Counter()):
+                self.newest_ns = max(self.newest_ns or 0, int(batch.log_time_ns[-1]))
+                yield batch
+        except (LogError, struct.error):
+            self.damaged += 1
+
+    def tail(self, seconds: float) -> Iterator[LogBatch]:
+        """Go to the end: the latest events of what is passed over, then all messages of the last ``seconds``.
+
+        Heads of chunks and of their indexes are looked at, nothing else is read of what lies before.
+        """
+        chunks: deque[tuple[int, int]] = deque()  # place and last time of those within the last seconds
+        with_events: deque[int] = deque(maxlen=EVENT_CHUNKS)
+        chunk_at, events_id = self._at, None
+        while (head := self._whole_record()) is not None and head[0] != OP_DATA_END:
+            opcode, length = head
+            peek = self._pread(self._at, _PEEK_BYTES)
+            if opcode == OP_CHUNK:
+                chunk_at, newest_ns = self._at, int.from_bytes(peek[17:25], "little")
+                if events_id is None:
+                    events_id = self._learn_events(self._at, length)
+                chunks.append((chunk_at, newest_ns))
+                while newest_ns - chunks[0][1] > seconds * 1e9:
+                    chunks.popleft()
+            elif opcode == OP_MESSAGE_INDEX and int.from_bytes(peek[9:11], "little") == events_id:
+                with_events.append(chunk_at)
+            self._at += _HEAD.size + length
+        begin = chunks[0][0] if chunks else self._at
+        for at in with_events:
+            if at < begin:
+                length = _HEAD.unpack(self._pread(at, _HEAD.size))[1]
+                yield from (batch for batch in self._chunk(at, length) if batch.channel.topic == _EVENTS)
+        self._at = begin
+        yield from self.batches()
+
+    def _learn_events(self, at: int, length: int) -> int | None:
+        """Id of the channel of events, if this chunk has it: a part's first one has."""
+        ids = [batch.channel_id for batch in self._chunk(at, length) if batch.channel.topic == _EVENTS]
+        return ids[0] if ids else None
+
+
+class LogFollower:
+    """Follows what is recorded in a directory, from part to part and from session to session.
+
+    Attributes:
+        part: the file that is read; None: nothing was recorded since the following began.
+        sign: what the directory says is growing; None: nothing.
+    """
+
+    def __init__(self, directory: Path, tail_s: float, *, every_part: bool = True) -> None:
+        """``tail_s``: how much of a log that is there already is read; ``every_part``: even of those long finished."""
+        self.part: PartFollower | None = None
+        self.sign: Sign | None = None
+        self._directory = directory
+        self._tail_s = tail_s
+        self._every_part = every_part
+        self._waited = False
+
+    def poll(self) -> Iterator[LogBatch]:
+        """All that has become readable since the last call."""
+        self.sign = read_sign(self._directory)
+        if self.part is None:
+            if self.sign is not None:
+                yield from self._open(self.sign.path, tail=True)
+            return
+        got = False
+        for batch in self.part.batches():
+            got = True
+            yield batch
+        if self.sign is None or self.sign.path == self.part.path:
+            self._waited = False
+        elif self.part.ended or (self._waited and not got):
+            yield from self._go_on(self.part, self.sign)
+        else:  # a part that was left open by a crash: what it still holds comes first
+            self._waited = True
+
+    def _go_on(self, part: PartFollower, sign: Sign) -> Iterator[LogBatch]:
+        """The session's next part, where it is wanted and there; else what is growing now."""
+        following = self._directory / f"{part.info.session_id}_{part.number + 1}.mcap"
+        if sign.path == following or (self._every_part and part.ended and following.exists()):
+            yield from self._open(following, tail=False)
+        else:
+            yield from self._open(sign.path, tail=not self._every_part)
+
+    def _open(self, path: Path, *, tail: bool) -> Iterator[LogBatch]:
+        try:
+            part = PartFollower(path)
+        except (LogError, OSError):
+            return  # not yet begun, or gone again: the next look tells
+        if self.part is not None:
+            self.part.close()
+        self.part, self._waited = part, False
+        yield from part.tail(self._tail_s) if tail else part.batches()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.part is not None:
+            self.part.close()

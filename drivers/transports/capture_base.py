@@ -1,0 +1,118 @@
+"""What the readers of recordings share: the unit they give, how a file is opened, what is told of damage."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from drivers.transports.base import TransportError
+
+Address = tuple[str, int]
+LATEST_NS = 2**63 - 1
+MAX_LINE_BYTES = 4096  # the longest line of a text format here has some 300
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedUnit:
+    """One unit as it was recorded.
+
+    Attributes:
+        time_ns: the recorder's wall clock, nanoseconds since 1970.
+        data: a datagram's payload, a SocketCAN frame of 16 or 72 bytes, or the bytes of one serial read.
+        channel: the CAN interface's name; ``udp`` or ``serial``.
+        source, destination: address and port of a datagram.
+    """
+
+    time_ns: int
+    data: bytes
+    channel: str
+    source: Address | None = None
+    destination: Address | None = None
+
+
+class CaptureDamageError(TransportError):
+    """A file is not what it should be from some place on."""
+
+
+@dataclass(slots=True)
+class CaptureTally:
+    """What a reader found beside units. A reader that is given one counts and goes on; without it, it raises.
+
+    Attributes:
+        damage: places that could not be read. first_damage: the first of them, one line.
+        passed: what was passed over on purpose, by what it is.
+    """
+
+    damage: int = 0
+    first_damage: str = ""
+    passed: Counter[str] = field(default_factory=Counter)
+
+    def damaged(self, text: str) -> None:
+        """Count a bad place; the first is remembered."""
+        if not self.damage:
+            self.first_damage = text
+        self.damage += 1
+
+
+def report(tally: CaptureTally | None, text: str) -> None:
+    """Count a bad place, or raise where nobody counts."""
+    if tally is None:
+        raise CaptureDamageError(text)
+    tally.damaged(text)
+
+
+def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> Iterator[CapturedUnit]:
+    """Units up to the place from which the file cannot be read on."""
+    try:
+        yield from units
+    except CaptureDamageError as error:
+        report(tally, str(error))
+
+
+def open_capture(path: Path) -> BinaryIO:
+    """The file's content as a stream, decompressed where it begins as gzip does."""
+    try:
+        plain = path.open("rb")
+        packed = plain.peek(2)[:2] == b"\x1f\x8b"
+    except OSError as error:
+        raise TransportError(f"{path}: {error.strerror}") from error
+    if not packed:
+        return plain
+    plain.close()
+    return gzip.open(path, "rb")  # type: ignore[return-value]
+
+
+def read_bytes(stream: BinaryIO, count: int, path: Path) -> bytes:
+    """Up to ``count`` bytes, fewer at the end of the file only."""
+    try:
+        return stream.read(count)
+    except (EOFError, OSError, zlib.error) as error:
+        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error
+
+
+def read_lines(path: Path, tally: CaptureTally | None = None) -> Iterator[tuple[int, str]]:
+    """Lines that are not empty, with their number; what is too long for a line of any format here is damage."""
+    with open_capture(path) as stream:
+        number = 0
+        while line := _read_line(stream, path):
+            number += 1
+            if len(line) > MAX_LINE_BYTES:
+                report(tally, f"{path}: line {number} is longer than {MAX_LINE_BYTES} bytes")
+                while line and not line.endswith(b"\n"):
+                    line = _read_line(stream, path)
+                continue
+            text = line.decode("ascii", "replace").strip()
+            if text:
+                yield number, text
+
+
+def _read_line(stream: BinaryIO, path: Path) -> bytes:
+    try:
+        return stream.readline(MAX_LINE_BYTES + 1)
+    except (EOFError, OSError, zlib.error) as error:
+        raise CaptureDamageError(f"{path}: cannot be read on: {error}") from error

@@ -1,0 +1,80 @@
+"""Runs recordings through the parsers of spinning heads and compares their points with other decoders' clouds."""
+
+from __future__ import annotations
+
+import gzip
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.core.parser import PacketParser
+from drivers.scanner.beams import BeamTable, beam_points
+from drivers.transports.capture_file import read_pcap
+from georef.records import DeviceClockSamples, Record, ScannerReturns, StructArray
+from tests.drivers.recordings import FIXTURES
+
+Points = NDArray[np.float64]
+
+
+def payloads(path: str) -> list[bytes]:
+    """Datagrams of a capture in ``fixtures/``."""
+    return [unit.data for unit in read_pcap(FIXTURES / path)]
+
+
+def feed(parser: PacketParser, units: list[bytes]) -> list[Record]:
+    """Runs of equal length as one batch each, one millisecond a unit."""
+    records: list[Record] = []
+    at = 0
+    while at < len(units):
+        stop = at + 1
+        while stop < len(units) and len(units[stop]) == len(units[at]):
+            stop += 1
+        rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
+        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
+        at = stop
+    return records
+
+
+def returns_of(records: list[Record]) -> StructArray:
+    """All returns, in order."""
+    return np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
+
+
+def clock_of(records: list[Record]) -> StructArray:
+    """All clock samples, in order."""
+    return np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
+
+
+def ros_points(rows: StructArray, beams: BeamTable) -> Points:
+    """The maker's frame turned as ROS decoders publish it: x forward, y left."""
+    x, y, z = beam_points(rows, beams).T
+    return np.stack([y, -x, z], axis=1)
+
+
+def xyz(points: StructArray) -> Points:
+    """(n, 3) of records with the fields x, y, z."""
+    return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
+
+
+def read_pcd(path: Path, dtype: np.dtype[np.void]) -> StructArray:
+    """Points of a gzipped binary PCD file."""
+    data = gzip.decompress(path.read_bytes())
+    start = data.index(b"DATA binary\n") + len(b"DATA binary\n")
+    return np.frombuffer(data[start:], dtype=dtype)
+
+
+def are_near(points: Points, others: Points, cell_m: float) -> NDArray[np.bool_]:
+    """(n,) whether a point has one of the others within 1.5 cells an axis; True where one is within half a cell."""
+
+    def keys(cells: Points) -> NDArray[np.int64]:
+        x, y, z = (cells.astype(np.int64) + (1 << 20)).T
+        keyed: NDArray[np.int64] = (x << 42) + (y << 21) + z
+        return keyed
+
+    there = keys(np.floor(others / cell_m))
+    near = np.zeros(len(points), dtype=np.bool_)
+    for shift in product((-0.5, 0.5), repeat=3):
+        near |= np.isin(keys(np.floor(points / cell_m + np.array(shift))), there)
+    return near

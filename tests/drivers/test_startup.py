@@ -1,0 +1,221 @@
+"""Start-up messages: what they are by pyubx2 and by the makers' documents, and answers found in what devices send."""
+
+from __future__ import annotations
+
+import gzip
+import re
+
+import pytest
+from pyubx2 import SET, UBX_CONFIG_DATABASE, UBXMessage, UBXReader
+
+from drivers.core.frame_kinds import UBX_NAMES
+from drivers.core.parser import DeviceSettings, DriverSettingsError
+from drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish
+from drivers.gnss import novatel_layouts, novatel_startup, sbf_frame, sbf_startup, ubx_startup
+from drivers.gnss.ubx_startup import AckListener
+from tests.drivers.recordings import FIXTURES
+
+ACK = UBXMessage("ACK", "ACK-ACK", 0, clsID=0x06, msgID=0x8A).serialize()
+NAK = UBXMessage("ACK", "ACK-NAK", 0, clsID=0x06, msgID=0x8A).serialize()
+OTHER_ACK = UBXMessage("ACK", "ACK-ACK", 0, clsID=0x06, msgID=0x01).serialize()
+
+# PolaRx5TR reference guide, 3.2.9 (setClockSyncThreshold) and Septentrio's ROS driver (telegram_handler.cpp)
+SBF_COMMAND = "scst, msec1, on"
+SBF_REPLY = b"$R: scst, msec1, on\r\n  ClockSyncThreshold, msec1, on\r\nCOM1>"
+SBF_ERROR = b"$R? setGNSSAttitude: Argument 'Source' is invalid!\r\nCOM1>"
+
+
+def settings(**setup: object) -> DeviceSettings:
+    return DeviceSettings("gnss/rover", {"setup": setup})
+
+
+def texts(messages: tuple[StartupMessage, ...]) -> list[str]:
+    return [line for message in messages for line in message.lines]
+
+
+def recording(name: str) -> bytes:
+    data = (FIXTURES / name).read_bytes()
+    return gzip.decompress(data) if name.endswith(".gz") else data
+
+
+def heard(listener: AnswerListener, data: bytes, size: int) -> Answer | None:
+    """The answer in data that comes in reads of a size."""
+    for start in range(0, len(data), size):
+        answer = listener.hear(data[start : start + size])
+        if answer is not None:
+            return answer
+    return listener.close()
+
+
+def sbf_listener(text: str) -> AnswerListener:
+    messages = sbf_startup.startup_messages(settings(), StartupWish())
+    return next(message for message in messages if message.lines == (text,)).listen()
+
+
+class TestUbx:
+    @pytest.mark.parametrize("port", ["UART1", "UART2", "USB"])
+    @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10, 20])
+    @pytest.mark.parametrize("save", [False, True])
+    def test_pyubx2_reads_back_the_keys_and_values_that_are_shown(self, port: str, rate_hz: int, save: bool) -> None:
+        wish = StartupWish(save=save, baud=460800)
+        for message in ubx_startup.startup_messages(settings(port=port, rate_hz=rate_hz), wish):
+            parsed = UBXReader.parse(message.data, msgmode=SET)
+            assert parsed.identity == "CFG-VALSET"
+            assert (parsed.version, parsed.ram, parsed.bbr, parsed.flash) == (0, 1, 1, int(save))
+            assert message.lines[0] == "UBX-CFG-VALSET RAM+BBR" + ("+Flash" if save else "")
+            assert 1 <= len(message.lines) - 1 <= 64
+            for line in message.lines[1:]:
+                name, value = line.split(" = ")
+                assert getattr(parsed, name.replace("-", "_")) == int(value), line
+            known = [name for name in vars(parsed) if name.startswith("CFG_")]
+            assert len(known) == len(message.lines) - 1
+
+    def test_every_key_is_that_of_the_interface_description_as_pyubx2_has_it(self) -> None:
+        named = {name.replace("-", "_"): key for name, key, _ in ubx_startup.TIME_PULSE}
+        for port, place in ubx_startup.PORT_PLACES.items():
+            named |= {f"CFG_MSGOUT_UBX_{name}_{port}": key + place for name, key in ubx_startup.MESSAGE_RATES.items()}
+            named[f"CFG_{port}OUTPROT_UBX"] = ubx_startup.UBX_OUTPUT[port]
+        named |= {f"CFG_{port}_BAUDRATE": key for port, key in ubx_startup.BAUD_RATES.items()}
+        assert named == {name: UBX_CONFIG_DATABASE[name][0] for name in named}
+
+    def test_a_u_blox_message_asked_for_is_one_of_its_name(self) -> None:
+        names = {name.replace("-", "_") for name in UBX_NAMES.values()}
+        assert set(ubx_startup.MESSAGE_RATES) <= names
+
+    def test_a_rate_is_of_positions_and_raw_measurements_come_once_a_second(self) -> None:
+        lines = texts(ubx_startup.startup_messages(settings(rate_hz=10), StartupWish()))
+        assert {"CFG-RATE-MEAS = 100", "CFG-RATE-NAV = 1", "CFG-RATE-TIMEREF = 1"} <= set(lines)
+        assert "CFG-MSGOUT-UBX_NAV_PVT_UART1 = 1" in lines
+        assert "CFG-MSGOUT-UBX_RXM_RAWX_UART1 = 10" in lines
+        assert "CFG-MSGOUT-UBX_NAV_TIMELS_UART1 = 10" in lines
+
+    def test_the_pulse_is_1_hz_in_gps_time_rising_and_only_when_the_time_is_known(self) -> None:
+        lines = texts(ubx_startup.startup_messages(settings(), StartupWish()))
+        shown = {line.split(" = ")[0]: int(line.split(" = ")[1]) for line in lines if " = " in line}
+        assert shown["CFG-TP-PERIOD_LOCK_TP1"] == 1_000_000
+        assert shown["CFG-TP-LEN_TP1"] == 0
+        assert shown["CFG-TP-TIMEGRID_TP1"] == shown["CFG-TP-POL_TP1"] == shown["CFG-TP-ALIGN_TO_TOW_TP1"] == 1
+
+    def test_without_raw_none_is_asked_for(self) -> None:
+        assert "RXM" not in " ".join(texts(ubx_startup.startup_messages(settings(raw=False), StartupWish())))
+
+    def test_usb_has_no_rate(self) -> None:
+        messages = ubx_startup.startup_messages(settings(port="USB"), StartupWish(baud=460800))
+        assert all(message.baud is None for message in messages)
+
+    def test_a_port_that_there_is_not(self) -> None:
+        with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'COM1', want one of: UART1, UART2, USB"):
+            ubx_startup.startup_messages(settings(port="COM1"), StartupWish())
+
+    @pytest.mark.parametrize(("reply", "answer"), [(ACK, Answer(True)), (NAK, Answer(False, "UBX-ACK-NAK"))])
+    def test_an_answer_is_found_amid_data_however_it_is_cut(self, reply: bytes, answer: Answer) -> None:
+        data = recording("ubx/pygpsdata-NAVHPPOS.log.gz")[:3000]
+        for size in (1, 7, 64, 4096):
+            assert heard(AckListener(), data + OTHER_ACK + reply + data, size) == answer
+
+    def test_data_holds_no_answer(self) -> None:
+        for path in sorted((FIXTURES / "ubx").glob("*.log.gz")):
+            assert heard(AckListener(), gzip.decompress(path.read_bytes()), 4096) is None, path.name
+
+    def test_a_damaged_answer_and_that_to_another_message_are_none(self) -> None:
+        damaged = ACK[:-1] + bytes([ACK[-1] ^ 1])
+        assert heard(AckListener(), damaged + OTHER_ACK, 5) is None
+
+    def test_an_answer_behind_the_beginning_of_a_message_that_never_ends(self) -> None:
+        """A false sync holds back what follows until the time is over."""
+        listener = AckListener()
+        assert listener.hear(b"\xb5b\x01\x07\x00\x10" + ACK) is None
+        assert listener.close() == Answer(True)
+
+
+class TestNovatel:
+    def test_logs_are_those_that_are_known(self) -> None:
+        wish = StartupWish()
+        config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"rate_hz": 10}}
+        messages = novatel_startup.startup_messages(DeviceSettings("gnss/rover", config), wish)
+        messages += novatel_startup.imu_startup_messages(settings(), wish)
+        logs = re.findall(r"^LOG (\w+)B (?:ONNEW|ONCHANGED|ONTIME \d)", "\n".join(texts(messages)), re.MULTILINE)
+        assert len(logs) == len(messages) - 1
+        layouts = {layout.name for layout in novatel_layouts.LAYOUTS.values()}
+        decoded = {"TIME", "BESTPOS", "BESTVEL", "MARK1TIME", "MARK2TIME", "HEADING2", "RAWIMUSX", "INSPVAX"}
+        assert decoded | {"INSCONFIG"} <= layouts & set(logs)
+        raw = {log.split()[0].removesuffix("B") for log in novatel_startup.RAW_LOGS}
+        assert set(logs) - raw <= layouts
+        assert "LOG BESTPOSB ONTIME 0.1" in texts(messages)
+
+    def test_the_rate_comes_first_and_saving_last(self) -> None:
+        messages = novatel_startup.startup_messages(settings(), StartupWish(save=True, baud=460800))
+        assert messages[0].data == b"SERIALCONFIG THISPORT 460800 N 8 1 N OFF\r\n"
+        assert (messages[0].baud, messages[-1].data, messages[-1].last) == (460800, b"SAVECONFIG\r\n", True)
+
+    def test_a_port_is_not_named(self) -> None:
+        with pytest.raises(DriverSettingsError, match=r"setup\.port"):
+            novatel_startup.startup_messages(settings(port="COM1"), StartupWish())
+
+    @pytest.mark.parametrize("name", ["novatel/bestpos.gps", "novatel/oemv_200911218.gps.gz"])
+    def test_a_receivers_answer_is_found_in_its_recording_however_it_is_cut(self, name: str) -> None:
+        data = recording(name)
+        first = data.index(b"<OK\r\n")
+        for size in (1, 5, 4096):
+            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            assert heard(listener, data[: first + 5], size) == Answer(True)
+            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            assert heard(listener, data[max(0, first - 9000) : first + 4], size) is None
+
+    def test_data_holds_no_answer(self) -> None:
+        for name in ("ins1.gps", "time.gps", "align.gps", "rxstatus.gps", "propak6-basic-fix.gps.gz"):
+            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            assert heard(listener, recording(f"novatel/{name}"), 4096) is None, name
+
+    def test_a_refusal_says_why(self) -> None:
+        listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+        answer = heard(listener, recording("novatel/time.gps") + b"\r\n<ERROR:Invalid Message ID\r\n[COM1]", 3)
+        assert answer == Answer(False, "Invalid Message ID")
+
+
+class TestSbf:
+    def test_blocks_are_those_that_are_known(self) -> None:
+        config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"port": "USB1"}}
+        messages = sbf_startup.startup_messages(DeviceSettings("gnss/rover", config), StartupWish())
+        messages += sbf_startup.imu_startup_messages(settings(port="USB1"), StartupWish())
+        streams = [text.split(", ") for text in texts(messages) if text.startswith("setSBFOutput, ")]
+        assert [stream[1] for stream in streams] == [f"Stream{number}" for number in range(1, 7)]
+        assert {stream[2] for stream in streams} == {"USB1"}
+        blocks = [block for stream in streams for block in stream[3].split("+")]
+        assert len(blocks) == len(set(blocks))
+        assert set(blocks) <= set(sbf_frame.NAMES.values())
+        assert [stream[4] for stream in streams] == ["OnChange", "msec200", "sec1", "msec200", "msec20", "OnChange"]
+
+    def test_one_hertz_is_said_in_seconds(self) -> None:
+        assert "EndOfPVT, sec1" in "\n".join(texts(sbf_startup.startup_messages(settings(rate_hz=1), StartupWish())))
+
+    def test_the_rate_comes_first_and_saving_last(self) -> None:
+        messages = sbf_startup.startup_messages(settings(port="COM2"), StartupWish(save=True, baud=460800))
+        assert messages[0].data == b"setCOMSettings, COM2, baud460800, bits8, No, bit1, none\r\n"
+        assert messages[-1].data == b"exeCopyConfigFile, Current, Boot\r\n"
+        assert messages[-1].last
+
+    def test_a_port_that_there_is_not(self) -> None:
+        with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'UART1', want COM1 to COM4, USB1 or USB2"):
+            sbf_startup.startup_messages(settings(port="UART1"), StartupWish())
+
+    @pytest.mark.parametrize(
+        ("reply", "answer"),
+        [(SBF_REPLY, Answer(True)), (SBF_ERROR, Answer(False, "setGNSSAttitude: Argument 'Source' is invalid!"))],
+    )
+    def test_a_reply_is_complete_with_the_prompt(
+        self, reply: bytes, answer: Answer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sbf_startup, "PULSE", SBF_COMMAND)
+        data = recording("sbf/pygpsdata_x5_time.log.gz")[:4000]
+        for size in (1, 6, 4096):
+            assert heard(sbf_listener(SBF_COMMAND), data + reply + data, size) == answer
+            assert heard(sbf_listener(SBF_COMMAND), data + reply[:-1], size) is None
+
+    def test_the_reply_to_another_command_is_none(self) -> None:
+        assert heard(sbf_listener(sbf_startup.PULSE), SBF_REPLY, 4096) is None
+
+    def test_data_holds_no_answer(self) -> None:
+        for path in sorted((FIXTURES / "sbf").glob("*.gz")):
+            data = gzip.decompress(path.read_bytes())
+            assert heard(sbf_listener(sbf_startup.PULSE), data, 4096) is None, path.name
