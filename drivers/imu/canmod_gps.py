@@ -39,12 +39,39 @@ IMU_SIGNALS = {
     "angular_rate": [f"gnss_imu.AngularRate{axis}" for axis in "XYZ"],
 }
 IMU_VALID = "gnss_imu.ImuValid"
+# message -> the signal that vouches for it, and the key and factor of each signal in the device's status
+STATUS_SIGNALS: dict[str, tuple[str, dict[str, tuple[str, float]]]] = {
+    "gnss_altitude": ("AltitudeValid", {"Altitude": ("altitude_m", 1), "AltitudeAccuracy": ("altitude_accuracy_m", 1)}),
+    "gnss_attitude": (
+        "AttitudeValid",
+        {
+            "Roll": ("roll_rad", radians(1)),
+            "Pitch": ("pitch_rad", radians(1)),
+            "Heading": ("heading_rad", radians(1)),
+            "RollAccuracy": ("roll_accuracy_rad", radians(1)),
+            "PitchAccuracy": ("pitch_accuracy_rad", radians(1)),
+            "HeadingAccuracy": ("heading_accuracy_rad", radians(1)),
+        },
+    ),
+    "gnss_odo": (
+        "DistanceValid",
+        {
+            "DistanceTrip": ("distance_trip_m", 1),
+            "DistanceAccuracy": ("distance_accuracy_m", 1),
+            "DistanceTotal": ("distance_total_m", 1000),
+        },
+    ),
+    "gnss_speed": ("SpeedValid", {"Speed": ("speed_mps", 1), "SpeedAccuracy": ("speed_accuracy_mps", 1)}),
+    "gnss_geofence": (
+        "FenceValid",
+        {"FenceCombined": ("fence_combined", 1), **{f"Fence{n}": (f"fence_{n}", 1) for n in range(1, 5)}},
+    ),
+}
 GNSS_SIGNALS = {  # message -> its signals that are read
     "gnss_status": ("FixType", "Satellites"),
     "gnss_time": ("TimeValid", "TimeConfirmed", "Epoch"),
     "gnss_pos": ("PositionValid", "Latitude", "Longitude", "PositionAccuracy"),
-    "gnss_altitude": ("AltitudeValid", "Altitude", "AltitudeAccuracy"),
-    "gnss_speed": ("SpeedValid", "Speed", "SpeedAccuracy"),
+    **{name: (valid, *signals) for name, (valid, signals) in STATUS_SIGNALS.items()},
 }
 FIX_TYPES = {  # VAL_ 1 FixType of the DBC
     0: FixType.NONE,
@@ -183,12 +210,9 @@ def utc_tag(unix_s: float) -> TimeTag:
 
 
 def _status_values(name: str, values: dict[str, float]) -> dict[str, float | int | str | bool]:
-    """Altitude and speed with their units in the keys; nothing where the device calls them invalid."""
-    if name == "gnss_altitude" and values["AltitudeValid"]:
-        return {"altitude_m": values["Altitude"], "altitude_accuracy_m": values["AltitudeAccuracy"]}
-    if name == "gnss_speed" and values["SpeedValid"]:
-        return {"speed_mps": values["Speed"], "speed_accuracy_mps": values["SpeedAccuracy"]}
-    return {}
+    """The message's values with their units in the keys; nothing where the device calls them invalid."""
+    valid, signals = STATUS_SIGNALS[name]
+    return {key: values[signal] * factor for signal, (key, factor) in signals.items()} if values[valid] else {}
 
 
 def make_time_parser(settings: DeviceSettings) -> CanmodGpsParser:

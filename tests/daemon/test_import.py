@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import gzip
 import json
 import shutil
@@ -30,6 +31,7 @@ FIXTURES = ROOT / "fixtures"
 VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"
 CANDUMP = FIXTURES / "canmod-gps" / "2F6913DB_00000004_00000001_candump.log.gz"
 NOVATEL = FIXTURES / "novatel" / "propak6-basic-fix.gps.gz"
+RTKLIB = FIXTURES / "rtklib"
 UBX = FIXTURES / "ubx" / "ublox-neo-m8t.log.gz"
 START_NS = 1_800_000_000_000_000_000
 HEAD = ("192.168.1.201", 2368)
@@ -271,6 +273,22 @@ class TestSerialTimes:
         assert [time_ns for time_ns, _, _ in units] == [
             START_NS + 500_000_000 + 20_000_000 * n for n in range(len(ends))
         ]
+
+    def test_a_capture_of_rtklib(self, tmp_path: Path) -> None:
+        """Nine minutes of an IMU on a serial line; CR, which upstream lost, is put back before each LF."""
+        data = gzip.decompress((RTKLIB / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
+        (tmp_path / "imu_1934.csv").write_bytes(data)
+        (tmp_path / "imu_1934.csv.tag").write_bytes(gzip.decompress((RTKLIB / "imu_1934.csv.tag.gz").read_bytes()))
+        write_config(tmp_path)
+        named = f"gnss/rover={tmp_path / 'imu_1934.csv'}"
+        result = swath("import", str(tmp_path / "swath.toml"), "--source", named, "-o", str(tmp_path / "logs"))
+        assert result.returncode == 0, result.stderr
+        units = content_of(tmp_path / "logs")["/gnss/rover/raw"]
+        assert len(units) == 37_632
+        assert b"".join(unit for _, unit, _ in units) == data
+        opened = dt.datetime(2025, 7, 8, 19, 34, 21, 854_000, dt.UTC) - dt.timedelta(seconds=18)  # its clock is GPS
+        assert units[0][0] == (round(opened.timestamp() * 1000) + 131) * 1_000_000
+        assert units[-1][0] - units[0][0] == 548_600_000_000
 
     @pytest.mark.parametrize(
         ("options", "first_after_ns"),

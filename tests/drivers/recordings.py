@@ -30,9 +30,17 @@ def recording(family: str, name: str) -> bytes:
 
 def gpsd_reports(family: str, name: str) -> list[dict[str, Any]]:
     """gpsd's TPV reports of a log that have a position."""
-    lines = gzip.decompress((FIXTURES / family / f"{name}.chk.gz").read_bytes()).decode().splitlines()
-    reports = [json.loads(line[line.index('{"class"') :]) for line in lines]
-    return [report for report in reports if "lat" in report and "time" in report]
+    return [report for report in gpsd_output(family, name, "TPV") if "lat" in report and "time" in report]
+
+
+def gpsd_output(family: str, name: str, kind: str) -> list[dict[str, Any]]:
+    """gpsd's reports of one class from a log, in order."""
+    return [json.loads(line) for line in gpsd_lines(family, name) if line.startswith(b'{"class":"%s"' % kind.encode())]
+
+
+def gpsd_lines(family: str, name: str) -> list[bytes]:
+    """gpsd's output from a log: its reports, and the receiver's sentences or such made from its messages."""
+    return gzip.decompress((FIXTURES / family / f"{name}.chk.gz").read_bytes()).splitlines()
 
 
 def every_recording() -> list[tuple[str, str]]:

@@ -124,6 +124,28 @@ def test_gnss_records_are_cantools(expected: Expected, tmp_path: Path) -> None:
     assert status == altitudes
 
 
+@pytest.mark.parametrize("expected", RECORDINGS, ids=lambda expected: expected.name)
+def test_attitude_distance_and_fences_are_cantools(expected: Expected, tmp_path: Path) -> None:
+    records = parse(candump_units(expected.name, tmp_path), CanmodGpsParser(SETTINGS))
+    theirs = decoded(expected.name)
+    for message, valid, names in (
+        ("gnss_attitude", "AttitudeValid", {"Roll": "roll", "Pitch": "pitch", "Heading": "heading"}),
+        ("gnss_odo", "DistanceValid", {"DistanceTrip": "distance_trip_m", "DistanceAccuracy": "distance_accuracy_m"}),
+        ("gnss_geofence", "FenceValid", {"FenceCombined": "fence_combined", "Fence1": "fence_1", "Fence4": "fence_4"}),
+    ):
+        found = [r.values for r in records if isinstance(r, DeviceStatus) and r.message == message]
+        signals = [one for name, one in theirs if name == message]
+        assert len(found) == len(signals) == expected.gnss
+        for values, said in zip(found, signals, strict=True):
+            assert bool(values) == bool(said[valid])
+            for signal, key in names.items() if values else ():
+                if message != "gnss_attitude":
+                    assert values[key] == said[signal]
+                    continue
+                assert values[f"{key}_rad"] == pytest.approx(np.radians(said[signal]), abs=1e-12)
+                assert values[f"{key}_accuracy_rad"] == pytest.approx(np.radians(said[f"{signal}Accuracy"]), abs=1e-12)
+
+
 def test_batches_do_not_matter(tmp_path: Path) -> None:
     units = candump_units(RECORDINGS[0].name, tmp_path)[500:2500]
     whole = check_packets(lambda: CanmodGpsParser(SETTINGS), units)

@@ -8,6 +8,8 @@ import operator
 import random
 import zlib
 from collections import Counter
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +45,7 @@ from drivers.gnss.nmea_sentences import encode_sentence
 from drivers.gnss.ubx_messages import encode_frame
 from georef.records import Chunk, Record
 from tests.drivers.harness import check_damage, check_garbage, check_stream
-from tests.drivers.recordings import every_recording, expected, recording
+from tests.drivers.recordings import every_recording, expected, gpsd_lines, gpsd_output, recording
 
 ALL_KINDS = (*GNSS_KINDS, NOVATEL, NOVATEL_SHORT, SBF)
 
@@ -172,6 +174,19 @@ def name_here(theirs: str) -> str:
     return name[2:] if protocol == "NMEA" and not name.startswith("P") and len(name) == 5 else name
 
 
+def comparable(messages: Mapping[str, int]) -> dict[str, int]:
+    """Messages that have the same name here as elsewhere."""
+    return {name: count for name, count in messages.items() if count and not name.startswith(NAMED_BY_NUMBER)}
+
+
+def others_messages(name: str, entry: Mapping[str, Any]) -> dict[str, int]:
+    """What others found in a recording, under our names, with what they do not count."""
+    theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
+    for message, count in entry["messages"].items():
+        theirs[name_here(message)] += count
+    return comparable(theirs)
+
+
 @pytest.mark.parametrize(("family", "name"), every_recording())
 def test_every_recording_has_the_frames_others_found(family: str, name: str) -> None:
     data, entry = recording(family, name), expected(family)[name]
@@ -182,11 +197,7 @@ def test_every_recording_has_the_frames_others_found(family: str, name: str) -> 
     assert kinds["novatel"] == kinds["novatel-short"] == kinds["sbf"] == 0
     assert counters.bytes_framed == sum(len(frame.data) for frame in parser.frames)
     assert counters.bytes == counters.bytes_framed + counters.bytes_skipped == len(data)
-    theirs: Counter[str] = Counter(UNCOUNTED_BY_OTHERS.get(name, {}))
-    for message, count in entry["messages"].items():
-        theirs[name_here(message)] += count
-    by_name = {key: count for key, count in counters.messages.items() if not key.startswith(NAMED_BY_NUMBER)}
-    assert by_name == {key: count for key, count in theirs.items() if not key.startswith(NAMED_BY_NUMBER)}
+    assert comparable(counters.messages) == others_messages(name, entry)
 
 
 @pytest.mark.parametrize("name", sorted(expected("sbf")))
@@ -201,11 +212,88 @@ def test_every_sbf_recording_has_the_frames_others_found(name: str) -> None:
     assert parser.counters.bytes == parser.counters.bytes_framed + parser.counters.bytes_skipped == len(data)
 
 
-def test_skipped_bytes_of_broken_files_are_those_that_belong_to_no_frame() -> None:
-    assert frames_of(recording("ubx", "pygpsdata-MIXED3BADCK.log")).counters.bad_checksums == 1
-    assert frames_of(recording("nmea", "pygpsdata-nmeabadck.log")).counters.bad_checksums == 2
-    assert frames_of(recording("ubx", "pygpsdata-BADEOF2.log")).counters.bytes_skipped == 9  # the cut-off third frame
-    assert frames_of(recording("ubx", "pygpsdata-BADHDR.log")).counters.bytes_skipped == 100  # its B5 77
+# What gpsd says otherwise: it joins a sentence that another interrupted, prints one that the file's end cut, and leaves
+# out the bars that tcp-torture marks its reads with.
+GPSD_ALONE = {
+    "isync.log": [b"$GPGSV,4,1,15,02,11,115,36,05,34,060,48,07,00,023,,13,56,090,49*71"],
+    "ublox-8.log": [b"$GNRMC,001053.00,A,4404.14083,N,12118.85886,W,0."],
+}
+WITH_SENTENCES = sorted(name for name, entry in expected("nmea").items() if entry.get("origin") == "gpsd")
+
+
+@pytest.mark.parametrize("name", WITH_SENTENCES)
+def test_every_sentence_is_gpsds(name: str) -> None:
+    """gpsd repeats each sentence it framed, so its output is a list of them."""
+    ours = [frame.data.strip().replace(b"|", b"") for frame in frames_of(recording("nmea", name)).frames]
+    theirs = [line.strip() for line in gpsd_lines("nmea", name) if line[:1] in (b"$", b"!")]
+    if name not in GPSD_ALONE:
+        assert ours == theirs
+    assert Counter(theirs) - Counter(ours) == Counter(GPSD_ALONE.get(name, []))
+    assert not Counter(ours) - Counter(theirs)
+
+
+@pytest.mark.parametrize(
+    ("family", "name", "count"),
+    [
+        ("rtcm3", "rtcm3.log", 2),
+        ("rtcm3", "rtcm3.2.log", 192),
+        ("rtcm3", "rtcm3.bndm.log", 100),
+        ("ubx", "ublox-zed-f9t-rtcm3.log", 182),
+    ],
+)
+def test_every_rtcm3_message_has_the_type_and_length_gpsd_says(family: str, name: str, count: int) -> None:
+    frames = [frame.data for frame in frames_of(recording(family, name)).frames if frame.kind == "rtcm3"]
+    ours = [(int.from_bytes(data[3:5], "big") >> 4, len(data) - 6) for data in frames]
+    assert ours == [(report["type"], report["length"]) for report in gpsd_output(family, name, "RTCM3")]
+    assert len(ours) == count
+
+
+# Of every file that is broken, by the name or by pyubx2: bytes of no frame, and frames with a wrong checksum. At a cut
+# end they are what its message counts as returned and the part of the frame before that.
+BROKEN = {
+    "nmea": {
+        "isync.log": (123, 0),  # a comment, and the halves of a sentence that another interrupts
+        "pygpsdata-BADHDR.log": (69, 0),
+        "pygpsdata-badeof.log": (1, 0),
+        "pygpsdata-nmeabadck.log": (138, 2),
+        "pygpsdata-nmeafoo1.log": (0, 0),  # unknown, with a good checksum
+        "pygpsdata-nmeafoo2.log": (0, 0),
+        "quectel_nmea_poll.log": (0, 0),
+    },
+    "ubx": {
+        "pygpsdata-BADEOF1.log": (5, 0),
+        "pygpsdata-BADEOF2.log": (6 + 3, 0),
+        "pygpsdata-BADEOF3.log": (1, 0),
+        "pygpsdata-BADHDR.log": (100, 0),  # its B5 77
+        "pygpsdata-BADNMEAEOF.log": (2 + 50, 0),
+        "pygpsdata-MGASF.log": (0, 0),
+        "pygpsdata-MIXED3BADCK.log": (110, 1),
+        "pygpsdata-NMEABADEND.log": (2 + 30, 0),
+        "ublox-8-time.log": (1 + 6 + 13, 0),
+        "ublox-neo-m8t.log": (6 + 308, 0),
+        "ublox-zed-f9p-sfrbx.log": (6 + 5, 0),
+        "ublox-zed-f9t-rtcm3.log": (3 + 86, 0),
+        "ublox-zoe-m8b-logbatch.log": (6 + 43, 0),
+    },
+    "rtcm3": {
+        "GMSD7_20121014.rtcm3": (3 + 299, 0),
+        "pygpsdata-BADHDR.log": (100, 0),
+        "rtcm3.2.log": (344, 0),  # it begins within a message
+    },
+    "sbf": {"pygpsdata_ubx.log": (0, 0), "pygpsdata_x5_pvttruncated.log": (8 + 6, 0)},
+}
+
+
+def test_every_broken_file_is_in_the_table() -> None:
+    for family, files in BROKEN.items():
+        names = {name for name, entry in expected(family).items() if entry["errors"] or "bad" in name.lower()}
+        assert names == set(files), family
+
+
+@pytest.mark.parametrize(("family", "name"), [(family, name) for family in BROKEN for name in BROKEN[family]])
+def test_skipped_bytes_of_broken_files_are_those_that_belong_to_no_frame(family: str, name: str) -> None:
+    counters = frames_of(recording(family, name)).counters
+    assert (counters.bytes_skipped, counters.bad_checksums) == BROKEN[family][name]
 
 
 # --- false syncs, bounds, arrival ---

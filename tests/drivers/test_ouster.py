@@ -47,8 +47,9 @@ from tests.drivers.ouster_cases import (
 )
 
 DUAL, LEGACY, LOW = "OS-0-32-U1_v2.2.0_1024x10", "OS-1-32-G_v2.1.1_1024x10", "OS-1-128_v2.3.0_1024x10_lb_n3"
-LIDAR = (DUAL, LEGACY, LOW, "crc_test", "windowed_frame1")
-RETURNS = {DUAL: 21_803, LEGACY: 27_310, LOW: 322_536, "crc_test": 29_692, "windowed_frame1": 9_246}
+SINGLE = f"{DUAL}-single-packet"
+LIDAR = (DUAL, SINGLE, LEGACY, LOW, "crc_test", "windowed_frame1")
+RETURNS = {DUAL: 21_803, SINGLE: 223, LEGACY: 27_310, LOW: 322_536, "crc_test": 29_692, "windowed_frame1": 9_246}
 
 
 def lidar_packets(capture: str) -> tuple[LidarLayout, StructArray]:
@@ -120,7 +121,7 @@ def test_returns_make_the_images_of_the_makers_decoder(capture: str) -> None:
         np.testing.assert_array_equal(frame["intensity"], image[places])
 
 
-@pytest.mark.parametrize("capture", [DUAL, LEGACY, "crc_test", "windowed_frame1"])
+@pytest.mark.parametrize("capture", LIDAR)
 def test_points_agree_with_the_makers_decoder(capture: str) -> None:
     parser = recorded(capture)
     rows = returns_of(feed(parser, payloads(capture)))
@@ -521,7 +522,7 @@ def test_a_head_is_told_by_the_form_of_its_packets() -> None:
     for capture in LIDAR:
         for unit in payloads(capture):
             probe.feed(Chunk("scanner/left", 0, unit))
-    assert probe.counters.messages == {"lidar": 64 + 64 + 192 + 34 + 17}
+    assert probe.counters.messages == {"lidar": 64 + 1 + 64 + 192 + 34 + 17}
     both = driver.make_probe(DeviceSettings("scanner/left"))
     for unit in payloads("same_ports"):  # a LEGACY head of 64 beams, one with two returns, and their IMUs
         both.feed(Chunk("scanner/left", 0, unit))

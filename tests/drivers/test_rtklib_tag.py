@@ -1,4 +1,4 @@
-"""RTKLIB's time tags: files laid out here by hand as src/stream.c writes them, and those of our writer."""
+"""RTKLIB's time tags: its own files, others laid out by hand as src/stream.c writes them, and those of our writer."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from drivers.transports.base import TransportError
 from drivers.transports.capture_file import CaptureTally, read_tagged
 from drivers.transports.rtklib_tag import TagWriter, read_tags
 
+FIXTURES = Path(__file__).parents[2] / "fixtures" / "rtklib"
 HEAD = b"TIMETAG RTKLIB 2.4.3 b34".ljust(60, b"\0") + struct.pack("<I", 123_456)
 OPENED_UTC_S = 1_700_000_000  # 2023-11-14T22:13:20Z
 OPENED_GPS_S = OPENED_UTC_S + 18  # GPS − UTC since 2017, IERS Bulletin C 52
@@ -90,6 +91,47 @@ def test_bytes_come_with_the_time_of_their_write(tmp_path: Path) -> None:
     assert b"".join(unit.data for unit in units) == stream + b"rest"
     assert [unit.time_ns for unit in units] == [time_ns for time_ns, _ in [*expected(), expected()[-1]]]
     assert [len(unit.data) for unit in units] == [100, 200, 1, 99, 4]
+
+
+def test_tags_of_a_receiver_are_right_behind_the_epochs_of_its_solution() -> None:
+    """RTKLIB's own solution of the same bytes says its epochs in GPS time; each was written within milliseconds."""
+    text = gzip.decompress((FIXTURES / "gnss_1934_sf.pos.gz").read_bytes()).decode()
+    epochs = [line[:23].replace("/", "-").replace(" ", "T") for line in text.splitlines()[1:]]
+    epoch_ms = np.array(epochs, "datetime64[ms]").astype(np.int64) - 18_000  # GPS − UTC
+    tags = np.array(list(read_tags(io.BytesIO(gzip.decompress((FIXTURES / "gnss_1934.ubx.tag.gz").read_bytes())))))
+    assert tags.shape == (7036, 2)
+    assert (np.diff(tags, axis=0) >= 0).all()
+    written_ms = tags[:, 0] // 1_000_000
+    assert (written_ms[0] - epoch_ms[0], written_ms[-1] - epoch_ms[-1]) == (308, 290)
+    behind_ms = written_ms[np.searchsorted(written_ms, epoch_ms)] - epoch_ms
+    assert np.percentile(behind_ms, 98) < 50
+
+
+def test_tags_of_an_imu_follow_its_own_clock(tmp_path: Path) -> None:
+    """Its lines carry its milliseconds; the time at which each was written stays within 30 ms of them for 9 minutes."""
+    data = gzip.decompress((FIXTURES / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
+    (tmp_path / "imu.csv").write_bytes(data)
+    units = list(read_tagged(tmp_path / "imu.csv", FIXTURES / "imu_1934.csv.tag.gz"))
+    assert len(units) == 37_632
+    assert b"".join(unit.data for unit in units) == data
+    ends = np.cumsum([len(unit.data) for unit in units])
+    lines = data.splitlines(keepends=True)
+    of_line = np.searchsorted(ends, np.cumsum([len(line) for line in lines]))
+    written_ms = np.array([unit.time_ns for unit in units])[of_line] // 1_000_000
+    ticks_ms = np.array([int(line.rpartition(b",")[2]) for line in lines])
+    apart_ms = (written_ms - written_ms[0]) - (ticks_ms - ticks_ms[0])
+    assert len(lines) == 54_860
+    assert np.abs(apart_ms - np.median(apart_ms)).max() < 30
+    assert np.abs(apart_ms - np.median(apart_ms)).mean() < 5
+
+
+def test_a_stream_whose_line_ends_were_changed_does_not_fit_its_tags() -> None:
+    tally = CaptureTally()
+    for _ in read_tagged(FIXTURES / "imu_1934.csv.gz", FIXTURES / "imu_1934.csv.tag.gz", tally):
+        pass
+    assert tally.damage == 1
+    assert "speaks of " in tally.first_damage
+    assert "bytes more than imu_1934.csv.gz has" in tally.first_damage
 
 
 def test_tags_that_do_not_fit_are_told_after_the_good_bytes(tmp_path: Path) -> None:

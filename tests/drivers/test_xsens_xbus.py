@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
+import re
 import struct
 from functools import cache
 from typing import Any
@@ -13,7 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from drivers.core.frame_kinds import XBUS, XBUS_MAX_DATA_BYTES
-from drivers.core.parser import DeviceSettings, DriverSettingsError
+from drivers.core.framing import Framer
+from drivers.core.parser import DeviceSettings, DriverSettingsError, ParserCounters
 from drivers.core.registry import find_driver
 from drivers.imu import xsens_xbus as xbus
 from drivers.imu.xsens_xbus import XbusParser, make_time_parser
@@ -98,6 +100,52 @@ def test_samples_are_what_the_other_library_decoded(name: str) -> None:
     assert parser.counters.messages == {"MTData2": 100}
     assert not +parser.counters.errors
     assert parser.counters.bytes_framed == len(recording(name))
+
+
+@pytest.mark.parametrize("number", "12")
+def test_messages_end_where_the_other_library_ends_them(number: str) -> None:
+    text = gzip.decompress((FIXTURES / f"xsens/{number}_messages.golden.gz").read_bytes())
+    theirs = [bytes.fromhex(line.decode()) for line in text.split()]
+    assert len(theirs) == 100
+    assert b"".join(theirs) == recording(f"{number}_output")
+    assert [XBUS.measure(message, 0, True) for message in theirs] == [len(message) for message in theirs]
+    framer = Framer((XBUS,), ParserCounters())
+    assert [frame.data for frame in framer.feed(recording(f"{number}_output"), 0)] == theirs
+
+
+ITEMS = {  # as the other library names them -> the identifier without number format
+    "PacketCounter": xbus.PACKET_COUNTER,
+    "SampleTimeFine": xbus.SAMPLE_TIME_FINE,
+    "UTCTime": xbus.UTC_TIME,
+    "StatusWord": xbus.STATUS_WORD,
+    "StatusByte": xbus.STATUS_BYTE,
+    "Acceleration": xbus.ACCELERATION,
+    "DeltaV": xbus.DELTA_V,
+    "RateOfTurn": xbus.RATE_OF_TURN,
+    "DeltaQ": xbus.DELTA_Q,
+}
+FORMAT_NAMES = {"Float32": xbus.FLOAT32, "FP1220": xbus.FP1220}
+
+
+@pytest.mark.parametrize("number", "12")
+def test_identifiers_are_those_of_the_devices_own_output_configuration(number: str) -> None:
+    """Identifier and rate of each item that the device was told to send, beside the other library's names for them."""
+    data = (FIXTURES / f"xsens/{number}_outputconfig.bin").read_bytes()
+    text = (FIXTURES / f"xsens/{number}_outputconfig.golden").read_text()
+    said = re.findall(r"^(\w+)(?:\((.*)\))?:\n  (?:(Max)|(\d+) Hz)", text, re.MULTILINE)
+    pairs = list(struct.iter_unpack(">HH", data))
+    assert len(said) == len(pairs) == 13
+    known = 0
+    for (name, form, unlimited, rate_hz), (identifier, rate) in zip(said, pairs, strict=True):
+        assert rate == (0xFFFF if unlimited else int(rate_hz))
+        number_format = FORMAT_NAMES[form.rpartition(",")[2]] if form else 0
+        if name in ITEMS:
+            assert identifier == ITEMS[name] | number_format, name
+            known += 1
+    assert known == 8
+    parser = make()
+    assert feed_pieces(parser, [xbus.encode_message(0xC1, data)]) == []  # ReqOutputConfigurationAck
+    assert parser.counters.messages == {"XBUS-C1": 1}
 
 
 @pytest.mark.parametrize("name", NAMES)
