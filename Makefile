@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
+SECONDS ?= 600
 PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
 
 DESTDIR ?=
@@ -12,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint bench install uninstall clean
+.PHONY: help demo test test-long fuzz lint bench install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -26,6 +27,10 @@ test: lint $(VENV)/.tools ## install and run everything: style, types, import ru
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long
+
+fuzz: $(VENV)/.tests ## inputs nobody would send, to every parser and reader: SECONDS=600 each, TARGETS=… for some, GUIDED=1 by coverage
+	@if [ -n "$(GUIDED)" ]; then $(BIN)/python -m pip install -q 'atheris>=2.3'; fi
+	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) $(if $(GUIDED),--guided) $(TARGETS)
 
 lint: $(VENV)/.tests ## style, import rules and types only
 	$(BIN)/ruff check .
