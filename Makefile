@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
+SECONDS ?= 600
+MINUTES ?= 60
+RATE ?= 0.1
 PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
 
 DESTDIR ?=
@@ -12,10 +15,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-MINUTES ?= 60
-RATE ?= 0.1
-
-.PHONY: help demo test test-long soak-short lint bench install uninstall clean
+.PHONY: help demo test test-long soak-short fuzz lint bench install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -32,6 +32,10 @@ test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 
 soak-short: $(VENV)/.tests ## an hour of all kinds of sensors at a tenth of their rate (MINUTES=, RATE=)
 	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) --rate $(RATE)
+
+fuzz: $(VENV)/.tests ## inputs nobody would send, to every parser and reader: SECONDS=600 each, TARGETS=… for some, GUIDED=1 by coverage
+	@if [ -n "$(GUIDED)" ]; then $(BIN)/python -m pip install -q 'atheris>=2.3'; fi
+	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) $(if $(GUIDED),--guided) $(TARGETS)
 
 lint: $(VENV)/.tests ## style, import rules and types only
 	$(BIN)/ruff check .

@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from daemon.log.chunks import LogBatch
 from daemon.log.format import ChannelSpec
-from daemon.log.reader import LogBatch
 from daemon.sidecar import SidecarWriter
 from drivers.transports.candump_file import candump_line, held_by_line
 from drivers.transports.capture_base import LATEST_NS, Address

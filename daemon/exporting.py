@@ -18,8 +18,9 @@ from typing import Any
 
 from daemon.errors import ExitCode, UserError
 from daemon.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
+from daemon.log.chunks import LogBatch
 from daemon.log.format import LogError, safe_attachment_path
-from daemon.log.reader import LogBatch, Session
+from daemon.log.reader import Session
 from daemon.log_parsers import stored_config
 from daemon.replay import source_of_topic
 

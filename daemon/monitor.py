@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections import deque
@@ -10,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from daemon.health import duration_text, source_trouble
+from daemon.log.chunks import LogBatch, json_objects
 from daemon.log.claim import is_being_written
 from daemon.log.follow import LogFollower, PartFollower
 from daemon.log.format import LogError, SessionInfo
-from daemon.log.reader import LogBatch
 from daemon.log_parsers import stored_config, stored_drivers
 from daemon.monitor_source import Decoding, SourceWatch, decoded_trouble
 from daemon.replay import source_of_topic
@@ -93,10 +92,10 @@ class Monitor:
                 self._watch(other).decode(batch)
         elif topic.startswith("/status/"):
             watch = self._watch(topic.removeprefix("/status/"))
-            for time_ns, value in _objects(batch):
+            for time_ns, value in json_objects(batch):
                 watch.add_status(time_ns, value)
         elif topic == "/events":
-            self._events.extend(value for _, value in _objects(batch))
+            self._events.extend(value for _, value in json_objects(batch))
 
     def _watch(self, source: str) -> SourceWatch:
         return self._sources.setdefault(source, SourceWatch(source, None))
@@ -112,7 +111,7 @@ class Monitor:
             self._events.clear()
             for batch in part.tail(TAIL_S):
                 if batch.channel.topic == "/events":
-                    self._events.extend(value for _, value in _objects(batch))
+                    self._events.extend(value for _, value in json_objects(batch))
             part.close()
 
     # ------------------------------------------------------------------ saying
@@ -201,19 +200,6 @@ def _modified(path: Path) -> float:
         return path.stat().st_mtime
     except OSError:  # gone meanwhile
         return 0.0
-
-
-def _objects(batch: LogBatch) -> list[tuple[int, dict[str, Any]]]:
-    """JSON messages with their log times; a stranger's that are no objects are left out."""
-    values = []
-    for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
-        try:
-            value = json.loads(row.tobytes())
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(value, dict):
-            values.append((time_ns, value))
-    return values
 
 
 def _sentence(found: dict[str, Any]) -> str:

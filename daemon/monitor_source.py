@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from daemon.log.reader import LogBatch
+from daemon.log.chunks import LogBatch
 from drivers.core.parser import DriverSettingsError, Parser
 from georef.records import ChunkBatch
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 from daemon.config import Config
+from daemon.log.chunks import json_objects
 from daemon.log.reader import Session
 from daemon.wire_player import Output, PpsOutput, TimedUnit, open_output
 
@@ -16,7 +16,7 @@ _FIXED = "fixed:"
 def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
     """Raw units and PPS edges of a session in the order of their host time.
 
-    A PPS edge's time is the edge's own, not that of its message.
+    A PPS edge's time is the edge's own, not that of its message; a message that says none is passed over.
     """
     for batch in session.batches_by_time():
         source = source_of_topic(batch.channel.topic)
@@ -24,8 +24,10 @@ def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
             continue
         if source.startswith("pps/"):
             if with_pps:
-                for row in batch.units:
-                    yield TimedUnit(int(json.loads(row.tobytes())["edge_time_ns"]), source, b"")
+                for _, value in json_objects(batch):
+                    edge_time_ns = value.get("edge_time_ns")
+                    if isinstance(edge_time_ns, int) and 0 <= edge_time_ns < 1 << 63:
+                        yield TimedUnit(edge_time_ns, source, b"")
             continue
         for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
             yield TimedUnit(time_ns, source, row.tobytes())

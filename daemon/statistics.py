@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from daemon.log.reader import LogBatch, Session
+from daemon.log.chunks import LogBatch, json_objects
+from daemon.log.reader import Session
 from daemon.log_parsers import stored_parsers
 from daemon.replay import source_of_topic
 from drivers.core.parser import Parser
@@ -18,6 +18,8 @@ from georef.records import ChunkBatch, Int64Array
 
 USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
 GAP_MIN_NS = 100_000_000
+MAX_MARKS = 10_000  # nobody marks more in a flight; a stranger's log may say anything
+MAX_WORDS = 32
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
 _TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
 
@@ -85,7 +87,7 @@ class SourceNumbers:
         self.account_errors += units != written + sum(lost)
         self.miscounted += written != self.units
         if "time_state" in status:
-            self.time_states[str(status["time_state"])] += 1
+            _count_word(self.time_states, status["time_state"])
 
     def plain(self, *, complete: bool) -> dict[str, Any]:
         """For ``--json``; of a complete log every status must agree with the units read before it."""
@@ -121,6 +123,23 @@ class SourceNumbers:
         return numbers
 
 
+@dataclass(slots=True)
+class EventNumbers:
+    """Events of a session: how many of each severity, the operator's marks, the last that are no mere information."""
+
+    severities: Counter[str] = field(default_factory=Counter)
+    marks: list[dict[str, Any]] = field(default_factory=list)
+    last: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=10))
+
+    def add(self, event: dict[str, Any]) -> None:
+        """The next event."""
+        _count_word(self.severities, event.get("severity"))
+        if event.get("code") == "mark" and len(self.marks) < MAX_MARKS:
+            self.marks.append(event)
+        if event.get("severity") != "info":
+            self.last.append(event)
+
+
 def session_statistics(
     session: Session, *, decode: bool = True, progress: Callable[[int], None] | None = None
 ) -> dict[str, Any]:
@@ -134,7 +153,7 @@ def session_statistics(
     attachments = session.attachments()
     parsers, troubles = stored_parsers(attachments) if decode else ({}, [])
     sources: dict[str, SourceNumbers] = {}
-    events: list[dict[str, Any]] = []
+    events = EventNumbers()
     first_ns: int | None = None
     last_ns = 0
     for batch in session.batches():
@@ -161,9 +180,9 @@ def session_statistics(
         "growing": None if session.growing is None else session.growing.name,
         "attachments": sorted(attachments),
         "sources": {source: numbers.plain(complete=complete) for source, numbers in sorted(sources.items())},
-        "events": dict(Counter(str(event.get("severity")) for event in events)),
-        "marks": [event for event in events if event.get("code") == "mark"],
-        "last_events": [event for event in events if event.get("severity") != "info"][-10:],
+        "events": dict(events.severities),
+        "marks": events.marks,
+        "last_events": list(events.last),
         "damage": [
             {
                 "file": entry.path.name,
@@ -178,9 +197,7 @@ def session_statistics(
     }
 
 
-def _take(
-    batch: LogBatch, sources: dict[str, SourceNumbers], events: list[dict[str, Any]], parsers: dict[str, Parser]
-) -> None:
+def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbers, parsers: dict[str, Parser]) -> None:
     topic = batch.channel.topic
     source = source_of_topic(topic)
     if source is not None:
@@ -194,23 +211,17 @@ def _take(
                 numbers.records[type(record).__name__] += 1 if rows is None else len(rows)
     elif topic.startswith("/status/"):
         numbers = sources.setdefault(topic.removeprefix("/status/"), SourceNumbers())
-        for value in _objects(batch):
+        for _, value in json_objects(batch):
             numbers.add_status(value)
     elif topic == "/events":
-        events += _objects(batch)
+        for _, value in json_objects(batch):
+            events.add(value)
 
 
-def _objects(batch: LogBatch) -> list[dict[str, Any]]:
-    """JSON messages; a stranger's that are no objects are left out."""
-    values = []
-    for row in batch.units:
-        try:
-            value = json.loads(row.tobytes())
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(value, dict):
-            values.append(value)
-    return values
+def _count_word(counts: Counter[str], word: object) -> None:
+    """One of a few words; a stranger's many are one."""
+    key = str(word)[:64]
+    counts[key if key in counts or len(counts) < MAX_WORDS else "other"] += 1
 
 
 def _count(status: dict[str, Any], key: str) -> int:

@@ -25,6 +25,7 @@ from drivers.transports.uri import TransportSpec, open_transport
 
 _PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted
 _LATE_S = 0.002  # units due within this are sent without another sleep
+LONGEST_PAUSE_NS = 3600 * 1_000_000_000  # between units; a log that says more means another time, nobody waits for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +228,7 @@ class PlayReport:
         refused: units that nobody took in time.
         passed_over: units of sources without an output.
         latest_s: how late the latest unit was.
+        jumps: steps of time of more than an hour, forwards or back, that were not waited for.
     """
 
     units: Counter[str] = field(default_factory=Counter)
@@ -234,6 +236,7 @@ class PlayReport:
     refused: Counter[str] = field(default_factory=Counter)
     passed_over: Counter[str] = field(default_factory=Counter)
     latest_s: float = 0.0
+    jumps: int = 0
 
 
 def play(
@@ -245,6 +248,9 @@ def play(
     stopped: Callable[[], bool] = lambda: False,
 ) -> PlayReport:
     """Send units when they are due: the first now, the others after it as recorded, ``pace`` times as fast.
+
+    A step of more than an hour between two units is no pause: the later one is sent at once, and the pace goes on
+    from there.
 
     Args:
         units: in time order; those of sources without an output are passed over.
@@ -259,12 +265,18 @@ def play(
     start_ns = time.monotonic_ns()
     realtime_ns = time.time_ns()
     first_ns: int | None = None
+    last_ns = 0
     told_s = 0.0
     for unit in units:
         if unit.source not in outputs:
             report.passed_over[unit.source] += 1
             continue
-        first_ns = unit.time_ns if first_ns is None else first_ns
+        if first_ns is None:
+            first_ns = unit.time_ns
+        elif abs(unit.time_ns - last_ns) > LONGEST_PAUSE_NS:
+            first_ns += unit.time_ns - last_ns
+            report.jumps += 1
+        last_ns = unit.time_ns
         due_s = (unit.time_ns - first_ns) * 1e-9 / pace
         _sleep_until(start_ns, due_s, stopped)
         if stopped():

@@ -90,6 +90,10 @@ def _play_session(
 def _tell_report(
     report: PlayReport, session: Session, outputs: Mapping[str, Output], wire: Path, console: Console
 ) -> None:
+    if report.jumps:
+        console.print(
+            f"{session.session_id}: {report.jumps} steps of more than an hour in its times were not waited for"
+        )
     for source in sorted(report.passed_over):
         console.print(f"{source}: in the log, not in {wire}; not played")
     for source in sorted(outputs):

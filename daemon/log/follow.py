@@ -13,8 +13,8 @@ from pathlib import Path
 
 from mcap import records
 
+from daemon.log.chunks import LogBatch, chunk_batches
 from daemon.log.format import MAGIC, SESSION_METADATA, ChannelSpec, LogError, SessionInfo
-from daemon.log.reader import LogBatch, chunk_batches
 from daemon.log.scan import (
     MAX_RECORD_BYTES,
     OP_ATTACHMENT,
@@ -59,7 +59,7 @@ class PartFollower:
         self.damaged = 0
         self.newest_ns: int | None = None
         self._channels: dict[int, ChannelSpec] = {}
-        self._schemas: dict[int, str] = {}
+        self._schemas: dict[int, records.Schema] = {}
         self._file = path.open("rb")
         self._at = len(MAGIC)
         try:

@@ -13,6 +13,7 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 1 << 20
 CHUNK_OPEN_NS = 250_000_000
 SESSION_METADATA = "swath.session"
+MAX_PART = 999_999
 
 ChunkClass = Literal["scanner", "other"]
 CHUNK_CLASSES: tuple[ChunkClass, ...] = ("scanner", "other")
@@ -88,9 +89,12 @@ class SessionInfo:
                 monotonic_ns=int(values["monotonic_ns"]),
                 origin=values.get("origin"),
             )
-            return info, int(values["part"])
+            part = int(values["part"])
         except (KeyError, ValueError) as error:
             raise LogError(f"metadata {SESSION_METADATA}: {error} is missing or wrong") from error
+        if not 0 <= part <= MAX_PART:
+            raise LogError(f"metadata {SESSION_METADATA}: part {part} is none, want 0 to {MAX_PART}")
+        return info, part
 
 
 def _object(title: str, required: dict[str, str], optional: dict[str, str]) -> bytes:

@@ -9,22 +9,22 @@ from __future__ import annotations
 import heapq
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 from mcap import records
 
+from daemon.log.chunks import LogBatch, TopicFilter, chunk_batches, damage_within, take_description
 from daemon.log.claim import is_being_written
-from daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, ChunkClass, LogError, SessionInfo
+from daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, LogError, SessionInfo
 from daemon.log.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
     OP_CHUNK,
     OP_HEADER,
-    OP_MESSAGE,
     OP_METADATA,
     OP_SCHEMA,
     Damage,
@@ -32,33 +32,15 @@ from daemon.log.scan import (
     parse_record,
     scan,
 )
-from georef.records import ByteRows, Int64Array
 
-TopicFilter = Callable[[str], bool]
 RECOVERED = ".recovered.mcap"
-_MESSAGE_HEAD = 31
-_HEAD = struct.Struct("<BQ")
 LOOK_AHEAD_NS = 1_000_000_000  # a chunk is open for 250 ms and waits for the writer a little longer
 
-
-@dataclass(frozen=True, slots=True)
-class LogBatch:
-    """Consecutive messages of equal length of one channel, as they stand in a chunk.
-
-    Attributes:
-        log_time_ns: (n,) host time.
-        rows: (n, 31 + length) uint8, the whole message records, a view into the chunk.
-    """
-
-    channel: ChannelSpec
-    channel_id: int
-    log_time_ns: Int64Array
-    rows: ByteRows
-
-    @property
-    def units(self) -> ByteRows:
-        """(n, length) uint8, the messages' data, a view into the chunk."""
-        return self.rows[:, _MESSAGE_HEAD:]
+# What a stranger's log may take of the memory; ours stay far below.
+LOOK_AHEAD_BYTES = 128 << 20
+MAX_ATTACHMENTS_BYTES = 128 << 20
+MAX_DAMAGE = 1000  # places that are listed
+MAX_MISSING = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +82,9 @@ class Session:
 
     @property
     def missing_parts(self) -> list[int]:
-        """Numbers below the highest that are not there."""
+        """Numbers below the highest that are not there, the first thousand."""
         there = {part.number for part in self.parts}
-        return [number for number in range(max(there) + 1) if number not in there]
+        return list(islice((number for number in range(max(there) + 1) if number not in there), MAX_MISSING))
 
     def batches(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
         """All messages in the order in which they stand in the files."""
@@ -112,45 +94,62 @@ class Session:
     def batches_by_time(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
         """All messages merged by log time: batches are split where another's messages come between.
 
-        A second of messages is held, longer than a chunk stays open.
+        A second of messages is held, longer than a chunk stays open; of a log whose times do not go on, 128 MiB.
         """
         held: list[LogBatch] = []
+        limit_ns, size = 0, 0
         for chunk in self._chunks(topics):
             chunk = [run for batch in chunk for run in _in_order(batch)]
             held += chunk
             newest_ns = min((int(batch.log_time_ns.min()) for batch in chunk), default=None)
-            if newest_ns is not None:
-                ready, held = _older_than(held, newest_ns - LOOK_AHEAD_NS)
+            if newest_ns is not None and newest_ns - LOOK_AHEAD_NS > limit_ns:
+                limit_ns = newest_ns - LOOK_AHEAD_NS
+                ready, held = _older_than(held, limit_ns)
                 yield from _merge(ready)
+            size += _chunk_bytes(chunk)
+            if size > LOOK_AHEAD_BYTES:
+                size = _chunk_bytes(held)  # what was given out meanwhile counts no more
+                if size > LOOK_AHEAD_BYTES // 2:
+                    yield from _merge(held)
+                    held, size = [], 0
         yield from _merge(held)
 
     def attachments(self) -> dict[str, bytes]:
-        """Attachments by name, of the first part that has each."""
+        """Attachments by name, of the first part that has each; what goes beyond 128 MiB in all is left out."""
         found: dict[str, bytes] = {}
+        size = 0
         for part in self.parts:
             for record in self._records(part, chunks=False):
-                if record.opcode == OP_ATTACHMENT:
-                    attachment = parse_record(records.Attachment, record.body)
-                    found.setdefault(attachment.name, attachment.data)
+                if record.opcode != OP_ATTACHMENT:
+                    continue
+                attachment = parse_record(records.Attachment, record.body)
+                if attachment.name in found:
+                    continue
+                size += len(record.body)
+                if size > MAX_ATTACHMENTS_BYTES:
+                    self._note(part, Damage(record.offset, record.length, "attachments beyond 128 MiB are not read"))
+                    return found
+                found[attachment.name] = attachment.data
         return found
 
     def _chunks(self, topics: TopicFilter | None) -> Iterator[list[LogBatch]]:
         for part in self.parts:
             channels: dict[int, ChannelSpec] = {}
-            schemas: dict[int, str] = {}
+            schemas: dict[int, records.Schema] = {}
             for record in self._records(part):
                 if record.opcode == OP_CHUNK:
-                    orphans: Counter[int] = Counter()
+                    lost: Counter[str] = Counter()
                     try:
-                        yield list(chunk_batches(record.body, channels, schemas, topics, orphans))
+                        yield list(chunk_batches(record.body, channels, schemas, topics, lost))
                     except LogError as error:
                         self._note(part, Damage(record.offset, record.length, str(error)))
-                    if orphans:
-                        self._note(part, orphan_damage(record, orphans))
-                elif record.opcode == OP_CHANNEL:
-                    _take_channel(record.body, channels, schemas)
-                elif record.opcode == OP_SCHEMA:
-                    _take_schema(record.body, schemas)
+                    if lost:
+                        self._note(part, damage_within(record, lost))
+                elif record.opcode in (OP_CHANNEL, OP_SCHEMA):
+                    try:
+                        take_description(record, channels, schemas)
+                    except LogError as error:
+                        self._note(part, Damage(record.offset, record.length, str(error)))
 
     def _records(self, part: Part, *, chunks: bool = True) -> Iterator[Record]:
         growing = is_being_written(part.path)
@@ -166,9 +165,12 @@ class Session:
 
     def _note(self, part: Part, damage: Damage) -> None:
         entry = PartDamage(part.path, damage)
-        if entry not in self._noted:
-            self._noted.add(entry)
-            self.damage.append(entry)
+        if entry in self._noted or len(self.damage) > MAX_DAMAGE:
+            return
+        if len(self.damage) == MAX_DAMAGE:
+            entry = PartDamage(part.path, Damage(damage.offset, 0, "there is more damage, which is not listed"))
+        self._noted.add(entry)
+        self.damage.append(entry)
 
 
 def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None) -> list[Session]:
@@ -251,90 +253,6 @@ def read_part_head(path: Path) -> Part:
     raise LogError(f"{path}: no {SESSION_METADATA} at its beginning; not a log of swath, or cut off before it began")
 
 
-# ---------------------------------------------------------------------- inside a chunk
-
-
-def chunk_batches(
-    data: bytes,
-    channels: dict[int, ChannelSpec],
-    schemas: dict[int, str],
-    topics: TopicFilter | None = None,
-    orphans: Counter[int] | None = None,
-) -> Iterator[LogBatch]:
-    """Messages of an unpacked chunk as runs of equal channel and length; learns its channels on the way.
-
-    Args:
-        data: the chunk's records.
-        channels, schemas: known so far, by id.
-        topics: which are wanted.
-        orphans: counts messages of channels that no record has described; without it they are an error.
-
-    Raises:
-        LogError: a record is malformed.
-    """
-    at, size = 0, len(data)
-    array = np.frombuffer(data, np.uint8)
-    while at + _HEAD.size <= size:
-        opcode, length = _HEAD.unpack_from(data, at)
-        end = at + _HEAD.size + length
-        if end > size:
-            raise LogError("chunk in which a record reaches beyond its end")
-        if opcode == OP_MESSAGE and length >= _MESSAGE_HEAD - _HEAD.size:
-            stride = end - at
-            count = _run_length(array, at, stride)
-            channel_id = int.from_bytes(data[at + 9 : at + 11], "little")
-            spec = channels.get(channel_id)
-            if spec is None:
-                if orphans is None:
-                    raise LogError(f"chunk with messages of channel {channel_id}, whose record is lost")
-                orphans[channel_id] += count
-            elif topics is None or topics(spec.topic):
-                yield _batch(spec, channel_id, array[at : at + count * stride].reshape(count, stride))
-            end = at + count * stride
-        elif opcode == OP_CHANNEL:
-            _take_channel(data[at + _HEAD.size : end], channels, schemas)
-        elif opcode == OP_SCHEMA:
-            _take_schema(data[at + _HEAD.size : end], schemas)
-        at = end
-
-
-def orphan_damage(chunk: Record, orphans: Counter[int]) -> Damage:
-    """What is lost of a good chunk where the record of a channel was lost with another chunk."""
-    which = ", ".join(map(str, sorted(orphans)))
-    return Damage(chunk.offset, chunk.length, f"messages of channel {which}, whose record is lost", orphans.total())
-
-
-def _run_length(array: ByteRows, at: int, stride: int) -> int:
-    """Messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
-    possible = (len(array) - at) // stride
-    if possible <= 1:
-        return possible
-    # most runs in a chunk of several channels are short: look one ahead before looking at all
-    if not np.array_equal(array[at : at + 11], array[at + stride : at + stride + 11]):
-        return 1
-    heads = array[at : at + possible * stride].reshape(possible, stride)[:, :11]
-    differs = np.flatnonzero((heads != heads[0]).any(axis=1))
-    return int(differs[0]) if len(differs) else possible
-
-
-def _batch(spec: ChannelSpec, channel_id: int, rows: ByteRows) -> LogBatch:
-    times: Int64Array = rows[:, 15:23].copy().view("<i8")[:, 0]
-    return LogBatch(spec, channel_id, times, rows)
-
-
-def _take_channel(body: bytes, channels: dict[int, ChannelSpec], schemas: dict[int, str]) -> None:
-    channel = parse_record(records.Channel, body)
-    chunk_class: ChunkClass = "scanner" if channel.topic.startswith("/scanner/") else "other"
-    channels[channel.id] = ChannelSpec(
-        channel.topic, channel.message_encoding, channel.metadata, schemas.get(channel.schema_id), chunk_class
-    )
-
-
-def _take_schema(body: bytes, schemas: dict[int, str]) -> None:
-    schema = parse_record(records.Schema, body)
-    schemas[schema.id] = schema.name
-
-
 # ---------------------------------------------------------------------- merging by time
 
 
@@ -356,6 +274,12 @@ def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], li
         if split < len(batch.log_time_ns):
             rest.append(_slice(batch, split, len(batch.log_time_ns)))
     return ready, rest
+
+
+def _chunk_bytes(held: list[LogBatch]) -> int:
+    """Memory that batches keep: of each the whole chunk that it is a view into."""
+    chunks = {id(batch.rows.base): batch.rows.base for batch in held}
+    return sum(chunk.nbytes for chunk in chunks.values() if isinstance(chunk, np.ndarray))
 
 
 def _slice(batch: LogBatch, first: int, last: int) -> LogBatch:

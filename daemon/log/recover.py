@@ -14,11 +14,12 @@ from typing import BinaryIO
 
 from mcap import records
 
+from daemon.log.chunks import chunk_batches, damage_within, take_description
 from daemon.log.claim import is_being_written
 from daemon.log.durable import sync_directory
 from daemon.log.encode import encode_raw
-from daemon.log.format import SESSION_METADATA, ChannelSpec, LogError
-from daemon.log.reader import RECOVERED, chunk_batches, orphan_damage, read_part_head
+from daemon.log.format import SCHEMAS, SESSION_METADATA, ChannelSpec, LogError
+from daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
 from daemon.log.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
@@ -54,6 +55,14 @@ class RecoveryReport:
     messages: Counter[str] = field(default_factory=Counter)
     damage: list[Damage] = field(default_factory=list)
     messages_lost: int | None = None
+
+    def add_damage(self, damage: Damage) -> None:
+        """Note a stretch that could not be read; beyond a thousand they are one, with the bytes of all."""
+        if len(self.damage) < MAX_DAMAGE:
+            self.damage.append(damage)
+            return
+        last = self.damage[-1]
+        self.damage[-1] = Damage(last.offset, last.length + damage.length, "here and in many places behind")
 
     @property
     def whole(self) -> bool:
@@ -134,25 +143,26 @@ def _pass(path: Path, copy: Path | None) -> RecoveryReport:
     report = RecoveryReport(path)
     writer = None if copy is None else PartWriter(copy, head.info, head.number, compression="auto")
     channels: dict[int, ChannelSpec] = {}
-    schemas: dict[int, str] = {}
+    schemas: dict[int, records.Schema] = {}
     end: Record | None = None
     try:
         with path.open("rb") as file:
             size = path.stat().st_size
             for found in scan(file, size):
                 if isinstance(found, Damage):
-                    report.damage.append(found)
+                    report.add_damage(found)
                     end = None
                 elif found.opcode == OP_CHUNK:
                     _copy_chunk(found, writer, channels, schemas, report)
                 elif found.opcode in (OP_CHANNEL, OP_SCHEMA):
-                    list(chunk_batches(_as_chunk(found), channels, schemas))
+                    _take_description(found, channels, schemas, report)
                 elif found.opcode == OP_DATA_END:
                     end = found
                 elif writer is not None:
                     _copy_outside(found, writer)
             said = None if end is None else _messages_said(file, end, size)
-            report.messages_lost = None if said is None else said - report.messages.total()
+            saved = report.messages.total()
+            report.messages_lost = None if said is None or said < saved else said - saved
         if writer is not None:
             writer.finish()
     finally:
@@ -165,33 +175,52 @@ def _messages_said(file: BinaryIO, end: Record, size: int) -> int | None:
     """How many messages the statistics of a file whose end is whole speak of; None where it has none."""
     for found in summary_records(file, end.offset + end.length, size):
         if found.opcode == OP_STATISTICS:
-            return parse_record(records.Statistics, found.body).message_count
+            try:
+                return parse_record(records.Statistics, found.body).message_count
+            except LogError:
+                return None
     return None
+
+
+def _take_description(
+    found: Record, channels: dict[int, ChannelSpec], schemas: dict[int, records.Schema], report: RecoveryReport
+) -> None:
+    try:
+        take_description(found, channels, schemas)
+    except LogError as error:
+        report.add_damage(Damage(found.offset, found.length, str(error)))
 
 
 def _copy_chunk(
     found: Record,
     writer: PartWriter | None,
     channels: dict[int, ChannelSpec],
-    schemas: dict[int, str],
+    schemas: dict[int, records.Schema],
     report: RecoveryReport,
 ) -> None:
-    orphans: Counter[int] = Counter()
+    lost: Counter[str] = Counter()
     try:
-        batches = list(chunk_batches(found.body, channels, schemas, orphans=orphans))
+        batches = list(chunk_batches(found.body, channels, schemas, lost=lost))
     except LogError as error:
-        report.damage.append(Damage(found.offset, found.length, str(error)))
+        report.add_damage(Damage(found.offset, found.length, str(error)))
         return
-    if orphans:
-        report.damage.append(orphan_damage(found, orphans))
+    if lost:
+        report.add_damage(damage_within(found, lost))
     report.chunks += 1
     for batch in batches:
         report.messages[batch.channel.topic] += len(batch.units)
         if writer is not None:
+            _copy_schema(batch.channel, schemas, writer)
             writer.add_channel(batch.channel_id, batch.channel)
             writer.add(encode_raw(batch.channel_id, batch.log_time_ns, batch.rows))
     if writer is not None:
         writer.flush()
+
+
+def _copy_schema(channel: ChannelSpec, schemas: dict[int, records.Schema], writer: PartWriter) -> None:
+    """The schema of a channel where it is a stranger's."""
+    if channel.schema is not None and channel.schema not in SCHEMAS:
+        writer.add_schema(next(one for one in schemas.values() if one.name == channel.schema))
 
 
 def _copy_outside(found: Record, writer: PartWriter) -> None:
@@ -202,8 +231,3 @@ def _copy_outside(found: Record, writer: PartWriter) -> None:
         metadata = parse_record(records.Metadata, found.body)
         if metadata.name != SESSION_METADATA:
             writer.add_metadata(metadata.name, metadata.metadata)
-
-
-def _as_chunk(found: Record) -> bytes:
-    """A record outside chunks as if it stood in one."""
-    return bytes([found.opcode]) + len(found.body).to_bytes(8, "little") + found.body

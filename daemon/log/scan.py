@@ -22,9 +22,10 @@ from mcap.exceptions import McapError
 
 from daemon.log.format import MAGIC, LogError
 
-# Chunks of ours are 1 MiB and one block: 16 MiB. A stranger's may be larger; beyond this they are refused.
-MAX_CHUNK_BYTES = 256 << 20
-MAX_RECORD_BYTES = 256 << 20
+# Chunks of ours are 1 MiB and one block: 16 MiB. A stranger's may be larger; beyond this they are refused. Its messages
+# may be as small as 31 bytes, each then an object of several hundred.
+MAX_CHUNK_BYTES = 32 << 20
+MAX_RECORD_BYTES = 64 << 20
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 _COMPRESSION_NAME_MAX_BYTES = 32
@@ -213,6 +214,7 @@ def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True)
         return Record(opcode, offset, total, b"")
     file.seek(offset + _HEAD.size)
     try:
+        _refuse_large_chunk(_CHUNK_HEAD.unpack_from(start)[2], length)
         return Record(opcode, offset, total, unpack_chunk(file.read(length)))
     except LogError as error:
         return Damage(offset, total, str(error), _indexed_messages(file, offset + total, size))
@@ -295,14 +297,20 @@ def unpack_chunk(body: bytes) -> bytes:
     _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
     name = body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name_length]
     stored = body[_CHUNK_HEAD.size + name_length + 8 :]
-    if size > MAX_CHUNK_BYTES:
-        raise LogError(f"chunk claims {size} bytes, more than {MAX_CHUNK_BYTES}")
+    _refuse_large_chunk(size, len(stored))
     records = _decompress(name, stored, size)
     if len(records) != size:
         raise LogError(f"chunk holds {len(records)} bytes instead of {size}")
     if crc32(records) != crc:
         raise LogError("chunk with a wrong CRC" if crc else "chunk without a CRC")
     return records
+
+
+def _refuse_large_chunk(size: int, stored: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise LogError(f"chunk claims {size} bytes, more than {MAX_CHUNK_BYTES}")
+    if stored > MAX_CHUNK_BYTES + MAX_CHUNK_BYTES // 64:  # compression may make it a little longer
+        raise LogError(f"chunk of {stored} bytes, more than {MAX_CHUNK_BYTES}")
 
 
 def _decompress(name: bytes, stored: bytes, size: int) -> bytes:

@@ -57,10 +57,10 @@ class Summary:
         )
         self.chunks.append(index)
 
-    def sections(self, specs: Mapping[int, ChannelSpec]) -> list[tuple[int, list[bytes]]]:
+    def sections(self, specs: Mapping[int, ChannelSpec], schemas: SchemaTable) -> list[tuple[int, list[bytes]]]:
         """The summary's groups: opcode and records, those of the channels that have messages."""
         used = {id_: specs[id_] for id_ in self.messages}
-        schemas = sorted({spec.schema for spec in used.values() if spec.schema is not None})
+        names = sorted({spec.schema for spec in used.values() if spec.schema is not None})
         statistics = records.Statistics(
             attachment_count=len(self.attachments),
             channel_count=len(used),
@@ -70,11 +70,11 @@ class Summary:
             message_end_time=self.end,
             message_start_time=self.start or 0,
             metadata_count=len(self.metadata),
-            schema_count=len(schemas),
+            schema_count=len(names),
         )
         return [
-            (3, [record_bytes(schema_record(name)) for name in schemas]),
-            (4, [record_bytes(channel_record(id_, spec)) for id_, spec in used.items()]),
+            (3, [record_bytes(schemas.record(name)) for name in names]),
+            (4, [record_bytes(schemas.channel_record(id_, spec)) for id_, spec in used.items()]),
             (0x0B, [record_bytes(statistics)]),
             (0x08, [record_bytes(index) for index in self.chunks]),
             (0x0A, [record_bytes(index) for index in self.attachments]),
@@ -89,15 +89,33 @@ def record_bytes(record: records.McapRecord) -> bytes:
     return data
 
 
-def schema_record(name: str) -> records.Schema:
-    return records.Schema(data=SCHEMAS[name], encoding="jsonschema", id=SCHEMA_IDS[name], name=name)
+class SchemaTable:
+    """The schemas of a part by name: ours, and a stranger's that are copied with its messages."""
 
+    def __init__(self) -> None:
+        self._records = {
+            name: records.Schema(data=data, encoding="jsonschema", id=SCHEMA_IDS[name], name=name)
+            for name, data in SCHEMAS.items()
+        }
 
-def channel_record(channel_id: int, spec: ChannelSpec) -> records.Channel:
-    return records.Channel(
-        id=channel_id,
-        topic=spec.topic,
-        message_encoding=spec.message_encoding,
-        metadata=spec.metadata,
-        schema_id=0 if spec.schema is None else SCHEMA_IDS[spec.schema],
-    )
+    def add(self, schema: records.Schema) -> None:
+        """Make a stranger's schema known, under an id of this part; one of a known name is not taken."""
+        if schema.name not in self._records:
+            number = len(self._records) + 1
+            self._records[schema.name] = records.Schema(
+                data=schema.data, encoding=schema.encoding, id=number, name=schema.name
+            )
+
+    def record(self, name: str) -> records.Schema:
+        """The record of a schema."""
+        return self._records[name]
+
+    def channel_record(self, channel_id: int, spec: ChannelSpec) -> records.Channel:
+        """The record of a channel, with its schema's id."""
+        return records.Channel(
+            id=channel_id,
+            topic=spec.topic,
+            message_encoding=spec.message_encoding,
+            metadata=spec.metadata,
+            schema_id=0 if spec.schema is None else self._records[spec.schema].id,
+        )

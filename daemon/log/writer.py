@@ -36,7 +36,7 @@ from daemon.log.format import (
     ChunkClass,
     SessionInfo,
 )
-from daemon.log.summary import ChunkPieces, Summary, channel_record, record_bytes, schema_record
+from daemon.log.summary import ChunkPieces, SchemaTable, Summary, record_bytes
 
 _OP_CHUNK, _OP_FOOTER = 6, 2
 _FIXED_CHUNK_FIELDS = 40  # start u64, end u64, size u64, crc u32, compression length u32, records length u64
@@ -87,6 +87,7 @@ class PartWriter:
         self._specs: dict[int, ChannelSpec] = {}
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
         self._summary = Summary()
+        self._schemas = SchemaTable()
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         claim(self._fd)
         try:
@@ -115,6 +116,10 @@ class PartWriter:
     def add_channel(self, channel_id: int, spec: ChannelSpec) -> None:
         """Make a channel known; it is written with the first chunk that uses it, and every one after."""
         self._specs[channel_id] = spec
+
+    def add_schema(self, schema: records.Schema) -> None:
+        """Make a schema known that is not ours, for the channels that name it."""
+        self._schemas.add(schema)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         """Write a metadata record; raises `LogWriteError`."""
@@ -218,8 +223,8 @@ class PartWriter:
         chunk.blocks[channel_id] = []
         if spec.schema is not None and spec.schema not in chunk.schemas:
             chunk.schemas.add(spec.schema)
-            chunk.append(record_bytes(schema_record(spec.schema)))
-        chunk.append(record_bytes(channel_record(channel_id, spec)))
+            chunk.append(record_bytes(self._schemas.record(spec.schema)))
+        chunk.append(record_bytes(self._schemas.channel_record(channel_id, spec)))
 
     def _close_chunk(self, chunk_class: ChunkClass) -> None:
         chunk = self._chunks.pop(chunk_class)
@@ -280,7 +285,7 @@ class PartWriter:
         """In one piece: a file has its whole end or, where the disk refuses, none of it."""
         data_end = record_bytes(records.DataEnd(data_section_crc=0))
         summary_start = self.bytes_written + len(data_end)
-        sections = self._summary.sections(self._specs)
+        sections = self._summary.sections(self._specs, self._schemas)
         body = b"".join(record for _, group in sections for record in group)
         offsets, position = b"", summary_start
         for opcode, group in sections:

@@ -26,6 +26,8 @@ from drivers.core.parser import ParserCounters
 
 UNDECIDED = 0  # what a measure says while the bytes there are do not tell the length
 FALSE_SYNC = -1  # … when this is no frame after all
+MAX_NAMES = 1024  # of messages that are counted each by itself; a receiver sends a few dozen
+OTHER_NAMES = "other"
 OVER_BOUND = -2  # … when the length it claims is beyond what the protocol knows; counted
 
 
@@ -127,7 +129,7 @@ class Framer:
                 position = start + 1
             elif kind.intact(data := buffer[start:end]):
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
-                self.counters.messages[kind.message_name(data)] += 1
+                self._count(kind.message_name(data))
                 framed += end - start
                 position = end
             else:
@@ -137,6 +139,11 @@ class Framer:
             position = len(buffer)
         self._release(buffer, position, framed)
         return frames
+
+    def _count(self, name: str) -> None:
+        """A good frame by its name; names beyond what devices have are one, since noise makes any."""
+        messages = self.counters.messages
+        messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
 
     def _measure(self, kind: FrameKind, buffer: bytes, start: int, final: bool) -> int:
         """Bytes of the frame at ``start``; one more than there are while undecided; 0 if it is none."""

@@ -1,0 +1,5 @@
+"""Inputs nobody would send: everything that reads bytes of others is run on what a seed and a mutation make.
+
+`parsers` (every driver, found by what it declares), `logs` (reader and recovery), `files` (captures, configuration);
+`engine` runs them. ``python -m tests.fuzz`` is the long run, `test_fuzz` the short one of the suite.
+"""

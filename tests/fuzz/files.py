@@ -1,0 +1,145 @@
+"""Captures and configurations as targets: files that others made, refused in one line or read."""
+
+from __future__ import annotations
+
+import gzip
+import random
+import tempfile
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+
+from daemon.config import load_config
+from daemon.errors import UserError
+from drivers.transports.base import TransportError
+from drivers.transports.capture_file import CaptureTally, read_candump, read_pcap, read_serial
+from tests.drivers.recordings import FIXTURES
+from tests.fuzz.engine import FindingError, Target
+from tests.fuzz.mutation import damage
+
+CONFIG = FIXTURES / "config"
+WORDS = (
+    *(
+        "0",
+        "-1",
+        "1e999",
+        "nan",
+        "inf",
+        "[]",
+        "{}",
+        '""',
+        '"\\u0000"',
+        "true",
+        "9" * 30,
+        '"x/../.."',
+        '"/"',
+        "[[[[1]]]]",
+    ),
+    *(
+        '"udp:0.0.0.0:0"',
+        '"can:socketcan:can0?bitrate=0"',
+        '"serial:?"',
+        '"gnss:x"',
+        '"é"',
+        "1979-05-27",
+        '"/dev/pps0"',
+    ),
+)
+
+
+def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
+    """Readers of captures, each on what begins as its own kind, and the configuration with the files it names."""
+    yield "pcap", lambda: _captures("pcap", _pcaps(), read_pcap)
+    yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
+    yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
+    yield "config", _configuration
+
+
+def _heads(*patterns: str) -> list[bytes]:
+    paths = [path for pattern in patterns for path in sorted(FIXTURES.glob(pattern))]
+    return [gzip.decompress(path.read_bytes())[:3000] for path in paths]
+
+
+def _pcaps() -> list[bytes]:
+    """Beginnings of captures; one gzipped, whose end is missing."""
+    found = _heads("*/*.pcap.gz")
+    return [*found, gzip.compress(found[0])[:-20]]
+
+
+def _captures(name: str, seeds: list[bytes], read: Callable[..., Iterator[object]]) -> Target:
+    def run(data: bytes) -> Iterator[str]:
+        seen = set()
+        with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
+            path = Path(folder, "capture")
+            path.write_bytes(data)
+            for tally in (None, CaptureTally()):
+                try:
+                    for unit in islice(read(path, tally=tally), 5000):
+                        seen.add(f"{type(unit).__name__} {len(getattr(unit, 'data', b'')).bit_length()}")
+                except TransportError as error:
+                    if "\n" in str(error):
+                        raise FindingError(f"more than a line: {error}") from error
+                    seen.add(str(error).removeprefix(str(path))[:24])
+        return iter(seen)
+
+    return Target(name, seeds, lambda rng, base: damage(rng, base, start=rng.choice((0, 0, 20))), run)
+
+
+_TABLE = b"arrival_unix_s,offset,length\n1600000000.25,0,10\n1600000000.5,10,20\n1600000001,30,70\n"
+
+
+def _serial_case() -> bytes:
+    """The table of arrivals and, behind an empty line, the bytes."""
+    return _TABLE + b"\n" + bytes(range(100))
+
+
+def _read_serial(path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    table, _, data = path.read_bytes().partition(b"\n\n")
+    bare, chunks = path.with_name("bytes.bin"), path.with_name("chunks.csv")
+    bare.write_bytes(data)
+    chunks.write_bytes(table)
+    return read_serial(bare, chunks, tally=tally)
+
+
+# --- the configuration ----------------------------------------------------------------------------------------------
+
+_PARTED = b"\n#### FILE ####\n"
+
+
+def _configuration() -> Target:
+    named = [(CONFIG / name).read_bytes() for name in ("imu.dbc", "left.toml")]
+    texts = [CONFIG / "aircraft.toml", *sorted((CONFIG / "bad").glob("*.toml"))]
+    seeds = [_PARTED.join([path.read_bytes(), *named]) for path in texts]
+    return Target("config", seeds, _changed_configuration, _load)
+
+
+def _changed_configuration(rng: random.Random, base: bytes) -> bytes:
+    """A value of the configuration, or bytes of it or of a file that it names."""
+    parts = base.split(_PARTED)
+    at = rng.choice((0, 0, 0, rng.randrange(len(parts))))
+    lines = parts[at].split(b"\n")
+    for _ in range(rng.randrange(1, 4)):
+        place = rng.randrange(len(lines))
+        key, sign, _ = lines[place].partition(b" = ")
+        if at == 0 and sign and rng.random() < 0.7:
+            lines[place] = key + sign + rng.choice(WORDS).encode()
+        elif rng.random() < 0.5:
+            lines.insert(rng.randrange(len(lines)), lines[place])
+        else:
+            lines[place] = damage(rng, lines[place])
+    parts[at] = b"\n".join(lines)
+    return _PARTED.join(parts)
+
+
+def _load(data: bytes) -> Iterator[str]:
+    text, *files = data.split(_PARTED)
+    with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
+        for name, content in zip(("imu.dbc", "left.toml"), files, strict=False):
+            Path(folder, name).write_bytes(content)
+        path = Path(folder, "swath.toml")
+        path.write_bytes(text)
+        try:
+            config = load_config(path)
+        except UserError as error:
+            return iter({line.removeprefix(str(path))[:30] for line in error.message.splitlines()})
+        return iter({device.source for device in config.devices()})

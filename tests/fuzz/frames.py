@@ -1,0 +1,215 @@
+"""Frames with another content and a good checksum: what a checksum guards is decoded only behind it."""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+
+from drivers.core import frame_kinds
+from drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from drivers.core.framing import FrameKind, Framer
+from drivers.core.parser import ParserCounters
+from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
+
+KINDS: dict[str, FrameKind] = {kind.name: kind for kind in vars(frame_kinds).values() if isinstance(kind, FrameKind)}
+KEPT_OF_A_NAME = 6  # frames of one message in a pool
+
+NMEA_FIELDS = (
+    *("", "-", "0", "-0", "00", "1", "-1", "9" * 9, "9" * 30, "-" + "9" * 40, "1e999", "1e5", "nan", "inf", "-inf"),
+    *("0.0", ".", "..", "1.", ".5", "1.2.3", "240000", "235960", "235959.999999999", "999999", "000000.00", "310299"),
+    *("320100", "290223", "9100.0", "18060.0", "2460.0", "N", "S", "E", "W", "X", "A", "V", "M", "T", "K", "R", "+1"),
+    *("1_0", " 1", "1 ", "0x1", "FF", "65536", "4294967296", "0.000000000000000000001"),
+)
+
+
+def _seal_nmea(frame: bytes) -> bytes:
+    body = frame[1:].partition(b"*")[0].rstrip(b"\r\n")
+    return frame[:1] + body + b"*%02X\r\n" % nmea_xor(body)
+
+
+def _seal_ubx(frame: bytes) -> bytes:
+    payload = frame[6:-2][:8192]
+    content = frame[2:4].ljust(2, b"\1") + struct.pack("<H", len(payload)) + payload
+    return b"\xb5b" + content + bytes(ubx_fletcher(content))
+
+
+def _seal_rtcm3(frame: bytes) -> bytes:
+    payload = frame[3:-3][:1023]
+    content = b"\xd3" + struct.pack(">H", len(payload)) + payload
+    return content + crc24q(content).to_bytes(3, "big")
+
+
+def _seal_novatel(frame: bytes) -> bytes:
+    content = bytearray(b"\xaaD\x12" + frame[3:-4].ljust(25, b"\0"))
+    if not 28 <= content[3] <= min(64, len(content)):
+        content[3] = 28
+    del content[content[3] + 24 * 1024 :]
+    struct.pack_into("<H", content, 8, len(content) - content[3])
+    return bytes(content) + struct.pack("<I", crc32_novatel(content))
+
+
+def _seal_novatel_short(frame: bytes) -> bytes:
+    content = bytearray(b"\xaaD\x13" + frame[3:-4].ljust(9, b"\0")[:264])
+    content[3] = len(content) - 12
+    return bytes(content) + struct.pack("<I", crc32_novatel(content))
+
+
+def _seal_xbus(frame: bytes) -> bytes:
+    identifier = frame[2:3] if frame[2:3] in [bytes([one]) for one in frame_kinds.XBUS_IDENTIFIERS] else b"\x36"
+    payload = frame[6 if frame[3:4] == b"\xff" else 4 : -1][:2048]
+    length = bytes([len(payload)]) if len(payload) < 255 else b"\xff" + struct.pack(">H", len(payload))
+    content = b"\xff" + identifier + length + payload
+    return b"\xfa" + content + bytes([-sum(content) & 0xFF])
+
+
+def _seal_sbf(frame: bytes) -> bytes:
+    content = frame[4:6].ljust(2, b"\0") + b"\0\0" + frame[8 : 16 * 1024]
+    content += bytes(-len(content) % 4)
+    content = content[:2] + struct.pack("<H", len(content) + 4) + content[4:]
+    return b"$@" + struct.pack("<H", crc16_ccitt(content)) + content
+
+
+SEALS: dict[str, Callable[[bytes], bytes]] = {
+    "nmea": _seal_nmea,
+    "ubx": _seal_ubx,
+    "rtcm3": _seal_rtcm3,
+    "novatel": _seal_novatel,
+    "novatel-short": _seal_novatel_short,
+    "xbus": _seal_xbus,
+    "sbf": _seal_sbf,
+}
+"""Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
+
+
+def split_frames(data: bytes) -> list[tuple[str, bytes]]:
+    """A stream as frames by kind and what lies between them (kind empty)."""
+    framer = Framer(tuple(KINDS.values()), ParserCounters())
+    pieces: list[tuple[str, bytes]] = []
+    position = 0
+    for frame in [*framer.feed(data, 0), *framer.close()]:
+        start = data.index(frame.data, position)
+        if start > position:
+            pieces.append(("", data[position:start]))
+        pieces.append((frame.kind, frame.data))
+        position = start + len(frame.data)
+    return [*pieces, ("", data[position:])] if position < len(data) else pieces
+
+
+class FramePool:
+    """A few frames of every message in the recordings, whichever are frequent."""
+
+    def __init__(self, recordings: Sequence[bytes]) -> None:
+        by_name: dict[tuple[str, str], list[bytes]] = {}
+        for recording in recordings:
+            for kind, data in split_frames(recording):
+                if kind:
+                    kept = by_name.setdefault((kind, KINDS[kind].message_name(data)), [])
+                    if len(kept) < KEPT_OF_A_NAME and data not in kept:
+                        kept.append(data)
+        self._by_name = [(kind, frames) for (kind, _), frames in sorted(by_name.items())]
+
+    def draw(self, rng: random.Random) -> tuple[str, bytes]:
+        """A frame, of each message as often as of any other."""
+        if not self._by_name:
+            return "", rng.randbytes(rng.randrange(1, 60))
+        kind, frames = rng.choice(self._by_name)
+        return kind, rng.choice(frames)
+
+
+def mutate_stream(rng: random.Random, base: bytes, pool: FramePool) -> bytes:
+    """Some frames of the base and of the pool, most of them changed and sealed anew, some left broken."""
+    pieces = split_frames(base[:LARGEST_CASE_BYTES]) or [("", base)]
+    first = rng.randrange(len(pieces))
+    chosen = pieces[first : first + 1 + int(12 * rng.random() ** 2)]
+    for _ in range(rng.choice((0, 0, 1, 2, 4))):
+        chosen.insert(rng.randrange(len(chosen) + 1), pool.draw(rng))
+    if rng.random() < 0.1:
+        rng.shuffle(chosen)
+    if rng.random() < 0.2:
+        chosen += [rng.choice(chosen)] * rng.randrange(1, 4)
+    data = b"".join(_changed(rng, kind, piece) if rng.random() < 0.6 else piece for kind, piece in chosen)
+    if rng.random() < 0.08:
+        data = damage(rng, data)
+    return data[:LARGEST_CASE_BYTES]
+
+
+def _changed(rng: random.Random, kind: str, frame: bytes) -> bytes:
+    seal = SEALS.get(kind)
+    if seal is None:
+        return damage(rng, frame)
+    if kind == "nmea":
+        return seal(_changed_sentence(rng, frame))
+    # what a frame is (identifier, time) stands in its head, so that part is spared mostly
+    start = 2 if rng.random() < 0.15 else min(6, len(frame) - 1)
+    return seal(damage(rng, frame, resize=rng.random() < 0.15, start=start))
+
+
+def _changed_sentence(rng: random.Random, sentence: bytes) -> bytes:
+    fields = sentence.partition(b"*")[0].split(b",")
+    for _ in range(rng.randrange(1, 4)):
+        at = rng.randrange(len(fields))
+        kind = rng.randrange(8)
+        if kind < 4 and at:
+            fields[at] = rng.choice(NMEA_FIELDS).encode()
+        elif kind == 4:
+            text = bytearray(fields[at] or b"0")
+            text[rng.randrange(len(text))] = rng.randrange(0x2D, 0x5B)
+            fields[at] = bytes(text)
+        elif kind == 5:
+            fields[at:at] = [rng.choice(NMEA_FIELDS).encode()] * rng.choice((1, 2, 40))
+        elif kind == 6 and len(fields) > 1:
+            del fields[rng.randrange(1, len(fields))]
+        elif kind == 7:
+            fields[0] = fields[0][:3] + rng.choice(
+                (b"GGA", b"RMC", b"ZDA", b"VTG", b"GST", b"HDT", rng.randbytes(2).hex().upper().encode())
+            )
+    return b",".join(fields)
+
+
+# --- datagrams ------------------------------------------------------------------------------------------------------
+
+_CRC64_POLYNOMIAL = 0xC96C5795D7870F42  # of ECMA-182, reflected, as in .xz
+
+
+def _crc64_table() -> list[int]:
+    table = []
+    for value in range(256):
+        for _ in range(8):
+            value = value >> 1 ^ (_CRC64_POLYNOMIAL if value & 1 else 0)
+        table.append(value)
+    return table
+
+
+_CRC64 = _crc64_table()
+
+
+def crc64_xz(data: bytes) -> int:
+    """CRC-64 as the .xz format has it."""
+    crc = (1 << 64) - 1
+    for byte in data:
+        crc = _CRC64[(crc ^ byte) & 0xFF] ^ crc >> 8
+    return crc ^ ((1 << 64) - 1)
+
+
+TAILS: tuple[tuple[int, Callable[[bytes], int]], ...] = ((4, zlib.crc32), (8, crc64_xz))
+
+
+def tail_of(datagrams: Sequence[bytes]) -> Callable[[bytes], bytes]:
+    """What makes a changed datagram good again: the checksum that the recorded ones are seen to end in, if any."""
+    sample = [datagram for datagram in datagrams[:8] if len(datagram) > 16]
+    for width, checksum in TAILS:
+        if sample and all(checksum(one[:-width]) == int.from_bytes(one[-width:], "little") for one in sample):
+            return lambda datagram: datagram[:-width] + checksum(datagram[:-width]).to_bytes(width, "little")
+    return lambda datagram: datagram
+
+
+def changed_datagram(rng: random.Random, datagram: bytes, seal: Callable[[bytes], bytes]) -> bytes:
+    """A datagram with a few fields changed, near its beginning rather than elsewhere, sealed again mostly."""
+    if rng.random() < 0.3:
+        head = damage(rng, datagram[:64], resize=False)
+        changed = head + datagram[64:]
+    else:
+        changed = damage(rng, datagram, resize=rng.random() < 0.1)
+    return seal(changed) if rng.random() < 0.95 else changed + bounds(rng)

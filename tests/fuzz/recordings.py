@@ -1,0 +1,112 @@
+"""What a driver is made with and what its device has sent, found by its page and its folder in fixtures/.
+
+The settings are those of the example on ``docs/devices/<protocol>.md``; a file they name is taken by its name, else by
+its suffix, from the driver's fixtures.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import tomllib
+from itertools import accumulate
+from pathlib import Path
+
+from daemon.config.config import Config, plain_table
+from daemon.config.tables import Tables
+from drivers.core.can_frames import encode_can_frame
+from drivers.core.parser import DeviceSettings, Driver, Parser
+from drivers.imu.dbc import DbcParser
+from drivers.transports.base import TransportError
+from drivers.transports.capture_file import read_candump, read_pcap
+from tests.drivers.recordings import FIXTURES
+from tests.drivers.srep_cases import split_datagrams
+
+PAGES = FIXTURES.parent / "docs/devices"
+MOST_OF_A_FILE_BYTES = 256 * 1024
+MOST_UNITS = 3000
+MOST_VARIANTS = 4
+NO_RECORDING = {".md", ".json", ".jsonl", ".csv", ".npz", ".pcd", ".chk", ".ascii", ".golden", ".dbc", ".toml", ".xml"}
+
+
+def folders_of(driver: Driver) -> list[Path]:
+    """The driver's fixtures and its family's, the nearest first."""
+    names = accumulate(driver.protocol.split("-"), lambda head, part: f"{head}-{part}")
+    return [folder for name in reversed(list(names)) if (folder := FIXTURES / name).is_dir()]
+
+
+def _files_of(driver: Driver) -> list[Path]:
+    return [path for folder in folders_of(driver) for path in sorted(folder.iterdir()) if path.is_file()]
+
+
+def _suffix(path: Path) -> str:
+    return path.with_suffix("").suffix if path.suffix == ".gz" else path.suffix
+
+
+def _content(path: Path) -> bytes:
+    return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+
+
+def settings_of(driver: Driver) -> list[DeviceSettings]:
+    """Of the page's example, once for each file that could be the one it names."""
+    source = f"{driver.kind}/fuzz"
+    page = (PAGES / f"{driver.protocol}.md").read_text()
+    for block in re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S):
+        config = Config(Tables.model_validate({"session": {"name": "fuzz"}, **tomllib.loads(block)}), Path("x"), block)
+        for kind, _, table in config.device_tables():
+            if kind == driver.kind and table.protocol == driver.protocol:
+                named = {key: path for key, path in config.files_of(table).items() if key != "calibration"}
+                variants = [DeviceSettings(source, plain_table(table))]
+                for key, path in named.items():
+                    contents = _candidates(driver, path)
+                    variants += [DeviceSettings(source, plain_table(table), {key: content}) for content in contents]
+                    variants = variants if not driver.needs else variants[1:]
+                return variants
+    return [DeviceSettings(source)]
+
+
+def _candidates(driver: Driver, path: Path) -> list[bytes]:
+    there = [*_files_of(driver), *sorted((FIXTURES / "config").iterdir())]
+    named = [one for one in there if one.name.removesuffix(".gz") == path.name]
+    alike = [one for one in there if _suffix(one) == path.suffix]
+    return [_content(one) for one in (named or alike)[:MOST_VARIANTS]]
+
+
+def streams_of(driver: Driver) -> list[bytes]:
+    """What a serial device sent, a file each; of a receiver also what others lay between."""
+    others = [FIXTURES / "rtcm3", FIXTURES / "nmea"] if driver.kind == "gnss" else []
+    paths = _files_of(driver) + [path for folder in others for path in sorted(folder.iterdir())[:6]]
+    found = [path for path in paths if _suffix(path).lower() not in NO_RECORDING and path.suffix != ".pcap"]
+    return [_content(path)[:MOST_OF_A_FILE_BYTES] for path in found]
+
+
+def packets_of(driver: Driver, parser: Parser) -> list[list[bytes]]:
+    """Datagrams or CAN frames, a list a recording; of a CAN unit without one, frames under its identifiers."""
+    read = read_candump if "can" in driver.transports else read_pcap
+    found = []
+    for path in _files_of(driver):
+        if _suffix(path).lower() in NO_RECORDING:
+            continue
+        units: list[bytes] = []
+        try:
+            for unit in read(path):
+                units.append(unit.data)
+                if len(units) == MOST_UNITS:
+                    break
+        except TransportError:
+            pass
+        if not units and driver.protocol == "srep" and path.suffix == ".bin":
+            units = split_datagrams(path.read_bytes())
+        if units:
+            found.append(units)
+    return found or [_frames_of_map(parser)]
+
+
+def _frames_of_map(parser: Parser) -> list[bytes]:
+    assert isinstance(parser, DbcParser), "a driver without a recording"
+    parts = parser._map.parts
+    return [
+        encode_can_frame(part.can_id & 0x1FFF_FFFF, bytes([cycle, 0] * 4), extended=part.can_id >> 31 == 1)
+        for cycle in range(20)
+        for part in parts
+    ]
