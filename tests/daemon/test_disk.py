@@ -112,7 +112,7 @@ def failing_disk(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
     subprocess.run(["mkfs.ext4", "-q", "-F", str(image)], check=True)
     mounted = ["mount", "-o", "loop,errors=remount-ro", str(image), str(folder)]
     if subprocess.run(mounted, check=False).returncode != 0:
-        pytest.skip("this machine has no loop devices: no disk of which one can say that it fails")
+        pytest.fail("this test needs loop devices (modprobe loop): no other disk can be told to fail")
     number = os.stat(folder).st_dev
     device = Path(f"/sys/dev/block/{os.major(number)}:{os.minor(number)}").resolve().name
     try:
