@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.fuzz.engine import Report, Target, check, fuzz, save_crashes
-from tests.fuzz.targets import all_targets
 
 CRASHES = Path("fuzz/crashes")
 
@@ -30,7 +29,7 @@ def main() -> int:
     parser.add_argument("--input", type=Path, help="run this input only")
     parser.add_argument("--list", action="store_true")
     given = parser.parse_args()
-    targets = all_targets()
+    targets = _targets(guided=given.guided)
     if unknown := set(given.targets) - set(targets):
         parser.error(f"no target {min(unknown)}; there are: {', '.join(targets)}")
     names = given.targets or list(targets)
@@ -48,6 +47,20 @@ def main() -> int:
         else:
             found += _mutated(targets[name](), given.seconds, given.seed)
     return int(found > 0)
+
+
+def _targets(*, guided: bool) -> dict[str, Callable[[], Target]]:
+    """All targets; what they run is instrumented while it is imported."""
+    if guided:
+        import atheris  # type: ignore[import-untyped,import-not-found,unused-ignore]
+
+        with atheris.instrument_imports(include=["drivers", "daemon", "georef"]):
+            from tests.fuzz.targets import all_targets
+
+            return all_targets()  # imports the drivers
+    from tests.fuzz.targets import all_targets
+
+    return all_targets()
 
 
 def _mutated(target: Target, seconds: float, seed: int) -> int:
@@ -88,7 +101,6 @@ def _guided(build: Callable[[], Target], name: str, seconds: float, seed: int) -
         "-max_len=65536",
         "-print_final_stats=1",
     ]
-    atheris.instrument_all()
     atheris.Setup([name, *options, f"-artifact_prefix={crashes}/", str(corpus)], run, custom_mutator=mutate)
     atheris.Fuzz()
 
