@@ -338,6 +338,7 @@ class TestCommand:
         assert not (tmp_path / "swath-export.json").exists()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_memory_stays_flat(tmp_path: Path) -> None:
     """Files are read and written in a stream: four times the datagrams need no more memory."""

@@ -225,6 +225,7 @@ def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path)
     assert "nothing has been written for" in found["sentence"]
 
 
+@pytest.mark.long
 def test_the_log_of_another_computer_is_judged_by_its_growth(
     tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -374,6 +375,7 @@ def test_a_costly_parser_is_given_a_share_only(tmp_path: Path) -> None:
     assert decoding.plain()["share"] == round(decoding.share, 3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_memory_is_bounded_and_processor_little(tmp_path: Path, logs: Path) -> None:
     """Over some 100 MB its memory stands still; it costs less than the recorder it looks at would notice."""
