@@ -165,7 +165,7 @@ def there_and_back(folder: Path, config: Config, units: list[Unit]) -> None:
     second = export(folder / "back", folder / "out2")
     names = {path.name for path in report.folder.iterdir() if path.is_file()} - {MANIFEST}
     for name in names:
-        if len(report.units) == 1 or not name.endswith(".pcap"):  # a head's two ports may be laid otherwise
+        if len(report.units) == 1 or ".pcap" not in name:  # a head's two ports may be laid otherwise
             assert (second.folder / name).read_bytes() == (report.folder / name).read_bytes(), name
 
 
