@@ -137,6 +137,7 @@ sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 ask_receive_buffer(sock, 32 << 20)
 sock.bind(("127.0.0.1", port))
 reader = MessageReader(65535, 256, peers=False)
+reader._expected = int(sys.argv[3])
 fd = os.open(path, os.O_WRONLY | os.O_CREAT)
 print("ready", flush=True)
 total = 0
@@ -144,9 +145,8 @@ while True:
     time.sleep(0.004)
     while count := reader.read(sock.fileno()):
         total += count
-        lengths = reader._headers["len"][:count]
-        os.write(fd, reader._units[:count, : int(lengths[0])].copy())
-        if count < reader.slots:
+        os.write(fd, reader.rows(count))
+        if count < reader.offered:
             break
 """
 
@@ -155,7 +155,7 @@ def bare_udp(length: int, rate: float, seconds: float) -> float:
     """CPU percent of the building blocks alone."""
     with tempfile.TemporaryDirectory() as name:
         port = free_port()
-        command = [sys.executable, "-c", BARE, str(port), f"{name}/raw"]
+        command = [sys.executable, "-c", BARE, str(port), f"{name}/raw", str(length)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         try:
             assert process.stdout is not None
@@ -308,7 +308,7 @@ def measure(seconds: float) -> list[Figure]:
         figures.append(figure)
     figure = record_udp(1206, 110000.0, 10.0)
     figure.limit_cpu_percent = bare_udp(1206, 110000.0, 5.0)
-    return [*figures, figure, stall(6.0), with_others(20.0), no_data(10.0)]
+    return [*figures, figure, stall(6.0), with_others(seconds), no_data(10.0)]
 
 
 def median(runs: list[Figure]) -> Figure:

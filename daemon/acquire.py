@@ -303,7 +303,8 @@ class UnitReceiver(Receiver):
             sequence = self._sequences[channel_id]
             self._sequences[channel_id] = (sequence + len(units)) & 0xFFFFFFFF
             self.note_units(len(units), length, int(times[-1]))
-            self.hand_over(encode_block(channel_id, sequence, times, units))
+            rows = None if block.rows is None else block.rows[first : first + step]
+            self.hand_over(encode_block(channel_id, sequence, times, units, rows=rows))
 
     def _channel(self, peer: tuple[str, int] | None) -> int:
         channel_id = self._channel_ids.get(peer)

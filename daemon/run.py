@@ -35,6 +35,8 @@ from drivers.transports.uri import TransportSpec, open_transport, parse_pps
 from georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
+KEPT_BYTES = 64 << 20  # freed memory that an arena keeps
+LARGEST_KEPT_BYTES = 32 << 20  # glibc's own largest
 
 _ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp"}
 
@@ -203,6 +205,18 @@ def lock_memory() -> None:
     ctypes.CDLL(None, use_errno=True).mlockall(current | future | on_fault)
 
 
+def keep_freed_memory() -> None:
+    """Have glibc use freed memory again instead of giving it back page by page, to be faulted in anew (mallopt(3)).
+
+    Set before threads start. Another C library has no such call, and does without.
+    """
+    trim_threshold, mmap_threshold = -1, -3
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(trim_threshold, KEPT_BYTES)
+        mallopt(mmap_threshold, LARGEST_KEPT_BYTES)
+
+
 def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEUE_BYTES) -> ExitCode:
     """Record until SIGTERM, SIGINT or for ``seconds``.
 
@@ -217,6 +231,7 @@ def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEU
             time.sleep(0.05)
             assembly = assemble(config, queue_bytes)
         lock_memory()
+        keep_freed_memory()
         whole = asyncio.run(RecorderProcess(assembly, ServiceManager()).run(seconds))
         return ExitCode.OK if whole else ExitCode.PROBLEM
     finally:

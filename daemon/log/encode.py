@@ -63,6 +63,7 @@ def encode_block(
     log_time_ns: Int64Array,
     units: ByteRows,
     publish_time_ns: Int64Array | None = None,
+    rows: ByteRows | None = None,
 ) -> EncodedBlock:
     """Messages of equal length, one a unit.
 
@@ -72,6 +73,8 @@ def encode_block(
         log_time_ns: (n,).
         units: (n, length) uint8.
         publish_time_ns: (n,); the log time where None.
+        rows: (n, 31 + length) contiguous memory the units lie in already, behind room for the headers, which are
+            written there.
     """
     count, length = units.shape
     if count == 1:  # a read of a serial port: NumPy's rows would cost several times the message
@@ -82,16 +85,17 @@ def encode_block(
         head = _MESSAGE.pack(_OP_MESSAGE, content, channel_id, sequence, log_time, publish_time)
         return EncodedBlock(channel_id, 1, log_time_ns, _FIRST, memoryview(head + units.tobytes()))
     layout = _layout(length)
-    rows = np.empty(count, layout)
-    rows["opcode"] = _OP_MESSAGE
-    rows["length"] = MESSAGE_HEADER_BYTES - 9 + length
-    rows["channel"] = channel_id
-    rows["sequence"] = (first_sequence + np.arange(count, dtype=np.uint64)) & 0xFFFFFFFF
-    rows["log_time"] = log_time_ns
-    rows["publish_time"] = log_time_ns if publish_time_ns is None else publish_time_ns
-    rows["data"] = units
+    records = np.empty(count, layout) if rows is None else rows.view(layout)[:, 0]
+    records["opcode"] = _OP_MESSAGE
+    records["length"] = MESSAGE_HEADER_BYTES - 9 + length
+    records["channel"] = channel_id
+    records["sequence"] = (first_sequence + np.arange(count, dtype=np.uint64)) & 0xFFFFFFFF
+    records["log_time"] = log_time_ns
+    records["publish_time"] = log_time_ns if publish_time_ns is None else publish_time_ns
+    if rows is None:
+        records["data"] = units
     offsets = np.arange(count, dtype=np.int64) * layout.itemsize
-    return EncodedBlock(channel_id, count, log_time_ns, offsets, rows.view(np.uint8).data)
+    return EncodedBlock(channel_id, count, log_time_ns, offsets, records.view(np.uint8).data)
 
 
 def encode_raw(channel_id: int, log_time_ns: Int64Array, rows: ByteRows) -> EncodedBlock:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 from georef.records import ByteRows, Int64Array
 
+HEAD_ROOM_BYTES = 31  # of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
+
 
 class TransportError(OSError):
     """The device cannot be opened or has gone; the text is one line: what, where, what would be right."""
@@ -26,11 +28,14 @@ class UnitBlock:
         kernel_realtime_ns: (n,) CLOCK_REALTIME receive stamps; None where the kernel gives none (serial), and 0 in
             the rows that came without one.
         peer: (address, port) of a UDP sender; None elsewhere.
+        rows: (n, `HEAD_ROOM_BYTES` + length) the memory that ``units`` lie in, without gaps, the receiver's for good:
+            the room before each unit may be written to. None where there is no such room.
     """
 
     units: ByteRows
     kernel_realtime_ns: Int64Array | None = None
     peer: tuple[str, int] | None = None
+    rows: ByteRows | None = None
 
 
 @dataclass(slots=True)

@@ -127,7 +127,7 @@ class SocketCanTransport(DescriptorTransport):
                 self._fail_after(blocks, TransportError(self._why(error)))
                 break
             blocks += self._reader.blocks(count)
-            if count < self._reader.slots:
+            if count < self._reader.offered:
                 break
         for block in blocks:
             self._count_errors(block)

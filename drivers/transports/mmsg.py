@@ -1,4 +1,4 @@
-"""Many datagrams in one system call: recvmmsg(2) into preallocated slots, stamps and senders read as arrays.
+"""Many datagrams in one system call: recvmmsg(2) into slots laid out before, stamps and senders read as arrays.
 
 Used for UDP and for SocketCAN, whose sockets differ only in the length of a unit and in having a sender. The layouts
 are those of <sys/socket.h>: `struct mmsghdr`, `struct iovec` and the one control message that is asked for,
@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transports.base import UnitBlock
+from drivers.transports.base import HEAD_ROOM_BYTES, UnitBlock
 from georef.records import ByteRows, Int64Array
 
 SO_TIMESTAMPNS = 35  # also SCM_TIMESTAMPNS, <asm-generic/socket.h>
@@ -25,6 +25,9 @@ SO_RCVBUFFORCE = 33
 SO_MEMINFO = 55  # nine u32, <linux/sock_diag.h>
 SK_MEMINFO_DROPS = 8
 PEER_BYTES = 16  # struct sockaddr_in
+MEMORY_BYTES = 2 << 20  # taken at once; it is given back when the last block in it is written
+LEAST_OFFERED = 32  # slots; with fewer left a read begins new memory
+FIRST_EXPECTED_BYTES = 1248
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _MMSGHDR = np.dtype(  # struct msghdr in whole words, then msg_len
@@ -47,32 +50,37 @@ _recvmmsg.restype = ctypes.c_int
 
 
 class MessageReader:
-    """Slots for ``slots`` datagrams of at most ``unit_bytes`` each; one reader serves one thread.
+    """Receives up to ``slots`` datagrams of at most ``unit_bytes`` each at once; one reader serves one thread.
 
-    The slots are anonymous memory: only pages that a datagram has touched count. They are spread over the cache by a
-    stride that is no power of two.
+    Units are received where they will stand in the log: one after the other, with room for a message's header before
+    each, in memory that goes along with the blocks. That takes their length to be known, so the length of the last one
+    is expected of the next; what is longer runs over into slots of the reader's own, and units of another length than
+    the expected are copied.
     """
 
     def __init__(self, unit_bytes: int, slots: int, *, peers: bool) -> None:
-        stride = -(-unit_bytes // 64) * 64 + 64
         self.slots = slots
-        self._memory = mmap.mmap(-1, slots * stride)
-        self._units: ByteRows = np.frombuffer(self._memory, np.uint8).reshape(slots, stride)
+        self.offered = 0  # slots of the last read
+        self._unit_bytes = unit_bytes
+        self._overflow: ByteRows = np.frombuffer(mmap.mmap(-1, slots * unit_bytes), np.uint8).reshape(slots, unit_bytes)
+        self._memory = np.empty(0, np.uint8)
+        self._taken = 0  # bytes of it that blocks have
+        self._expected = min(unit_bytes, FIRST_EXPECTED_BYTES)
         self._peers = np.zeros((slots, PEER_BYTES), np.uint8)
         self._peer_keys: NDArray[np.uint64] = self._peers.view(np.uint64)[:, 0]  # family, port, address
         self._stamps = np.zeros(slots, _STAMP)
         self._headers = np.zeros(slots, _MMSGHDR)
-        self._iovecs = np.zeros(slots, _IOVEC)
+        self._iovecs = np.zeros((slots, 2), _IOVEC)
+        self._number = np.arange(slots, dtype=np.uintp)
         self._peer_names: dict[int, tuple[str, int]] = {}
         self._with_peers = peers
-        self._lay_out(unit_bytes, stride)
+        self._lay_out()
 
-    def _lay_out(self, unit_bytes: int, stride: int) -> None:
-        row = np.arange(self.slots, dtype=np.uintp)
-        self._iovecs["base"] = self._units.ctypes.data + row * stride
-        self._iovecs["len"] = unit_bytes
-        self._headers["iov"] = self._iovecs.ctypes.data + row * _IOVEC.itemsize
-        self._headers["iovlen"] = 1
+    def _lay_out(self) -> None:
+        row = self._number
+        self._iovecs["base"][:, 1] = self._overflow.ctypes.data + row * self._unit_bytes
+        self._headers["iov"] = self._iovecs.ctypes.data + row * (2 * _IOVEC.itemsize)
+        self._headers["iovlen"] = 2
         self._headers["control"] = self._stamps.ctypes.data + row * _STAMP.itemsize
         self._headers["controllen"] = _STAMP.itemsize
         if self._with_peers:
@@ -81,12 +89,13 @@ class MessageReader:
         self._headers_at = self._headers.ctypes.data
 
     def read(self, fd: int) -> int:
-        """Fill slots with what ``fd`` holds, without waiting; the number filled.
+        """Fill slots with what ``fd`` holds, without waiting; the number filled, of ``offered``.
 
         Raises:
             OSError: of the call, other than that there is nothing or that a signal came.
         """
-        count: int = _recvmmsg(fd, self._headers_at, self.slots, socket.MSG_DONTWAIT, None)
+        self._offer()
+        count: int = _recvmmsg(fd, self._headers_at, self.offered, socket.MSG_DONTWAIT, None)
         if count >= 0:
             return count
         number = ctypes.get_errno()
@@ -94,8 +103,24 @@ class MessageReader:
             return 0
         raise OSError(number, os.strerror(number))
 
+    def _offer(self) -> None:
+        """Lay the slots of the next read behind what blocks have, or into new memory where too little is left."""
+        stride = HEAD_ROOM_BYTES + self._expected
+        least = min(self.slots, LEAST_OFFERED) * stride
+        if len(self._memory) - self._taken < least:
+            self._memory, self._taken = np.empty(max(MEMORY_BYTES, least), np.uint8), 0
+        self.offered = min(self.slots, (len(self._memory) - self._taken) // stride)
+        at = self._memory.ctypes.data + self._taken + HEAD_ROOM_BYTES
+        self._iovecs["base"][: self.offered, 0] = at + self._number[: self.offered] * stride
+        self._iovecs["len"][: self.offered] = self._expected, self._unit_bytes - self._expected
+
+    def rows(self, count: int) -> ByteRows:
+        """(count, room + expected length) the first slots of the last read as they lie in memory."""
+        stride = HEAD_ROOM_BYTES + self._expected
+        return self._memory[self._taken : self._taken + count * stride].reshape(count, stride)
+
     def blocks(self, count: int) -> list[UnitBlock]:
-        """The first ``count`` slots as blocks: runs of equal length and sender, copied out of the slots, in order."""
+        """The first ``count`` slots as blocks: runs of equal length and sender, in order."""
         if count == 0:
             return []
         lengths = self._headers["len"][:count]
@@ -105,12 +130,20 @@ class MessageReader:
             keys = self._peer_keys[:count]
             changes |= keys[1:] != keys[:-1]
         starts = [0, *(np.flatnonzero(changes) + 1).tolist(), count]
-        return [self._block(first, last, stamps) for first, last in pairwise(starts)]
+        rows = self.rows(count)
+        blocks = [self._block(first, last, rows, stamps) for first, last in pairwise(starts)]
+        self._taken += rows.size
+        self._expected = int(lengths[-1])
+        return blocks
 
-    def _block(self, first: int, last: int, stamps: Int64Array) -> UnitBlock:
-        units = self._units[first:last, : int(self._headers["len"][first])].copy()
+    def _block(self, first: int, last: int, rows: ByteRows, stamps: Int64Array) -> UnitBlock:
+        length, mine = int(self._headers["len"][first]), rows[first:last]
         peer = self._peer(first) if self._with_peers else None
-        return UnitBlock(units, stamps[first:last], peer)
+        units = mine[:, HEAD_ROOM_BYTES : HEAD_ROOM_BYTES + length]
+        if length == self._expected:
+            return UnitBlock(units, stamps[first:last], peer, mine)
+        beyond = self._overflow[first:last, : max(0, length - self._expected)]
+        return UnitBlock(np.concatenate([units, beyond], axis=1), stamps[first:last], peer)
 
     def _take_stamps(self, count: int) -> Int64Array:
         """(count,) nanoseconds of CLOCK_REALTIME, 0 where the kernel gave none; readies the headers for the next."""

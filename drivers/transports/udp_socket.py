@@ -143,7 +143,7 @@ class UdpTransport(DescriptorTransport):
             more = self._reader.blocks(count)
             blocks += more
             size += sum(block.units.size for block in more)
-            if count < self._reader.slots or size > MAX_BYTES:
+            if count < self._reader.offered or size > MAX_BYTES:
                 break
         return blocks if self._source is None else self._accepted(blocks)
 

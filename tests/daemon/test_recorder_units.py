@@ -21,7 +21,7 @@ from daemon.channels import ChannelTable
 from daemon.events import Events, Severity
 from daemon.health import sentence, stuck_threads
 from daemon.host_clock import HostClock
-from daemon.log.encode import EncodedBlock, encode_block
+from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from daemon.log.format import ChannelSpec, SessionInfo
 from daemon.log.writer import PartWriter
 from daemon.parts import Attachment, Parts
@@ -41,6 +41,19 @@ def block_of(channel_id: int, count: int, length: int = 100) -> EncodedBlock:
 
 
 # --- the queue ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 300])
+def test_messages_written_around_units_where_they_lie_are_those_that_copy_them(count: int) -> None:
+    units = np.random.default_rng(1).integers(0, 256, (count, 40), dtype=np.uint8)
+    rows = np.full((count, MESSAGE_HEADER_BYTES + 40), 0xEE, np.uint8)
+    rows[:, MESSAGE_HEADER_BYTES:] = units
+    times = np.arange(count, dtype=np.int64) * 1000
+    copied = encode_block(7, 4_294_967_200, times, units)
+    in_place = encode_block(7, 4_294_967_200, times, rows[:, MESSAGE_HEADER_BYTES:], rows=rows)
+    assert in_place.data.tobytes() == copied.data.tobytes()
+    assert in_place.offsets.tolist() == copied.offsets.tolist()
+    assert len(in_place.data) == len(copied.data) == count * (MESSAGE_HEADER_BYTES + 40)
 
 
 def test_queue_is_bounded_for_data_and_open_for_events_and_accounts() -> None:

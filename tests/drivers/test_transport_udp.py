@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.transports.base import TransportError, UnitBlock
+from drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
 from drivers.transports.udp_socket import UdpTransport
 from drivers.transports.uri import parse_transport
 
@@ -79,7 +79,7 @@ def test_burst_of_mixed_lengths_comes_whole_and_in_order(sender: socket.socket) 
     assert payloads(blocks) == sent
     for block in blocks:
         assert block.peer == sender.getsockname()
-        assert block.units.flags.c_contiguous
+        assert block.rows is None or block.rows.flags.c_contiguous
     assert udp.poll_counters().lost_kernel == 0
     udp.close()
 
@@ -115,6 +115,29 @@ def test_blocks_stay_as_they_are_when_more_is_read(sender: socket.socket) -> Non
     sender.sendto(b"other", ("127.0.0.1", port_of(udp)))
     assert payloads(udp.receive(5.0)) == [b"other"]
     assert payloads(first) == [b"first"]
+    udp.close()
+
+
+def test_writing_into_the_room_before_units_harms_no_unit(sender: socket.socket) -> None:
+    """Over several of the reader's memories, with lengths that change now and then."""
+    rng = random.Random(2)
+    sent, length = [], 1206
+    for _ in range(4000):
+        length = rng.choice([90, 1206, 3000]) if rng.random() < 0.002 else length
+        sent.append(rng.randbytes(length))
+    udp, blocks = transport(), []
+    udp.open()
+    for first in range(0, len(sent), 500):
+        for data in sent[first : first + 500]:
+            sender.sendto(data, ("127.0.0.1", port_of(udp)))
+        blocks += collect(udp, 500)
+    with_room = [block for block in blocks if block.rows is not None]
+    for block in with_room:
+        assert block.rows is not None
+        assert np.array_equal(block.rows[:, HEAD_ROOM_BYTES:], block.units)
+        block.rows[:, :HEAD_ROOM_BYTES] = 0xEE
+    assert payloads(blocks) == sent
+    assert sum(len(block.units) for block in with_room) > 1000
     udp.close()
 
 
