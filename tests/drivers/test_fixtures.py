@@ -23,6 +23,7 @@ from drivers.core.registry import find_driver
 from drivers.gnss.novatel import message_name
 from drivers.imu.nmea2000 import pgn_and_source
 from drivers.scanner.ouster_head import read_head
+from drivers.transports.can_frame import pack_frame
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import Chunk, Record, ScannerReturns, TimeMessage
 from tests.drivers.imu_dbc import imu_rows
@@ -41,8 +42,6 @@ CAN_EFF_MASK = 0x1FFF_FFFF
 LATER = {"las/": "point clouds", "trajectory/": "trajectories of others"}
 WITHOUT_COPY = {
     "can/FACTS.json": "layouts of CAN messages with their sources: what the drivers were written from, no recording",
-    "can/canmod-gps/2F6913DB_00000004_00000001.MF4": "no library here reads it; its frames are in the candump log",
-    "can/canmod-gps/3BA199E2_00000164_00000005.MF4": "no library here reads it; its frames are in the candump log",
     "can/canmod-gps/canmod-gps.dbc": "the driver's own copy has the licence in it besides",
     "gnss/novatel-oem7-driver/README.upstream.md": "how the recordings were made, in words",
 }
@@ -309,6 +308,19 @@ def test_every_file_of_the_collection_has_a_copy_or_says_why_not() -> None:
     own = (ROOT / "drivers" / "imu" / "canmod-gps.dbc").read_bytes()
     without_licence = re.sub(rb'^CM_ "CSS Electronics.*?";\n', b"", own, count=1, flags=re.DOTALL | re.MULTILINE)
     assert hashlib.sha256(without_licence).hexdigest() == dbc["sha256"]
+
+
+@pytest.mark.parametrize("name", ["2F6913DB_00000004_00000001", "3BA199E2_00000164_00000005"])
+def test_frames_of_a_candump_log_are_those_of_the_loggers_own_file(name: str, tmp_path: Path) -> None:
+    """The logger's MF4, as python-can reads it by asammdf; both write microseconds."""
+    from can.io.mf4 import MF4Reader  # brings pandas along: seconds that no other test should wait
+
+    own = tmp_path / "own.MF4"
+    own.write_bytes(content(FIXTURES / "canmod-gps" / f"{name}.MF4.gz"))
+    with MF4Reader(own) as messages:
+        frames = [(round(one.timestamp * 1e6) * 1000, f"can{one.channel}", pack_frame(one)) for one in messages]
+    units = read_candump(FIXTURES / "canmod-gps" / f"{name}_candump.log.gz")
+    assert [(unit.time_ns, unit.channel, unit.data) for unit in units] == frames
 
 
 @pytest.mark.parametrize(
