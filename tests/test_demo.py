@@ -14,6 +14,7 @@ from demo.__main__ import Hashed, prove
 from tests.daemon.log_check import LogContent, read_log
 
 ROOT = Path(__file__).resolve().parent.parent
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]  # it is played once, by one worker
 SOURCES = ("gnss/rover", "imu/main", "scanner/top", "scanner/top/aux")
 
 
@@ -46,7 +47,6 @@ def sent_as_logged(content: LogContent, report: PlayReport) -> dict[str, Hashed]
     return outputs | {"pps/main": Hashed(Nowhere())}
 
 
-@pytest.mark.slow
 def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]) -> None:
     text, logs = played
     assert "demonstration passed" in text
@@ -58,7 +58,6 @@ def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]
     assert [event["severity"] for _, event in content.messages["/events"] if event["severity"] != "info"] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("source", [*SOURCES, "pps/main"])
 def test_its_proof_fails_when_anything_differs(played: tuple[str, Path], source: str) -> None:
     _, logs = played
