@@ -264,6 +264,47 @@ def test_two_of_each_kind_at_once_and_one_receiver_changes_its_messages(tmp_path
     assert "has its message set or baud rate changed?" in stopped["text"]
 
 
+def heard_at(data: bytes, sent_baud: int, heard_baud: int) -> bytes:
+    """What a UART set to one rate makes of bytes sent at another, 8N1: a bit is what the line holds at its middle."""
+    bits = [1] * 20  # the line at rest
+    for byte in data:
+        bits += [0, *(byte >> place & 1 for place in range(8)), 1]
+    bits += [1] * 20
+    ratio = sent_baud / heard_baud
+    heard, at, end = bytearray(), 0.0, len(bits) - 10 * max(1.0, ratio)
+
+    def line(places: float) -> int:
+        return bits[int(at + (places + 0.5) * ratio)]
+
+    while at < end:
+        if line(-0.5) == 0:  # a start bit
+            heard.append(sum(line(1 + place) << place for place in range(8)))
+            at += 9.5 * ratio
+        at += ratio / 16
+    return bytes(heard)
+
+
+def test_a_receiver_that_changes_its_baud_rate_is_told_and_recorded_as_it_came(tmp_path: Path, logs: Path) -> None:
+    rover = serial_wire("gnss/rover")
+    assert heard_at(zda(1), 9600, 9600) == zda(1)
+    with recording(tmp_path, logs, [rover]) as recorder:
+        for number in range(20):
+            rover.send(zda(number))
+            time.sleep(0.02)
+        number = 20
+        while "gnss/rover time_messages_stopped" not in recorder.stderr() and number < 1000:
+            rover.send(heard_at(zda(number), 38400, 115200))
+            number += 1
+            time.sleep(0.05)
+        rover.send(zda(number))
+        recorder.wait_said("gnss/rover time_messages_back")
+    content = read_log(logs)
+    account_of(content, rover)
+    (stopped,) = content.events("time_messages_stopped")
+    assert "has its message set or baud rate changed?" in stopped["text"]
+    assert info(logs)["gnss/rover"]["decoded"]["messages"] == {"ZDA": 21}
+
+
 # --- counters -------------------------------------------------------------------------------------------------------
 
 IMU_TABLE = """protocol = "dbc"
