@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import faulthandler
 import gc
 import logging
 import signal
@@ -20,6 +19,7 @@ from daemon.errors import ExitCode, UserError
 from daemon.events import Severity
 from daemon.health import sentence, stuck_threads
 from daemon.host_clock import read_clock_discipline, read_clock_sample
+from daemon.journal import threads_text
 from daemon.recorder import Writing
 from daemon.repair import repair_left_open
 from daemon.sd_notify import ServiceManager
@@ -159,7 +159,7 @@ class RecorderProcess:
                 self._service.notify(STATUS=f"STUCK: {', '.join(stuck)}")
                 text = f"no progress in {', '.join(stuck)}"
                 self._assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
-                faulthandler.dump_traceback()  # into the journal: where every thread is, before a restart wipes it out
+                log.critical("%s", threads_text())  # before a restart wipes it out
             self._stuck = stuck
             if time.monotonic() - collected_s > COLLECT_ALL_S:
                 collected_s = time.monotonic()

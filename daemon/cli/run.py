@@ -10,20 +10,13 @@ from typing import Annotated
 
 import typer
 
-_JOURNAL_PRIORITY = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
-
-
-class _JournalFormatter(logging.Formatter):
-    """Lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return f"<{_JOURNAL_PRIORITY[record.levelno]}>{super().format(record)}"
-
 
 def _log_to_stderr() -> None:
-    handler = logging.StreamHandler(sys.stderr)
+    from daemon.journal import JournalFormatter, JournalHandler
+
+    handler = JournalHandler(sys.stderr.fileno())
     if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(_JournalFormatter("%(message)s"))
+        handler.setFormatter(JournalFormatter("%(message)s"))
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-8s %(message)s", "%H:%M:%S"))
     logging.getLogger("swath").addHandler(handler)

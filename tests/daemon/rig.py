@@ -90,6 +90,7 @@ class Recorder:
         watchdog_s: float | None = None,
         prefix: list[str] | None = None,
         module: tuple[str, ...] = ("daemon.cli.main", "run"),
+        says_to: int | None = None,
     ):
         folder.mkdir(parents=True, exist_ok=True)
         self.config = folder / "swath.toml"
@@ -102,7 +103,7 @@ class Recorder:
         with self.stderr_path.open("ab") as stderr:
             self.process = subprocess.Popen(
                 [*(prefix or []), sys.executable, "-m", *module, str(self.config)],
-                stderr=stderr,
+                stderr=stderr if says_to is None else says_to,
                 stdout=subprocess.DEVNULL,
                 env=environment,
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -153,6 +154,33 @@ def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
         restarted.wait_said("log_repaired")
         assert restarted.stop() == 0
     assert len(list(logs.glob("*.recovered.mcap"))) == 1
+
+
+def test_a_journal_that_nobody_reads_holds_up_nothing(tmp_path: Path, logs: Path) -> None:
+    """stderr is a full pipe from the start, so that not one line of the recorder's is taken."""
+    unread, full = os.pipe()
+    os.set_blocking(full, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(full, b"x" * 4096)
+    os.set_blocking(full, True)
+    port, absent = free_udp_port(), tmp_path / "nothing"
+    config = session_table(logs) + SREP.format(port=port) + ROVER.format(path=absent, fifo=tmp_path / "nofifo")
+    with (
+        Recorder(tmp_path, config, watchdog_s=1.0, says_to=full) as recorder,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        wait_until(lambda: recorder.notify.count("WATCHDOG") >= 3, "watchdog fed")
+        for number in range(200):
+            sender.sendto(number.to_bytes(4, "big"), ("127.0.0.1", port))
+        fed = recorder.notify.count("WATCHDOG")
+        wait_until(lambda: recorder.notify.count("WATCHDOG") >= fed + 12, "watchdog fed for 3 s more")
+        assert recorder.stop() == 0
+    os.close(unread)
+    os.close(full)
+    content = read_log(logs)
+    assert [int.from_bytes(data, "big") for _, data in content.units["scanner/left"]] == list(range(200))
+    assert {event["source"] for event in content.events("device_absent")} == {"gnss/rover", "pps/main"}
 
 
 def test_serial_port_unplugged_and_plugged_in_again(tmp_path: Path, logs: Path) -> None:
