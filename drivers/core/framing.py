@@ -22,6 +22,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.core.parser import ParserCounters
 
 UNDECIDED = 0  # what a measure says while the bytes there are do not tell the length
@@ -57,6 +60,9 @@ class FrameKind:
             buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`. With ``final`` nothing more will come.
         intact: whether the checksum of a complete frame is good.
         message_name: what a good frame is counted as.
+        marks: of up to twice ``max_bytes``, a number a place between them; those at two places are equal just where an
+            intact frame may lie between. For a checksum that is dear to make anew for each of many false frames that
+            overlap; None: it is not.
     """
 
     name: str
@@ -65,6 +71,7 @@ class FrameKind:
     measure: Callable[[bytes, int, bool], int]
     intact: Callable[[bytes], bool]
     message_name: Callable[[bytes], str]
+    marks: Callable[[bytes], NDArray[np.uint32]] | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> FrameKind:
         """A kind never changes: a parser's copy shares it."""
@@ -81,6 +88,30 @@ def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
             expression = one + (b"(?:\\Z|" + expression + b")" if expression else b"")
         groups.append(b"(" + expression + b")")
     return re.compile(b"|".join(groups), re.DOTALL)
+
+
+class _Overlaps:
+    """The frames of one buffer whose kind has marks; those that overlap a bad one share the work of their checksums."""
+
+    def __init__(self, buffer: bytes) -> None:
+        self._buffer = buffer
+        self._bad_end = 0  # of the bad frames so far
+        self._kind: FrameKind | None = None  # whose marks these are
+        self._marks = memoryview(b"")
+        self._marked = 0  # the place of the first mark
+
+    def intact(self, kind: FrameKind, start: int, end: int) -> bool:
+        """Whether the checksum of a complete frame is good."""
+        if kind.marks is None or start >= self._bad_end:
+            good = kind.intact(self._buffer[start:end])
+        else:
+            if kind is not self._kind or end - self._marked >= len(self._marks):
+                self._kind, self._marked = kind, start
+                self._marks = kind.marks(self._buffer[start : start + 2 * kind.max_bytes]).data
+            good = self._marks[start - self._marked] == self._marks[end - self._marked]
+        if not good and kind.marks is not None:
+            self._bad_end = max(self._bad_end, end)
+        return good
 
 
 class Framer:
@@ -116,6 +147,7 @@ class Framer:
     def _scan(self, *, final: bool) -> list[Frame]:
         buffer = self._pieces[0] if len(self._pieces) == 1 else b"".join(self._pieces)
         frames: list[Frame] = []
+        overlaps = _Overlaps(buffer)
         position, framed = 0, 0
         self._needed = 0
         while match := self._search(buffer, position):
@@ -127,7 +159,8 @@ class Framer:
                 break
             if end <= start:
                 position = start + 1
-            elif kind.intact(data := buffer[start:end]):
+            elif overlaps.intact(kind, start, end):
+                data = buffer[start:end]
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
                 self._count(kind.message_name(data))
                 framed += end - start
