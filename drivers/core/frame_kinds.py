@@ -53,7 +53,7 @@ def nmea_name(frame: bytes) -> str:
     comma = frame.find(b",", 0, NMEA_LONGEST_ADDRESS)
     if comma < 0:
         return _nmea_name(frame)
-    return _nmea_name(frame[: NMEA_NUMBER_END if frame[1:comma] == b"PUBX" else comma])
+    return _nmea_name(frame[: NMEA_NUMBER_END if comma == 5 and frame[1:5] == b"PUBX" else comma])
 
 
 @lru_cache(maxsize=256)

@@ -100,16 +100,18 @@ class _Overlaps:
         self._marks = memoryview(b"")
         self._marked = 0  # the place of the first mark
 
-    def intact(self, kind: FrameKind, start: int, end: int) -> bool:
+    def intact(self, kind: FrameKind, start: int, data: bytes) -> bool:
         """Whether the checksum of a complete frame is good."""
-        if kind.marks is None or start >= self._bad_end:
-            good = kind.intact(self._buffer[start:end])
+        assert kind.marks is not None
+        end = start + len(data)
+        if start >= self._bad_end:
+            good = kind.intact(data)
         else:
             if kind is not self._kind or end - self._marked >= len(self._marks):
                 self._kind, self._marked = kind, start
                 self._marks = kind.marks(self._buffer[start : start + 2 * kind.max_bytes]).data
             good = self._marks[start - self._marked] == self._marks[end - self._marked]
-        if not good and kind.marks is not None:
+        if not good:
             self._bad_end = max(self._bad_end, end)
         return good
 
@@ -153,14 +155,16 @@ class Framer:
         while match := self._search(buffer, position):
             start = match.start()
             kind = self._kinds[(match.lastindex or 1) - 1]
-            end = start + self._measure(kind, buffer, start, final)
-            if end > len(buffer):
-                position, self._needed = start, end - start
-                break
-            if end <= start:
+            length = kind.measure(buffer, start, final)
+            end = start + length
+            if length <= 0 or end > len(buffer):
+                if needed := self._without_end(kind, length, len(buffer) - start, final):
+                    position, self._needed = start, needed
+                    break
                 position = start + 1
-            elif overlaps.intact(kind, start, end):
-                data = buffer[start:end]
+                continue
+            data = buffer[start:end]
+            if kind.intact(data) if kind.marks is None else overlaps.intact(kind, start, data):
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
                 self._count(kind.message_name(data))
                 framed += end - start
@@ -178,14 +182,13 @@ class Framer:
         messages = self.counters.messages
         messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
 
-    def _measure(self, kind: FrameKind, buffer: bytes, start: int, final: bool) -> int:
-        """Bytes of the frame at ``start``; one more than there are while undecided; 0 if it is none."""
-        length = kind.measure(buffer, start, final)
+    def _without_end(self, kind: FrameKind, length: int, there: int, final: bool) -> int:
+        """Bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
         if length == UNDECIDED:
-            length = len(buffer) - start + 1
+            length = there + 1
         elif length == OVER_BOUND:
             self.counters.errors[f"{kind.name}_length_over_bound"] += 1
-        return 0 if length < 0 or (final and start + length > len(buffer)) else length
+        return 0 if final or length < 0 else length
 
     def _arrival(self, end_offset: int) -> int:
         """Host time of the read that brought the byte before ``end_offset``."""
