@@ -149,7 +149,7 @@ class Framer:
     def _scan(self, *, final: bool) -> list[Frame]:
         buffer = self._pieces[0] if len(self._pieces) == 1 else b"".join(self._pieces)
         frames: list[Frame] = []
-        overlaps = _Overlaps(buffer)
+        overlaps, messages = _Overlaps(buffer), self.counters.messages
         position, framed = 0, 0
         self._needed = 0
         while match := self._search(buffer, position):
@@ -166,7 +166,8 @@ class Framer:
             data = buffer[start:end]
             if kind.intact(data) if kind.marks is None else overlaps.intact(kind, start, data):
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
-                self._count(kind.message_name(data))
+                name = kind.message_name(data)  # noise makes any: those beyond what devices have are one
+                messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
                 framed += end - start
                 position = end
             else:
@@ -176,11 +177,6 @@ class Framer:
             position = len(buffer)
         self._release(buffer, position, framed)
         return frames
-
-    def _count(self, name: str) -> None:
-        """A good frame by its name; names beyond what devices have are one, since noise makes any."""
-        messages = self.counters.messages
-        messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
 
     def _without_end(self, kind: FrameKind, length: int, there: int, final: bool) -> int:
         """Bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
