@@ -45,6 +45,7 @@ NOTES_PER_S = 5.0
 SPLITS_AT_ONCE = 3  # a new part costs a few syncs
 SPLITS_PER_S = 1.0
 IGNORED_TOLD_S = 60.0
+LOOK_S = 1.0  # between two looks whether the socket is still where people look for it
 _SUN_PATH_BYTES = 107  # unix(7), without the end
 
 
@@ -178,21 +179,39 @@ class Control(threading.Thread):
         self._notes = _Allowance(NOTES_AT_ONCE, NOTES_PER_S)
         self._splits = _Allowance(SPLITS_AT_ONCE, SPLITS_PER_S)
         self._told_ignored = (0, 0.0)  # how many, CLOCK_MONOTONIC
+        self._look_s = 0.0  # CLOCK_MONOTONIC of the next look
 
     # ------------------------------------------------------------------ its life
 
     def open(self) -> None:
         """Begin to listen; where that cannot be, an event says so and the recording goes on without."""
         try:
-            self._sock = listen(self.place)
-            found = os.stat(self.place)
-            self._inode = found.st_dev, found.st_ino
-            place_link(self._link, self.place)
+            self._listen()
         except OSError as error:
             text = f"no control socket at {self.place}: {error.strerror or error}; swath mark and split cannot be used"
             self._events.post(Severity.WARNING, "recorder", "control_absent", text)
         if self._sock is not None:
             self.start()
+
+    def _listen(self) -> None:
+        self._sock = listen(self.place)
+        found = os.stat(self.place)
+        self._inode = found.st_dev, found.st_ino
+        place_link(self._link, self.place)
+
+    def _come_back(self, now_s: float) -> None:
+        """Listen anew where the socket was removed, and lead to it anew: with the log directory, when it is back."""
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
+        with contextlib.suppress(OSError):
+            if not os.path.lexists(self.place):
+                gone = self._sock
+                self._listen()
+                if gone is not None:
+                    gone.close()
+            elif not os.path.lexists(self._link):
+                place_link(self._link, self.place)
 
     def close(self) -> None:
         """Stop listening and leave nothing behind that others could take for a recorder."""
@@ -234,6 +253,7 @@ class Control(threading.Thread):
         now_s = time.monotonic()
         self._peers = [peer for peer in self._peers if not self._is_done(peer, peer.sock in ready, now_s)]
         self._tell_ignored(now_s)
+        self._come_back(now_s)
 
     def _accept(self) -> None:
         assert self._sock is not None

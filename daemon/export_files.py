@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections import deque
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from daemon.log.chunks import LogBatch
 from daemon.log.format import ChannelSpec
+from daemon.log.reader import LOOK_AHEAD_BYTES, LOOK_AHEAD_NS
 from daemon.sidecar import SidecarWriter
 from drivers.transports.candump_file import candump_line, held_by_line
 from drivers.transports.capture_base import LATEST_NS, Address
@@ -28,6 +30,8 @@ from georef.records import Int64Array
 
 # .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)
 _SERIAL_SUFFIX = {"ubx": ".ubx", "novatel": ".gps", "sbf": ".sbf", "nmea": ".nmea"}
+
+_EVER_NS = (1 << 63) - 1  # no stamp is later
 
 
 class NativeFile(ABC):
@@ -133,7 +137,11 @@ class CandumpFile(NativeFile):
 
 
 class PcapFile(NativeFile):
-    """Datagrams with stamps in nanoseconds; Ethernet, IP and UDP headers are made anew."""
+    """Datagrams with stamps in nanoseconds; Ethernet, IP and UDP headers are made anew.
+
+    A head's two ports are merged by their stamps; each keeps its own order, also where its stamps step back. A second
+    of them is held for that: a log has blocks of one port after blocks of the other.
+    """
 
     kind = "pcap"
     suffix = ".pcap"
@@ -142,9 +150,41 @@ class PcapFile(NativeFile):
         super().__init__(path)
         self._stream.write(FILE_HEADER)
         self._unnamed = 0
+        self._held: dict[str, deque[LogBatch]] = {}
+        self._held_bytes = 0
 
     def add(self, source: str, batch: LogBatch) -> None:
         """Units that follow."""
+        copy = LogBatch(batch.channel, batch.channel_id, batch.log_time_ns.copy(), batch.rows.copy())
+        self._held.setdefault(source, deque()).append(copy)
+        self._held_bytes += copy.rows.size
+        until_ns = int(copy.log_time_ns.max()) - LOOK_AHEAD_NS
+        self._write_held(until_ns if self._held_bytes <= LOOK_AHEAD_BYTES else _EVER_NS)
+
+    def close(self) -> None:
+        """Finish the file and what lies beside it."""
+        self._write_held(_EVER_NS)
+        super().close()
+
+    def _write_held(self, until_ns: int) -> None:
+        """Write what is held up to a time, of the ports always the one whose next stamp is the earlier."""
+        while waiting := [(int(batches[0].log_time_ns[0]), source) for source, batches in self._held.items()]:
+            first_ns, source = min(waiting)
+            if first_ns > until_ns:
+                return
+            batches = self._held[source]
+            batch = batches.popleft()
+            limit_ns = min([until_ns, *(time_ns for time_ns, other in waiting if other != source)])
+            later = np.flatnonzero(batch.log_time_ns > limit_ns)
+            count = int(later[0]) if later.size else len(batch.log_time_ns)
+            if count < len(batch.log_time_ns):
+                batches.appendleft(batch.between(count, len(batch.log_time_ns)))
+            elif not batches:
+                del self._held[source]
+            self._held_bytes -= count * batch.rows.shape[1]
+            self._write(batch.between(0, count))
+
+    def _write(self, batch: LogBatch) -> None:
         sender, receiver = self._addresses(batch.channel)
         if sender == NOBODY:
             self._unnamed += len(batch.units)

@@ -16,6 +16,7 @@ from daemon.log.durable import sync_directory
 from daemon.log.encode import EncodedBlock
 from daemon.log.format import SessionInfo
 from daemon.log.writer import PartWriter
+from daemon.places import keep_directory
 
 RECORDING_SIGN = "recording.json"
 _DROP_CACHE_AFTER_S = 60.0
@@ -55,6 +56,7 @@ class Parts:
     """Opens parts, lays blocks into the current one and counts what was written and lost over all of them.
 
     Attributes:
+        lock: descriptor of the directory's lock; None: it is not locked.
         written, lost: messages by channel in all parts closed so far; `total_written` adds the current one's.
     """
 
@@ -66,6 +68,7 @@ class Parts:
     part: int = -1
     current: PartWriter | None = None
     opened_monotonic_s: float = 0.0
+    lock: int | None = None
     written: Counter[int] = field(default_factory=Counter)
     lost: Counter[int] = field(default_factory=Counter)
     _known: set[int] = field(default_factory=set)
@@ -96,6 +99,11 @@ class Parts:
         self._known = set()
         self.opened_monotonic_s = time.monotonic()
         return before
+
+    def keep_directory(self) -> None:
+        """Lock the directory anew where it was made anew; raises OSError, BlockingIOError for another recorder."""
+        if self.lock is not None:
+            keep_directory(self.directory, self.lock)
 
     def _next(self) -> tuple[int, Path]:
         """Number and path of the next part; a name that is taken is passed over, never written to."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 from pathlib import Path
 
 from daemon.errors import ExitCode, UserError
 
 DEFAULT_CONFIG = Path("/etc/swath/swath.toml")
+LOCK = ".swath.lock"  # in the log directory: held while a recorder is at work there
 CONTROL_LINK = ".swath.control"  # in the log directory: the control socket, or a link to it
 
 _WHO_MAY = "the group of the log directory may (swath, as installed), and root"
@@ -31,3 +34,49 @@ def log_directory(where: Path) -> Path:
     if not os.access(directory, os.R_OK | os.X_OK):
         raise UserError(f"{directory}: not permitted; {_WHO_MAY}", ExitCode.IO)
     return directory.absolute()
+
+
+def take_directory(directory: Path, key: str = "session.directory") -> int:
+    """Create the log directory if need be and lock it; returns the lock's descriptor, which must stay open.
+
+    Args:
+        directory: of logs.
+        key: what says so, for people.
+
+    Raises:
+        UserError: it cannot be written, or another recorder is at work in it.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        return _lock(directory)
+    except BlockingIOError as error:
+        text = f"{key} {directory}: another recorder is at work there; stop it or give another directory"
+        raise UserError(text, exit_code=ExitCode.IO) from error
+    except OSError as error:
+        text = f"{key} {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
+        raise UserError(text, exit_code=ExitCode.IO) from error
+
+
+def keep_directory(directory: Path, lock: int) -> None:
+    """Lock a directory anew that was removed and made anew since; the descriptor stays the same.
+
+    Raises:
+        BlockingIOError: another recorder has come first.
+        OSError: it cannot be locked.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        if os.path.samestat(os.stat(directory / LOCK), os.fstat(lock)):
+            return
+    anew = _lock(directory)
+    os.dup2(anew, lock, inheritable=False)
+    os.close(anew)
+
+
+def _lock(directory: Path) -> int:
+    lock = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(lock)
+        raise
+    return lock

@@ -302,7 +302,7 @@ class Recorder(threading.Thread):
         if time.monotonic() < self._resume_after_s:
             return
         try:
-            self._parts.open_next(self._clock.now_ns())
+            self._open_next()
         except OSError as error:
             self.health.reason = f"{error.strerror or error} in {self._parts.directory}: units are being lost"
             return
@@ -328,13 +328,24 @@ class Recorder(threading.Thread):
             )
         )
 
+    def _open_next(self) -> PartWriter | None:
+        """Open the next part; where its directory was made anew, its lock with it, or it is said why not."""
+        old = self._parts.open_next(self._clock.now_ns())
+        try:
+            self._parts.keep_directory()
+        except OSError as error:
+            why = "another recorder is at work there" if isinstance(error, BlockingIOError) else error.strerror
+            text = f"{self._parts.directory} was made anew and is not locked: {why}; recording goes on"
+            self._events.post(Severity.ERROR, "recorder", "directory_unlocked", text)
+        return old
+
     def _split(self) -> None:
         """Open the next part and write its first chunk before the old one is finished."""
         self._guard(lambda part: part.flush())
         if self._parts.current is None:
             return
         try:
-            old = self._parts.open_next(self._clock.now_ns())
+            old = self._open_next()
         except OSError as error:
             self._split_after_s = time.monotonic() + SPLIT_AGAIN_S
             text = f"the next part cannot be opened ({error.strerror or error}); recording goes on in this one"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import fcntl
 import importlib.metadata
 import os
 import platform
@@ -20,11 +19,12 @@ from daemon.answers import FirstUnits
 from daemon.block_queue import BlockQueue
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.config import Config, DeviceEntry
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode
 from daemon.events import Events
 from daemon.host_clock import HostClock
 from daemon.log.format import SessionInfo
 from daemon.parts import Attachment, Parts
+from daemon.places import take_directory
 from daemon.process import RecorderProcess
 from daemon.recorder import Recorder, RecorderSettings
 from daemon.sd_notify import ServiceManager
@@ -59,31 +59,6 @@ def make_session_info(name: str, clock: HostClock) -> SessionInfo:
         realtime_ns=clock.realtime_ns,
         monotonic_ns=clock.monotonic_ns,
     )
-
-
-def take_directory(directory: Path, key: str = "session.directory") -> int:
-    """Create the log directory if need be and lock it; returns the lock's descriptor, which must stay open.
-
-    Args:
-        directory: of logs.
-        key: what says so, for people.
-
-    Raises:
-        UserError: it cannot be written, or another recorder is at work in it.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        lock = os.open(directory / ".swath.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
-    except OSError as error:
-        text = f"{key} {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
-        raise UserError(text, exit_code=ExitCode.IO) from error
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(lock)
-        text = f"{key} {directory}: another recorder is at work there; stop it or give another directory"
-        raise UserError(text, exit_code=ExitCode.IO) from error
-    return lock
 
 
 @dataclass(slots=True)
@@ -230,6 +205,7 @@ def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEU
         while (directory / f"{assembly.info.session_id}_0.mcap").exists():  # restarted within the second
             time.sleep(0.05)
             assembly = assemble(config, queue_bytes)
+        assembly.parts.lock = lock
         lock_memory()
         keep_freed_memory()
         whole = asyncio.run(RecorderProcess(assembly, ServiceManager()).run(seconds))

@@ -262,8 +262,7 @@ def play(
     report = PlayReport()
     # loopback keeps the order of datagrams only while they are sent from one processor
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    start_ns = time.monotonic_ns()
-    realtime_ns = time.time_ns()
+    start_ns = realtime_ns = 0
     first_ns: int | None = None
     last_ns = 0
     told_s = 0.0
@@ -273,6 +272,7 @@ def play(
             continue
         if first_ns is None:
             first_ns = unit.time_ns
+            start_ns, realtime_ns = time.monotonic_ns(), time.time_ns()  # reading up to it has taken its time
         elif abs(unit.time_ns - last_ns) > LONGEST_PAUSE_NS:
             first_ns += unit.time_ns - last_ns
             report.jumps += 1

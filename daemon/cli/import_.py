@@ -76,7 +76,7 @@ def _import(config: Config, routes: Routes, captures: list[Capture], output: Pat
     from rich.console import Console
 
     from daemon.importing import import_captures
-    from daemon.run import take_directory
+    from daemon.places import take_directory
     from drivers.transports.base import TransportError
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

@@ -47,6 +47,10 @@ class LogBatch:
         """(n, length) uint8, the messages' data, a view into the chunk."""
         return self.rows[:, _MESSAGE_HEAD:]
 
+    def between(self, first: int, last: int) -> LogBatch:
+        """The messages from one to before another."""
+        return LogBatch(self.channel, self.channel_id, self.log_time_ns[first:last], self.rows[first:last])
+
 
 def chunk_batches(
     data: bytes,

@@ -260,7 +260,7 @@ def _in_order(batch: LogBatch) -> Iterator[LogBatch]:
     """A batch split where its times step back: stamps of one socket come from several processors."""
     steps_back = np.flatnonzero(np.diff(batch.log_time_ns) < 0) + 1
     for first, last in pairwise([0, *steps_back.tolist(), len(batch.log_time_ns)]):
-        yield _slice(batch, first, last)
+        yield batch.between(first, last)
 
 
 def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], list[LogBatch]]:
@@ -270,9 +270,9 @@ def _older_than(held: list[LogBatch], limit_ns: int) -> tuple[list[LogBatch], li
     for batch in held:
         split = int(np.searchsorted(batch.log_time_ns, limit_ns))
         if split:
-            ready.append(_slice(batch, 0, split))
+            ready.append(batch.between(0, split))
         if split < len(batch.log_time_ns):
-            rest.append(_slice(batch, split, len(batch.log_time_ns)))
+            rest.append(batch.between(split, len(batch.log_time_ns)))
     return ready, rest
 
 
@@ -280,10 +280,6 @@ def _chunk_bytes(held: list[LogBatch]) -> int:
     """Memory that batches keep: of each the whole chunk that it is a view into."""
     chunks = {id(batch.rows.base): batch.rows.base for batch in held}
     return sum(chunk.nbytes for chunk in chunks.values() if isinstance(chunk, np.ndarray))
-
-
-def _slice(batch: LogBatch, first: int, last: int) -> LogBatch:
-    return LogBatch(batch.channel, batch.channel_id, batch.log_time_ns[first:last], batch.rows[first:last])
 
 
 def _merge(batches: list[LogBatch]) -> Iterator[LogBatch]:
@@ -298,6 +294,6 @@ def _merge(batches: list[LogBatch]) -> Iterator[LogBatch]:
         if heap:
             next_ns = heap[0][0] + (number < heap[0][1])  # of equal times the one first in the file goes first
             last = max(first + 1, first + int(np.searchsorted(times[first:], next_ns)))
-        yield _slice(batch, first, last)
+        yield batch.between(first, last)
         if last < len(times):
             heapq.heappush(heap, (int(times[last]), number, last))

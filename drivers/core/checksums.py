@@ -19,7 +19,12 @@ Bytes: TypeAlias = bytes | bytearray | memoryview
 
 CRC24Q_POLYNOMIAL = 0x1864CFB  # RTCM 10403.3, 4.1.2 (Qualcomm's)
 CRC24Q_STEP_BYTES = 1029  # the longest RTCM3 frame goes through the table at once
+CRC24Q_MARKED_BYTES = 2 * CRC24Q_STEP_BYTES
 FLETCHER_STEP_BYTES = 8192 + 8  # so does the longest UBX frame
+
+
+# By the bit length of a body's last place: shifts of the halves of the power of two not below its length, in bits.
+_FOLDS = [tuple(8 << power for power in reversed(range(places))) for places in range(32)]
 
 
 def nmea_xor(body: Bytes) -> int:
@@ -28,10 +33,8 @@ def nmea_xor(body: Bytes) -> int:
     Folded in halves: shifting a number by half its length and adding it without carry leaves the halves' XOR below.
     """
     folded = int.from_bytes(body, "little")
-    width = 1 << max(0, len(body) - 1).bit_length()  # a power of two not below the length
-    while width > 1:
-        width >>= 1
-        folded ^= folded >> (8 * width)
+    for shift in _FOLDS[(len(body) - 1).bit_length()] if body else ():
+        folded ^= folded >> shift
     return folded & 0xFF
 
 
@@ -85,6 +88,36 @@ def crc24q(data: Bytes) -> int:
         rest = (crc << (8 * len(part))) & 0xFF_FFFF if len(part) < 3 else 0
         crc = int(np.bitwise_xor.reduce(table[places])) ^ rest
     return crc
+
+
+@cache
+def _crc24q_mark_table() -> tuple[NDArray[np.uint32], NDArray[np.intp]]:
+    """CRC of each byte value at place k, divided by x⁸ for each byte before it, flat over (k, value); rows' offsets."""
+    divided = np.arange(256, dtype=np.uint32)  # low byte of a register, by x⁸
+    for _ in range(8):
+        divided = (divided ^ (divided & np.uint32(1)) * np.uint32(CRC24Q_POLYNOMIAL)) >> np.uint32(1)
+    table = np.empty((CRC24Q_MARKED_BYTES, 256), dtype=np.uint32)
+    table[0] = _crc24q_table()[0][-256:]
+    for k in range(1, CRC24Q_MARKED_BYTES):
+        table[k] = (table[k - 1] >> np.uint32(8)) ^ divided[table[k - 1] & np.uint32(0xFF)]
+    return table.reshape(-1), np.arange(CRC24Q_MARKED_BYTES, dtype=np.intp) * 256
+
+
+def crc24q_marks(data: Bytes) -> NDArray[np.uint32]:
+    """One number a place between bytes; ``crc24q(data[a:b]) == 0`` just where those at a and b are equal.
+
+    The CRC up to a place, divided by x⁸ for every byte before it (the polynomial ends in 1, so that x has an inverse),
+    is a sum to which each byte adds its own part, whatever comes behind. What lies between two places adds nothing to
+    it when and only when its own CRC is 0.
+
+    Args:
+        data: at most CRC24Q_MARKED_BYTES bytes.
+    """
+    table, offsets = _crc24q_mark_table()
+    marks = np.zeros(len(data) + 1, dtype=np.uint32)
+    part = np.frombuffer(data, dtype=np.uint8)
+    np.bitwise_xor.accumulate(table[offsets[: len(part)] + part], out=marks[1:])
+    return marks
 
 
 def crc32_novatel(data: Bytes) -> int:

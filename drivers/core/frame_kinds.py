@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import re
 import struct
+from functools import lru_cache
 
-from drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from drivers.core.checksums import crc16_ccitt, crc24q, crc24q_marks, crc32_novatel, nmea_xor, ubx_fletcher
 from drivers.core.framing import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
 
 # --- NMEA 0183: $ttsss,field,…*hh CR LF -----------------------------------------------------------------------------
 
 # The standard allows 82 characters; proprietary sentences (PUBX,03 with 32 satellites, PQTM…) reach several hundred.
 NMEA_MAX_BYTES = 1024
+NMEA_LONGEST_ADDRESS = 16  # that is looked for by its comma
+NMEA_NUMBER_END = 9  # of $PUBX,00,
+# A whole sentence with its line end, which nearly all are: body and checksum as below, the body as long as may be.
+NMEA_SENTENCE = re.compile(rb"[$!][A-Z][ -#%%-)+-~]{0,%d}\*[0-9A-Fa-f]{2}\r?\n" % (NMEA_MAX_BYTES - 7))
 NMEA_BODY = re.compile(rb"[$!][A-Z][ -#%-)+-~]*")  # printable, neither $ (a new sentence) nor * (the checksum)
 NMEA_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
 NMEA_ADDRESS = re.compile(rb"[$!]([A-Z0-9]+)(?:,(\d\d)(?=[,*]))?")
@@ -19,6 +24,9 @@ NMEA_ADDRESS = re.compile(rb"[$!]([A-Z0-9]+)(?:,(\d\d)(?=[,*]))?")
 
 def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
     """Up to the line end, which belongs to the sentence; up to the checksum where there is none (6.1 of NMEA 0183)."""
+    sentence = NMEA_SENTENCE.match(buffer, start)
+    if sentence:
+        return sentence.end() - start
     body = NMEA_BODY.match(buffer, start, start + NMEA_MAX_BYTES)
     star = body.end() if body else min(start + 1, len(buffer))
     if star - start > NMEA_MAX_BYTES - 5:
@@ -36,13 +44,21 @@ def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
 
 def intact_nmea(frame: bytes) -> bool:
     """Whether the two hexadecimal digits are the XOR of the body."""
-    body, _, digits = frame.rpartition(b"*")
-    return nmea_xor(body[1:]) == int(digits[:2], 16)
+    star = frame.rindex(b"*")
+    return nmea_xor(frame[1:star]) == int(frame[star + 1 : star + 3], 16)
 
 
 def nmea_name(frame: bytes) -> str:
     """``GGA`` whoever talks; a maker's own sentence by its whole address, u-blox's with its number (``PUBX00``)."""
-    match = NMEA_ADDRESS.match(frame)
+    comma = frame.find(b",", 0, NMEA_LONGEST_ADDRESS)
+    if comma < 0:
+        return _nmea_name(frame)
+    return _nmea_name(frame[: NMEA_NUMBER_END if comma == 5 and frame[1:5] == b"PUBX" else comma])
+
+
+@lru_cache(maxsize=256)
+def _nmea_name(beginning: bytes) -> str:
+    match = NMEA_ADDRESS.match(beginning)
     address, number = (match.group(1).decode(), match.group(2)) if match else ("", None)
     if not address.startswith("P") and len(address) == 5:
         return address[2:]
@@ -241,6 +257,7 @@ RTCM3 = FrameKind(
     measure_rtcm3,
     lambda frame: crc24q(frame) == 0,
     rtcm3_name,
+    crc24q_marks,
 )
 NOVATEL = FrameKind(
     "novatel",

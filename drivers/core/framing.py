@@ -22,6 +22,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.core.parser import ParserCounters
 
 UNDECIDED = 0  # what a measure says while the bytes there are do not tell the length
@@ -57,6 +60,9 @@ class FrameKind:
             buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`. With ``final`` nothing more will come.
         intact: whether the checksum of a complete frame is good.
         message_name: what a good frame is counted as.
+        marks: of up to twice ``max_bytes``, a number a place between them; those at two places are equal just where an
+            intact frame may lie between. For a checksum that is dear to make anew for each of many false frames that
+            overlap; None: it is not.
     """
 
     name: str
@@ -65,6 +71,7 @@ class FrameKind:
     measure: Callable[[bytes, int, bool], int]
     intact: Callable[[bytes], bool]
     message_name: Callable[[bytes], str]
+    marks: Callable[[bytes], NDArray[np.uint32]] | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> FrameKind:
         """A kind never changes: a parser's copy shares it."""
@@ -81,6 +88,32 @@ def sync_expression(kinds: Sequence[FrameKind]) -> re.Pattern[bytes]:
             expression = one + (b"(?:\\Z|" + expression + b")" if expression else b"")
         groups.append(b"(" + expression + b")")
     return re.compile(b"|".join(groups), re.DOTALL)
+
+
+class _Overlaps:
+    """The frames of one buffer whose kind has marks; those that overlap a bad one share the work of their checksums."""
+
+    def __init__(self, buffer: bytes) -> None:
+        self._buffer = buffer
+        self._bad_end = 0  # of the bad frames so far
+        self._kind: FrameKind | None = None  # whose marks these are
+        self._marks = memoryview(b"")
+        self._marked = 0  # the place of the first mark
+
+    def intact(self, kind: FrameKind, start: int, data: bytes) -> bool:
+        """Whether the checksum of a complete frame is good."""
+        assert kind.marks is not None
+        end = start + len(data)
+        if start >= self._bad_end:
+            good = kind.intact(data)
+        else:
+            if kind is not self._kind or end - self._marked >= len(self._marks):
+                self._kind, self._marked = kind, start
+                self._marks = kind.marks(self._buffer[start : start + 2 * kind.max_bytes]).data
+            good = self._marks[start - self._marked] == self._marks[end - self._marked]
+        if not good:
+            self._bad_end = max(self._bad_end, end)
+        return good
 
 
 class Framer:
@@ -116,20 +149,25 @@ class Framer:
     def _scan(self, *, final: bool) -> list[Frame]:
         buffer = self._pieces[0] if len(self._pieces) == 1 else b"".join(self._pieces)
         frames: list[Frame] = []
+        overlaps, messages = _Overlaps(buffer), self.counters.messages
         position, framed = 0, 0
         self._needed = 0
         while match := self._search(buffer, position):
             start = match.start()
             kind = self._kinds[(match.lastindex or 1) - 1]
-            end = start + self._measure(kind, buffer, start, final)
-            if end > len(buffer):
-                position, self._needed = start, end - start
-                break
-            if end <= start:
+            length = kind.measure(buffer, start, final)
+            end = start + length
+            if length <= 0 or end > len(buffer):
+                if needed := self._without_end(kind, length, len(buffer) - start, final):
+                    position, self._needed = start, needed
+                    break
                 position = start + 1
-            elif kind.intact(data := buffer[start:end]):
+                continue
+            data = buffer[start:end]
+            if kind.intact(data) if kind.marks is None else overlaps.intact(kind, start, data):
                 frames.append(Frame(kind.name, self._arrival(self._offset + end), data))
-                self._count(kind.message_name(data))
+                name = kind.message_name(data)  # noise makes any: those beyond what devices have are one
+                messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
                 framed += end - start
                 position = end
             else:
@@ -140,19 +178,13 @@ class Framer:
         self._release(buffer, position, framed)
         return frames
 
-    def _count(self, name: str) -> None:
-        """A good frame by its name; names beyond what devices have are one, since noise makes any."""
-        messages = self.counters.messages
-        messages[name if name in messages or len(messages) < MAX_NAMES else OTHER_NAMES] += 1
-
-    def _measure(self, kind: FrameKind, buffer: bytes, start: int, final: bool) -> int:
-        """Bytes of the frame at ``start``; one more than there are while undecided; 0 if it is none."""
-        length = kind.measure(buffer, start, final)
+    def _without_end(self, kind: FrameKind, length: int, there: int, final: bool) -> int:
+        """Bytes to wait for from the candidate's start on, of which some are there; 0 if it is no frame."""
         if length == UNDECIDED:
-            length = len(buffer) - start + 1
+            length = there + 1
         elif length == OVER_BOUND:
             self.counters.errors[f"{kind.name}_length_over_bound"] += 1
-        return 0 if length < 0 or (final and start + length > len(buffer)) else length
+        return 0 if final or length < 0 else length
 
     def _arrival(self, end_offset: int) -> int:
         """Host time of the read that brought the byte before ``end_offset``."""

@@ -79,6 +79,28 @@ class TestFiles:
             (START_NS // 10**9, HEAD[0], HEAD[1], 2368, b"\2" * 1206),
         ]
 
+    def test_a_heads_two_ports_are_merged_by_their_stamps_and_keep_their_own_order(self, tmp_path: Path) -> None:
+        """A log has them block by block. The stamps of a port that step back stay where they are."""
+        main, aux, second = "scanner/top", "scanner/top/aux", 10**9
+        stamps = [(main, n * 10) for n in range(40)] + [(aux, n * 45 + 5) for n in range(8)]
+        stamps += [(main, 400 + n * 10) for n in range(40)] + [(aux, 5 * second), (main, 5 * second + 1)]
+        stamps += [(main, 5 * second - 7), (aux, 5 * second + 2), (main, 9 * second), (aux, 9 * second - 1)]
+        units: list[Unit] = [(source, START_NS + at, source.encode(), HEAD) for source, at in stamps]
+        report = export(write_log(tmp_path / "log", write_config(tmp_path), units), tmp_path / "out")
+        found = []
+        with (report.folder / "scanner-top.pcap").open("rb") as stream:
+            stream.seek(24)
+            while head := stream.read(16):
+                seconds, fraction, length, _ = struct.unpack("<IIII", head)
+                frame = dpkt.ethernet.Ethernet(stream.read(length))
+                found.append((frame.data.data.data.decode(), seconds * second + fraction - START_NS))
+        stepped = found.index((main, 5 * second - 7))
+        assert found[stepped - 1] == (main, 5 * second + 1)
+        for source in (main, aux):
+            assert [unit for unit in found if unit[0] == source] == [unit for unit in stamps if unit[0] == source]
+        del found[stepped]
+        assert [at for _, at in found] == sorted(at for _, at in found)
+
     def test_stamps_of_a_pcap_are_in_nanoseconds(self, exported: ExportReport) -> None:
         data = (exported.folder / "scanner-top.pcap").read_bytes()
         assert struct.unpack_from("<I", data) == (0xA1B23C4D,)

@@ -17,8 +17,8 @@ from daemon.capture_files import Told
 from daemon.errors import UserError
 from daemon.exporting import export_session
 from daemon.log.reader import open_logs
+from daemon.places import take_directory
 from daemon.replay import timed_units
-from daemon.run import take_directory
 from drivers.core.can_frames import encode_can_frame
 from drivers.transports.capture_file import read_candump, read_pcap, read_serial
 from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames

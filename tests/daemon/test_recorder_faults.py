@@ -19,9 +19,12 @@ from typing import Any
 import pytest
 
 from daemon.acquire import MAX_SENDERS
+from daemon.errors import UserError
 from daemon.log.reader import open_logs
+from daemon.places import take_directory
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
 from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.test_cli import swath
 
 SPECIAL = "tests.daemon.special_recorder"
 
@@ -199,6 +202,43 @@ def test_directory_removed_while_recording(tmp_path: Path, logs: Path, numbers: 
                 content.units["scanner/left"] += [(0, row.tobytes()) for row in batch.units]
     assert found(content) == list(range(before, numbers.sent))
     assert read_events(path)[0]["code"] in ("log_gone", "part_opened")
+
+
+def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, logs: Path) -> None:
+    config = session_table(logs)
+    with Recorder(tmp_path / "one", config) as recorder:
+        recorder.wait_said("session_started")
+        shutil.rmtree(logs)
+        recorder.wait_said("part_opened")
+        wait_until((logs / ".swath.control").is_socket, "the socket is back")
+        assert swath("mark", "still here", str(logs)).returncode == 0
+        with pytest.raises(UserError, match="another recorder is at work there"):
+            take_directory(logs)
+        assert recorder.stop() == 0, recorder.stderr()
+    assert not (logs / ".swath.control").exists()
+    os.close(take_directory(logs))
+    (path,) = logs.glob("*.mcap")
+    assert "mark" in [event["code"] for event in read_events(path)]
+
+
+def test_another_recorder_that_takes_the_directory_made_anew_is_told_and_not_disturbed(
+    tmp_path: Path, logs: Path
+) -> None:
+    with Recorder(tmp_path, session_table(logs)) as recorder:
+        recorder.wait_said("session_started")
+        new = tmp_path / "new"
+        lock = take_directory(new)
+        (new / ".swath.control").touch()
+        logs.rename(tmp_path / "old")
+        new.rename(logs)
+        recorder.wait_said("directory_unlocked")
+        assert recorder.stop() == 0, recorder.stderr()
+    with pytest.raises(UserError, match="another recorder is at work there"):
+        take_directory(logs)
+    os.close(lock)
+    assert (logs / ".swath.control").is_file()
+    (path,) = logs.glob("*.mcap")
+    assert "directory_unlocked" in [event["code"] for event in read_events(path)]
 
 
 def test_directory_that_cannot_come_back_is_not_called_alive(tmp_path: Path, logs: Path, numbers: Numbers) -> None:

@@ -10,13 +10,14 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import can
 import pytest
 
-from daemon.wire_player import PtyOutput
+from daemon.wire_player import Output, PtyOutput, TimedUnit, play
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table
 from tests.daemon.test_cli import ROOT
@@ -161,3 +162,33 @@ def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> N
     assert time.monotonic() - started < 30  # waited for once, not two hundred times
     output.close()
     assert not (tmp_path / "port").is_symlink()
+
+
+class Dues(Output):
+    """Takes everything and remembers when it was due."""
+
+    def __init__(self) -> None:
+        self.realtime_ns: list[int] = []
+
+    def send(self, data: bytes, due_realtime_ns: int) -> bool:
+        self.realtime_ns.append(due_realtime_ns)
+        return True
+
+    def close(self) -> None:
+        return None
+
+
+def test_time_begins_with_the_first_unit_however_long_reading_up_to_it_takes() -> None:
+    """Else the first units of every source are late, and the ones after them are not."""
+    output, read_ns = Dues(), []
+
+    def units() -> Iterator[TimedUnit]:
+        read_ns.append(time.time_ns())
+        yield TimedUnit(5_000_000, "gnss/rover", b"$")
+        yield TimedUnit(6_000_000, "gnss/rover", b"$")
+
+    with one_processor():
+        play(units(), {"gnss/rover": output})
+    first_ns, second_ns = output.realtime_ns
+    assert first_ns >= read_ns[0]
+    assert second_ns - first_ns == 1_000_000

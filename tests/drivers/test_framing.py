@@ -20,10 +20,12 @@ from pysbf2 import calc_crc as crc16_reference
 from pyubx2 import calc_checksum as fletcher_reference
 
 from drivers.core.checksums import (
+    CRC24Q_MARKED_BYTES,
     CRC24Q_STEP_BYTES,
     FLETCHER_STEP_BYTES,
     crc16_ccitt,
     crc24q,
+    crc24q_marks,
     crc32_novatel,
     crc64_xz,
     crc64_xz_holds,
@@ -102,6 +104,20 @@ def test_checksums_equal_other_implementations(data: bytes) -> None:
 def test_crc24q_of_long_data_joins_its_steps(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert crc24q(data) == crc24q_reference(data)
+
+
+@pytest.mark.parametrize("begin", [0, 1, 700, CRC24Q_MARKED_BYTES - 150])
+def test_crc24q_marks_are_equal_where_a_good_frame_begins_and_ends_and_nowhere_else(begin: int) -> None:
+    content = b"\xd3\x00\x04abcd"
+    frame = content + crc24q_reference(content).to_bytes(3, "big")
+    noise = random.Random(begin)
+    data = noise.randbytes(begin) + frame + noise.randbytes(30) + frame + frame + noise.randbytes(90)
+    data = data[:CRC24Q_MARKED_BYTES]
+    marks = crc24q_marks(data).tolist()
+    assert len(marks) == len(data) + 1
+    for start in range(max(0, begin - 20), len(data)):
+        for end in range(start + 3, min(len(data), start + 60)):
+            assert (marks[start] == marks[end]) == (crc24q_reference(data[start:end]) == 0)
 
 
 @pytest.mark.parametrize("length", [FLETCHER_STEP_BYTES - 1, FLETCHER_STEP_BYTES, FLETCHER_STEP_BYTES + 1, 30_000])
@@ -333,6 +349,19 @@ def test_good_frames_inside_a_false_one_are_found(false_start: bytes) -> None:
     assert parser.counters.bytes_skipped == len(false_start)
 
 
+@pytest.mark.parametrize("read_bytes", [1, 64, 750, 100_000])
+@pytest.mark.parametrize("false", [b"\xd3\x03\xff", b"\xd3\x00", b"\xd3\x01\x50\x00"])
+def test_good_frames_among_overlapping_false_ones_are_found(false: bytes, read_bytes: int) -> None:
+    """Every false start is decided by a checksum of its own bytes, and each is counted."""
+    [rtcm3] = frames_of(recording("rtcm3", "rtcm3.2.log")).frames[:1]
+    one = false * 700 + rtcm3.data + false * 3 + rtcm3.data * 2 + GOOD + false
+    stream = one * 3 + bytes(1029)
+    parser = frames_of(*(stream[at : at + read_bytes] for at in range(0, len(stream), read_bytes)))
+    assert [frame.data for frame in parser.frames] == [rtcm3.data, rtcm3.data, rtcm3.data, GOOD] * 3
+    assert parser.counters.bad_checksums == 3 * 704
+    assert parser.counters.bytes_skipped == 3 * 704 * len(false) + 1029
+
+
 @pytest.mark.parametrize("kind", ALL_KINDS, ids=lambda kind: kind.name)
 def test_a_false_sync_holds_back_no_more_than_its_bound(kind: FrameKind) -> None:
     starts = {
@@ -369,7 +398,29 @@ def test_a_sentence_longer_than_the_bound_is_no_sentence() -> None:
     longest = encode_sentence("PTEST," + "x" * (NMEA_MAX_BYTES - 12))
     assert len(longest) == NMEA_MAX_BYTES
     assert len(frames_of(longest).frames) == 1
-    assert frames_of(encode_sentence("PTEST," + "x" * NMEA_MAX_BYTES)).frames == []
+    assert frames_of(encode_sentence("PTEST," + "x" * (NMEA_MAX_BYTES - 11))).frames == []
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        ("GPGGA,120000", "GGA"),
+        ("GNGGA,120001", "GGA"),
+        ("AIVDM,1,1", "VDM"),
+        ("PUBX,00,120000", "PUBX00"),
+        ("PUBX,04,120000", "PUBX04"),
+        ("PUBX,04", "PUBX04"),
+        ("PUBX,041", "PUBX"),
+        ("PUBX", "PUBX"),
+        ("PQTMVERNO,1", "PQTMVERNO"),
+        ("PASHR", "PASHR"),
+        ("GPabc,1", "GP"),
+        ("GPLONGERTHANANYADDRESS,1", "GPLONGERTHANANYADDRESS"),
+        ("A bc,1", "A"),
+    ],
+)
+def test_a_sentence_is_counted_by_its_name(body: str, name: str) -> None:
+    assert frames_of(encode_sentence(body) * 2).counters.messages == {name: 2}
 
 
 @pytest.mark.parametrize("ending", [b"\r\n", b"\n", b"", b"\r"])
