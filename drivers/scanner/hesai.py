@@ -128,7 +128,7 @@ class HesaiParser(PacketParser):
         if length not in self._dtypes:
             self._refuse("bad_length", len(units), length)
             return []
-        packets = np.ascontiguousarray(units).view(self._dtypes[length]).reshape(-1)
+        packets = units.view(self._dtypes[length])[:, 0]
         second_ns = NS * _utc_seconds(packets)
         good = self._check(packets)
         self.counters.messages["points"] += int(good.sum())

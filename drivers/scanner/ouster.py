@@ -164,8 +164,7 @@ class OusterParser(PacketParser):
     # -- lidar packets
 
     def _lidar(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
-        units = np.ascontiguousarray(units)
-        packets = units.view(self.layout.dtype).reshape(-1)
+        packets = units.view(self.layout.dtype)[:, 0]
         good = crc_holds(units) if self.layout.has_crc else np.ones(len(packets), dtype=np.bool_)
         self._select(good, self._criteria(packets), units.shape[1])
         self._count("lidar", int(good.sum()), units.shape[1])

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from georef.records import RETURN_DTYPE, StructArray
 
-BLOCK_SLOTS = 32768  # slots worked on at once: their rows and temporaries stay in the processor's second-level cache
+# Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
+# call does not count.
+BLOCK_SLOTS = 32768
 
 # Work is done column by column, where NumPy is quick, and rows are written once, in 64-bit words: columns of words are
 # transposed. `common_words` are the last of a row, its fields from the channel on.
@@ -80,7 +82,7 @@ class ReturnSlots:
                 place = (index - pulse * slots) * pulses + pulse
             self._write_pulses(words, pulse)
             self._write_slots(words, place)
-            if slots > 1:
+            if slots > 1:  # the two bytes after the channel's
                 words[-1].view("<u2")[1::4] = _numbers(self.range_raw != 0).reshape(-1)[place]
         table[: len(index)].view(np.uint64).reshape(-1, _WORDS)[:] = words.T
         return len(index)

@@ -122,7 +122,7 @@ class VelodyneParser(PacketParser):
         if units.shape[1] != DATA_BYTES:
             self._refuse("bad_length", len(units), units.shape[1])
             return []
-        packets = np.ascontiguousarray(units).view(PACKET_DTYPE).reshape(-1)
+        packets = units.view(PACKET_DTYPE)[:, 0]
         good = self._check(packets)
         self.counters.messages["data"] += int(good.sum())
         self.counters.bytes_framed += int(good.sum()) * DATA_BYTES
