@@ -198,7 +198,7 @@ def _xz_part(content: bytes) -> bytes:
 _XZ_BEGIN = b"\xfd7zXZ\0" + _xz_part(bytes([0, 4])) + _xz_part(bytes([2, 0, 0x21, 1, 0, 0, 0, 0]))
 
 
-def crc64_xz_holds(data: bytes, crc: bytes) -> bool:
+def crc64_xz_holds(data: bytes | memoryview, crc: bytes | memoryview) -> bool:
     """Whether this is the data's CRC-64/XZ, little-endian: a tenth of the time `crc64_xz` needs to make one.
 
     liblzma compares it: the data is handed to it as the one stored chunk of an .xz block (The .xz File Format, 2.1,
@@ -208,9 +208,9 @@ def crc64_xz_holds(data: bytes, crc: bytes) -> bool:
         data: 1 to 65536 bytes.
         crc: 8 bytes.
     """
-    chunk = b"\x01" + (len(data) - 1).to_bytes(2, "big") + data + bytes(1 + -len(data) % 4)
+    chunk = (b"\x01", (len(data) - 1).to_bytes(2, "big"), data, bytes(1 + -len(data) % 4))
     try:
-        lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(_XZ_BEGIN + chunk + crc)
+        lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(b"".join((_XZ_BEGIN, *chunk, crc)))
     except lzma.LZMAError:
         return False
     return True

@@ -128,7 +128,7 @@ class HesaiParser(PacketParser):
         if length not in self._dtypes:
             self._refuse("bad_length", len(units), length)
             return []
-        packets = np.ascontiguousarray(units).view(self._dtypes[length]).reshape(-1)
+        packets = units.view(self._dtypes[length])[:, 0]
         second_ns = NS * _utc_seconds(packets)
         good = self._check(packets)
         self.counters.messages["points"] += int(good.sum())
@@ -233,7 +233,7 @@ class HesaiParser(PacketParser):
             host_time_ns=host_time_ns,
             number=number,
             most=head.blocks * head.channels,
-            device_time_ns=stamp_ns[:, np.newaxis] + firing_ns,
+            device_time_ns=(stamp_ns[:, np.newaxis], firing_ns[np.newaxis]),
             azimuth_rad=_azimuths(azimuth, packets["motor_rpm"], head),
             channel=np.arange(head.channels, dtype=np.uint16),
             flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._gps.locked == 1 else 0),
@@ -245,7 +245,7 @@ def _azimuths(azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: 
     """Azimuths (n, rounds, channels) at each firing, radians, 0 … 2π, from those of the rounds (n, rounds)."""
     turn = (motor_rpm * _RAD_PER_NS_AT_1_RPM)[:, np.newaxis] * head.offset_ns
     angle: FloatArray = (azimuth * (2 * np.pi / FULL_CIRCLE))[:, :, np.newaxis] + turn[:, np.newaxis, :]
-    angle -= (2 * np.pi) * (angle >= 2 * np.pi)
+    np.subtract(angle, 2 * np.pi, out=angle, where=angle >= 2 * np.pi)
     return angle
 
 

@@ -34,7 +34,7 @@ from drivers.scanner.ouster_layout import (
 )
 from drivers.scanner.ouster_probe import OusterProbe
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, BeamColumns, ReturnSlots, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -164,8 +164,7 @@ class OusterParser(PacketParser):
     # -- lidar packets
 
     def _lidar(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
-        units = np.ascontiguousarray(units)
-        packets = units.view(self.layout.dtype).reshape(-1)
+        packets = units.view(self.layout.dtype)[:, 0]
         good = crc_holds(units) if self.layout.has_crc else np.ones(len(packets), dtype=np.bool_)
         self._select(good, self._criteria(packets), units.shape[1])
         self._count("lidar", int(good.sum()), units.shape[1])
@@ -265,32 +264,29 @@ class OusterParser(PacketParser):
 
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:
         """The slots of valid columns; ``number`` is each column's, counted from the first frame on."""
-        flags: dict[str, NDArray[Any] | int] = {}
+        beam = np.arange(self.head.beams)
+        flags = 0
         per_slot: dict[str, NDArray[Any]] = {}
-        chosen: NDArray[np.intp] | None = None
         range_raw, light = (self._words(columns, name) for name in ("RANGE", self._light))
         if self.layout.dual:
-            second = self._words(columns, "RANGE2")
-            chosen = np.flatnonzero(range_raw | second)
-            light2 = self._words(columns, f"{self._light}2")[chosen]
-            range_raw, light, per_slot["flags"] = _pair_returns(
-                (range_raw[chosen], second[chosen]), (light[chosen], light2), self._strongest
-            )
+            range2, light2 = (self._words(columns, f"{name}2") for name in ("RANGE", self._light))
+            range_raw, light, per_slot["flags"] = _pair_returns((range_raw, range2), (light, light2), self._strongest)
         else:
-            range_raw, light = range_raw[:, np.newaxis], light[:, np.newaxis]
-            flags["flags"] = _SINGLE_FLAGS.get(self.head.return_order, 0)
-        per_column = {
-            "host_time_ns": host_time_ns,
-            "device_time_ns": columns["time_ns"].reshape(-1),
-            "encoder_rad": self._encoder_rad[columns["id"].reshape(-1)],
-        }
+            range_raw, light = range_raw[np.newaxis], light[np.newaxis]
+            flags = _SINGLE_FLAGS.get(self.head.return_order, 0)
         return ReturnSlots(
             range_raw=range_raw,
             range_unit_m=RANGE_MM * (1 << self.layout.profile.fields["RANGE"].dropped),
             intensity=light,
+            common=common_words((1, len(beam)), channel=beam, flags=flags),
+            shape=(len(number), len(beam)),
+            per_pulse={
+                "host_time_ns": (host_time_ns[:, np.newaxis],),
+                "device_time_ns": (columns["time_ns"].reshape(-1, 1),),
+                "encoder_rad": (self._encoder_rad[columns["id"].reshape(-1, 1)],),
+                "pulse_id": ((number * len(beam))[:, np.newaxis], beam[np.newaxis]),
+            },
             per_slot=per_slot,
-            per_pulse={"pulse_width_ns": 0, "mta_zone": 0, **flags},
-            columns=BeamColumns(self.head.beams, number * self.head.beams, per_column, chosen),
         )
 
     def _words(self, columns: StructArray, name: str) -> Words:
@@ -299,7 +295,7 @@ class OusterParser(PacketParser):
 
 
 def _pair_returns(ranges: WordPair, light: WordPair, strongest: str) -> tuple[Words, Words, NDArray[np.uint8]]:
-    """Two returns of a block, as sent, as slots (pulses, 2) of rising range: range, light and flags.
+    """Two returns of a block, as sent, as slots (2, pulses) of rising range: range, light and flags.
 
     Args:
         ranges, light: first and second of the block, each (pulses,).
@@ -307,17 +303,18 @@ def _pair_returns(ranges: WordPair, light: WordPair, strongest: str) -> tuple[Wo
     """
     first, second = ranges
     near, far = np.minimum(first, second), np.maximum(first, second)
+    # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
     two = near > 0
     in_order = (first == near) == two  # the nearer, or the only one, is the first
     near_strongest = in_order if strongest == "first" else (light[0] >= light[1]) == in_order
     said = np.uint8(0 if strongest == "unsaid" else RETURN_FLAG_STRONGEST)
-    alone = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
-    slots = np.empty((2, len(first), 2), dtype=np.uint32)
-    slots[0, :, 0], slots[0, :, 1] = np.where(two, near, far), np.where(two, far, 0)
-    slots[1, :, 0], slots[1, :, 1] = np.where(in_order, *light), np.where(in_order, light[1], light[0])
-    flags = np.empty((len(first), 2), dtype=np.uint8)
-    flags[:, 0] = np.where(two, near_strongest * said, alone)
-    flags[:, 1] = RETURN_FLAG_LAST + ~near_strongest * said
+    alone, last = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST), np.uint8(RETURN_FLAG_LAST)
+    swap = (light[0] ^ light[1]) * ~in_order
+    slots, flags = np.empty((2, 2, len(first)), dtype=np.uint32), np.empty((2, len(first)), dtype=np.uint8)
+    slots[0, 0], slots[0, 1] = near + far * ~two, far * two
+    slots[1, 0], slots[1, 1] = light[0] ^ swap, light[1] ^ swap
+    flags[0] = near_strongest * two * said + ~two * alone
+    flags[1] = last + ~near_strongest * said
     return slots[0], slots[1], flags
 
 

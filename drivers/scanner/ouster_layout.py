@@ -308,6 +308,6 @@ def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
     said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
     holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():
-        packet = units[row].tobytes()
+        packet = units[row].data
         holds[row] = crc64_xz_holds(packet[:-8], packet[-8:])
     return holds

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.scanner.beams import FloatArray
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
 from georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 
@@ -26,7 +26,8 @@ class Firings:
         host_time_ns: (packets,).
         number: (packets,) running number of each packet.
         most: firings a packet holds at most: packets' pulse ids are so far apart.
-        device_time_ns, azimuth_rad: of each firing, (packets, …).
+        device_time_ns: of each firing, the sum of these arrays, each (packets, firings), (packets, 1) or (1, firings).
+        azimuth_rad: of each firing, (packets, …).
         channel: (lasers,) of a group of firings, which repeats.
         flags: of all returns.
         pair: in dual return, whether one of the two is the strongest and whether one is the last return; else None.
@@ -37,7 +38,7 @@ class Firings:
     host_time_ns: Int64Array
     number: Int64Array
     most: int
-    device_time_ns: Int64Array
+    device_time_ns: tuple[Int64Array, ...]
     azimuth_rad: FloatArray
     channel: NDArray[np.uint16]
     flags: int
@@ -47,27 +48,28 @@ class Firings:
         """Their places for returns."""
         per_slot: dict[str, NDArray[Any]] = {}
         if self.pair is None:
-            range_raw = self.returns["range"].reshape(-1, 1)
-            reflectivity = self.returns["reflectivity"].reshape(-1, 1)
+            range_raw = self.returns["range"].reshape(1, -1)
+            reflectivity = self.returns["reflectivity"].reshape(1, -1)
         else:
             range_raw, reflectivity, flags = pair_slots(self.returns, *self.pair)
             per_slot["flags"] = flags | np.uint8(self.flags)
         packets = len(self.number)
-        shape = (packets, len(range_raw) // packets)
-        repeats = len(range_raw) // len(self.channel)
-        serial = self.number[:, np.newaxis] * self.most + np.arange(shape[1])
-        per_pulse: dict[str, NDArray[Any] | int] = {
-            "host_time_ns": np.broadcast_to(self.host_time_ns[:, np.newaxis], shape).reshape(-1),
-            "device_time_ns": self.device_time_ns.reshape(-1),
-            "encoder_rad": self.azimuth_rad.reshape(-1),
-            "pulse_id": serial.reshape(-1),
-            "channel": np.broadcast_to(self.channel, (repeats, len(self.channel))).reshape(-1),
-            "pulse_width_ns": 0,
-            "mta_zone": 0,
-        }
-        if self.pair is None:
-            per_pulse["flags"] = self.flags
-        return ReturnSlots(range_raw, self.range_unit_m, reflectivity, per_pulse, per_slot)
+        firing = np.arange(range_raw.shape[1] // packets)
+        shape = (packets, len(firing))
+        return ReturnSlots(
+            range_raw=range_raw,
+            range_unit_m=self.range_unit_m,
+            intensity=reflectivity,
+            common=common_words((1, len(firing)), channel=self.channel[firing % len(self.channel)], flags=self.flags),
+            shape=shape,
+            per_pulse={
+                "host_time_ns": (self.host_time_ns[:, np.newaxis],),
+                "device_time_ns": self.device_time_ns,
+                "encoder_rad": (self.azimuth_rad.reshape(shape),),
+                "pulse_id": ((self.number * self.most)[:, np.newaxis], firing[np.newaxis]),
+            },
+            per_slot=per_slot,
+        )
 
 
 def returns_of_packets(mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings]) -> StructArray:
@@ -91,7 +93,7 @@ def returns_of_packets(mode: NDArray[np.uint8], most: int, firings_of: Callable[
 def pair_slots(
     returns: StructArray, names_strongest: bool, names_last: bool
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Dual returns as slots (pulses, 2): range, reflectivity and flags.
+    """Dual returns as slots (2, pulses): range, reflectivity and flags.
 
     Equal ranges are one return, the only one: strongest and last. Of two the nearer comes first. Where the pair holds
     the last return it is the farther; where it holds the strongest, that is the one of greater reflectivity (the second
@@ -104,15 +106,18 @@ def pair_slots(
     """
     one, other = (returns["range"][:, at::2].reshape(-1) for at in (0, 1))
     one_light, other_light = (returns["reflectivity"][:, at::2].reshape(-1) for at in (0, 1))
+    # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
     other_is_far = other > one
     near, far = np.minimum(one, other), np.maximum(one, other)
-    near_light = np.where(other_is_far, one_light, other_light)
-    far_light = np.where(other_is_far, other_light, one_light)
+    swap = (one_light ^ other_light) * other_is_far
+    near_light, far_light = other_light ^ swap, one_light ^ swap
     two = (near > 0) & (near != far)
     near_strongest = (near_light > far_light) | ((near_light == far_light) & ~other_is_far)
     alone = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
     strongest, last = np.uint8(RETURN_FLAG_STRONGEST * names_strongest), np.uint8(RETURN_FLAG_LAST * names_last)
-    range_slots = np.stack([np.where(two, near, far), np.where(two, far, 0)], axis=1)
-    light_slots = np.stack([np.where(two, near_light, far_light), far_light], axis=1)
-    flags = np.stack([np.where(two, near_strongest * strongest, alone), last + ~near_strongest * strongest], axis=1)
-    return range_slots, light_slots, flags.astype(np.uint8, copy=False)
+    ranges, (lights, flags) = np.empty((2, len(one)), np.uint16), np.empty((2, 2, len(one)), np.uint8)
+    ranges[0], ranges[1] = near + far * (near == 0), far * two
+    lights[0], lights[1] = far_light ^ (near_light ^ far_light) * two, far_light
+    flags[0] = near_strongest * two * strongest + ~two * alone
+    flags[1] = last + ~near_strongest * strongest
+    return ranges, lights, flags

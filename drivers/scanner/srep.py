@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
 from drivers.scanner.srep_layout import (
     CRC,
     FLAG_LASER_ON,
@@ -79,15 +79,22 @@ class ScanAngle:
             self._facets = facets
 
     def angles(
-        self, encoder: NDArray[np.int32], encoder_counts: NDArray[np.uint32]
-    ) -> tuple[NDArray[np.float64], NDArray[Any] | int]:
-        """Scan angles (n, N) in radians and facets (n, N) of readings (n, N) with counts a revolution (n, 1)."""
+        self, encoder: NDArray[np.int32], encoder_counts: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64] | None]:
+        """Scan angles (n, N) in radians and, of a polygon, facets (n, N) of readings (n, N)."""
         if not self._facets:
-            return encoder * (2 * np.pi * self._factor / encoder_counts), 0
-        counts = encoder_counts.astype(np.int64)
-        facet, within = np.divmod(encoder.astype(np.int64) * self._facets, counts)
-        angle = (within / counts - 0.5) * (4 * np.pi / self._facets)  # 2 · (shaft angle − facet centre)
-        return angle, (facet % self._facets).astype(np.uint16)
+            angle = encoder.astype(np.float64)
+            angle *= 2 * np.pi * self._factor / encoder_counts
+            return angle, None
+        turned = encoder.astype(np.int64)
+        turned *= self._facets
+        facet = turned // encoder_counts  # np.divmod takes several times as long
+        turned -= facet * encoder_counts
+        angle = turned / encoder_counts
+        angle -= 0.5
+        angle *= 4 * np.pi / self._facets  # 2 · (shaft angle − facet centre)
+        facet -= facet // self._facets * self._facets
+        return angle, facet
 
 
 class SrepParser(PacketParser):
@@ -158,9 +165,10 @@ class SrepParser(PacketParser):
             self._refuse(code, int((good & ~passes).sum()))
             good &= passes
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
+        content = units[:, : -CRC.size]
+        said = np.ascontiguousarray(units[:, -CRC.size :]).view("<u4")[:, 0].tolist()
         for row in np.flatnonzero(verify).tolist():
-            unit = units[row]
-            if crc32(unit[: -CRC.size]) != CRC.unpack(unit[-CRC.size :])[0]:
+            if crc32(content[row]) != said[row]:
                 good[row] = False
                 self.counters.bad_checksums += 1
         self.counters.bytes_framed += length * int(good.sum())
@@ -207,34 +215,32 @@ class SrepParser(PacketParser):
     def _block(
         self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
     ) -> ReturnSlots:
-        """The slots of datagrams that have N, R and tick_hz in common."""
+        """The slots of datagrams of one layout."""
         n, pulses, slots = len(units), int(header["pulses"][0]), int(header["return_slots"][0])
         body = units[:, HEADER_BYTES : -CRC.size].view(pulse_dtype(slots))
-        angle, facet = self._scan_angle.angles(body["encoder"], header["encoder_counts"][:, np.newaxis])
-        number = np.arange(pulses, dtype=np.uint64)
-        shape = (n, pulses)
-
-        def every_pulse(values: NDArray[Any]) -> NDArray[Any] | int:
-            if (values == values[0]).all():
-                return int(values[0])
-            return np.broadcast_to(values[:, np.newaxis], shape).reshape(-1)
-
+        angle, facet = self._scan_angle.angles(body["encoder"], int(header["encoder_counts"][0]))
+        per_pulse: dict[str, tuple[NDArray[Any], ...]] = {
+            "host_time_ns": (host_time_ns[:, np.newaxis],),
+            "device_time_ns": (pulse_times(header, body["ticks"]),),
+            "encoder_rad": (angle,),
+            "pulse_id": ((unwrapped << 16)[:, np.newaxis], np.arange(pulses)[np.newaxis]),
+        }
+        if facet is not None:
+            per_pulse["channel"] = (facet,)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
-        slot = body["slot"]
+
+        def by_slot(name: str) -> NDArray[Any]:
+            return np.moveaxis(body["slot"][name], 2, 0).reshape(slots, -1)
+
+        width = by_slot("pulse_width") * np.float32(PULSE_WIDTH_UNIT_NS)
         return ReturnSlots(
-            range_raw=slot["range"].reshape(-1, slots),
+            range_raw=by_slot("range"),
             range_unit_m=RANGE_UNIT_M,
-            intensity=slot["intensity"].reshape(-1, slots),
-            per_slot={"pulse_width_ns": slot["pulse_width"] * np.float32(PULSE_WIDTH_UNIT_NS)},
-            per_pulse={
-                "host_time_ns": every_pulse(host_time_ns),
-                "device_time_ns": pulse_times(header, body["ticks"]).reshape(-1),
-                "encoder_rad": angle.reshape(-1),
-                "pulse_id": ((unwrapped.astype(np.uint64) << np.uint64(16))[:, np.newaxis] + number).reshape(-1),
-                "channel": facet if isinstance(facet, int) else facet.reshape(-1),
-                "mta_zone": every_pulse(header["mta_zone"]),
-                "flags": every_pulse(locked),
-            },
+            intensity=by_slot("intensity"),
+            common=common_words((n, 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis]),
+            shape=(n, pulses),
+            per_pulse=per_pulse,
+            per_slot={"pulse_width_ns": width},
         )
 
 
@@ -243,8 +249,12 @@ def _headers(units: ByteRows) -> StructArray:
 
 
 def _same_layout(header: StructArray) -> list[tuple[int, int]]:
-    """Bounds of runs of datagrams with equal N, R and tick_hz, none of more than `BLOCK_SLOTS` slots (or one row)."""
-    layout = np.stack([header[name].astype(np.int64) for name in ("pulses", "return_slots", "tick_hz")], axis=1)
+    """Bounds of runs of datagrams of one layout: equal N, R, tick_hz and encoder_counts.
+
+    None is of more than `BLOCK_SLOTS` slots (or one row).
+    """
+    names = ("pulses", "return_slots", "tick_hz", "encoder_counts")
+    layout = np.stack([header[name].astype(np.int64) for name in names], axis=1)
     edges = [0, *(np.flatnonzero((layout[1:] != layout[:-1]).any(axis=1)) + 1).tolist(), len(header)]
     bounds = []
     for start, stop in pairwise(edges):

@@ -142,7 +142,10 @@ def pulse_times(header: StructArray, ticks: NDArray[np.uint32]) -> Int64Array:
     hz = int(header["tick_hz"][0])
     seconds, rest = np.divmod(header["first_ticks"], np.uint64(hz))
     base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * _NS
-    after = ticks + rest.astype(np.int64)[:, np.newaxis]
-    after = after * (_NS // hz) if _NS % hz == 0 else after * _NS // hz
+    after = ticks.astype(np.int64)
+    after += rest.astype(np.int64)[:, np.newaxis]
+    after *= _NS // hz if _NS % hz == 0 else _NS
+    if _NS % hz:
+        after //= hz
     after += base[:, np.newaxis]
     return after

@@ -122,7 +122,7 @@ class VelodyneParser(PacketParser):
         if units.shape[1] != DATA_BYTES:
             self._refuse("bad_length", len(units), units.shape[1])
             return []
-        packets = np.ascontiguousarray(units).view(PACKET_DTYPE).reshape(-1)
+        packets = units.view(PACKET_DTYPE)[:, 0]
         good = self._check(packets)
         self.counters.messages["data"] += int(good.sum())
         self.counters.bytes_framed += int(good.sum()) * DATA_BYTES
@@ -228,13 +228,13 @@ class VelodyneParser(PacketParser):
         )
 
 
-def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> Int64Array:
-    """Device times (n, groups · places) of firings (9.4)."""
+def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> tuple[Int64Array, ...]:
+    """Device times (n, groups · places) of firings (9.4), as a sum."""
     offset = (np.arange(groups)[:, np.newaxis] * head.group_ns + head.offset_ns).reshape(-1) + head.stamp_ns
-    times: Int64Array = (stamp_us.astype(np.int64) * 1000)[:, np.newaxis] + offset
-    if len(times) and (times.max() >= HOUR_NS or times.min() < 0):
-        times %= HOUR_NS
-    return times
+    first = stamp_us.astype(np.int64) * 1000
+    if first.max() + offset.max() >= HOUR_NS or first.min() + offset.min() < 0:
+        return ((first[:, np.newaxis] + offset) % HOUR_NS,)
+    return first[:, np.newaxis], offset[np.newaxis]
 
 
 def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead) -> FloatArray:
@@ -243,7 +243,7 @@ def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: Spinni
     The rotation is that to the packet's next group, of the last group that to it; of a packet's only group it is
     ``turn`` (n,).
     """
-    start = azimuth.astype(np.int32)
+    start = azimuth.astype(np.float64)
     gap = np.empty(start.shape)
     if start.shape[1] == 1:
         gap[:, 0] = turn
@@ -254,8 +254,9 @@ def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: Spinni
     if odd.any():
         usual = np.where(odd, 0, gap).sum(axis=1) // np.maximum(1, (~odd).sum(axis=1))
         gap = np.where(odd, usual[:, np.newaxis], gap)
-    firing: FloatArray = gap[:, :, np.newaxis] * (head.offset_ns / head.group_ns) + start[:, :, np.newaxis]
-    firing -= FULL_CIRCLE * (firing >= FULL_CIRCLE)
+    firing: FloatArray = gap[:, :, np.newaxis] * (head.offset_ns / head.group_ns)
+    firing += start[:, :, np.newaxis]
+    np.subtract(firing, FULL_CIRCLE, out=firing, where=firing >= FULL_CIRCLE)
     firing *= 2 * np.pi / FULL_CIRCLE
     return firing
 
