@@ -24,7 +24,7 @@ import threading
 import time
 import tty
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from daemon.log.reader import open_logs
@@ -45,6 +45,7 @@ class Figure:
     limit_cpu_percent: float | None
     rss_mb: float
     note: str = ""
+    lost: dict[str, int] = field(default_factory=dict)
 
 
 def cpu_s(pid: int) -> float:
@@ -126,7 +127,7 @@ def record_udp(length: int, rate: float, seconds: float) -> Figure:
     note = f"{sent / took:,.0f} datagrams/s, {sent * length / took / 1e6:.0f} MB/s"
     lost = {key: status[key] for key in ("lost_kernel", "lost_queue", "lost_write") if status[key]}
     name = f"UDP {rate:,.0f} × {length} B/s"
-    return Figure(name, sent, status["written"], cpu, None, highest, note + str(lost or ""))
+    return Figure(name, sent, status["written"], cpu, None, highest, note, lost)
 
 
 BARE = """
@@ -315,10 +316,11 @@ def median(runs: list[Figure]) -> Figure:
     """The run in the middle by its CPU; the losses of all runs stand behind it."""
     middle = sorted(runs, key=lambda figure: figure.cpu_percent)[len(runs) // 2]
     lost = sum(figure.sent - figure.recorded for figure in runs)
+    where = "; ".join(f"{key} {count}" for figure in runs for key, count in figure.lost.items())
     spread = f"{min(f.cpu_percent for f in runs):.1f} to {max(f.cpu_percent for f in runs):.1f}"
     limits = [figure.limit_cpu_percent for figure in runs if figure.limit_cpu_percent is not None]
     bare = statistics.median(limits) if limits else None
-    note = f"{middle.note}; {lost} lost in {len(runs)} runs; {spread} %"
+    note = f"{middle.note}; {lost} lost in {len(runs)} runs{f' ({where})' if where else ''}; {spread} %"
     return replace(middle, limit_cpu_percent=bare, rss_mb=max(f.rss_mb for f in runs), note=note)
 
 
