@@ -275,21 +275,21 @@ class UnitReceiver(Receiver):
         self.tell_account(now=True)
 
     def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
+        counts = [len(block.units) for block in blocks]
+        if all(block.kernel_realtime_ns is None for block in blocks):  # of a serial port: the time they were read
+            read_ns = self.shared.clock.now_ns()
+            return [np.array([read_ns] * count, dtype=np.int64) for count in counts]
         pair = read_clock_pair()
         if len(blocks) == 1:
-            host = self.stamps.convert_at(blocks[0].kernel_realtime_ns, len(blocks[0].units), pair)
+            host = self.stamps.convert_at(blocks[0].kernel_realtime_ns, counts[0], pair)
             self.account.ambiguous = self.stamps.ambiguous
             return [host]
-        counts = [len(block.units) for block in blocks]
-        if all(block.kernel_realtime_ns is None for block in blocks):
-            joined = None
-        else:
-            joined = np.concatenate(
-                [
-                    np.zeros(n, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
-                    for block, n in zip(blocks, counts, strict=True)
-                ]
-            )
+        joined = np.concatenate(
+            [
+                np.zeros(count, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
+                for block, count in zip(blocks, counts, strict=True)
+            ]
+        )
         host = self.stamps.convert_at(joined, sum(counts), pair)
         self.account.ambiguous = self.stamps.ambiguous
         return np.split(host, np.cumsum(counts)[:-1])

@@ -26,7 +26,7 @@ from drivers.transports.uri import TransportSpec
 KERNEL_STAMPED = frozenset({"udp_multicast"})
 MAX_FRAMES = 1000  # bounds one receive
 SLICE_S = 0.1  # a bus without a descriptor is asked in slices, so that a close from outside is noticed
-BATCH_S = 0.016  # 130 frames of a full 1 Mbit/s bus; the kernel has their stamps
+BATCH_S = 0.032  # 260 frames of a full 1 Mbit/s bus; the kernel has their stamps
 BUFFER_BYTES = 4 << 20
 SEND_TIMEOUT_S = 1.0
 
