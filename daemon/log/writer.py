@@ -22,7 +22,7 @@ from isal.isal_zlib import crc32
 from mcap import records
 
 from daemon.log.claim import claim
-from daemon.log.durable import sync_directory
+from daemon.log.durable import begin_writing_out, sync_directory
 from daemon.log.encode import EncodedBlock, message_index
 from daemon.log.format import (
     CHUNK_BYTES,
@@ -39,6 +39,7 @@ from daemon.log.format import (
 from daemon.log.summary import ChunkPieces, SchemaTable, Summary, record_bytes
 
 _OP_CHUNK, _OP_FOOTER = 6, 2
+WRITE_OUT_BYTES = 8 << 20  # that the disk is given to write at once; a second's worth is too much to wait for
 _FIXED_CHUNK_FIELDS = 40  # start u64, end u64, size u64, crc u32, compression length u32, records length u64
 
 
@@ -83,6 +84,7 @@ class PartWriter:
         self.written: Counter[int] = Counter()
         self.lost: Counter[int] = Counter()
         self.bytes_written = 0
+        self._written_out = 0  # of them the disk has been told of
         self._compression = compression
         self._specs: dict[int, ChannelSpec] = {}
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
@@ -316,6 +318,9 @@ class PartWriter:
             self._cut_back(start)
             raise LogWriteError(error.errno, error.strerror or "cannot write", str(self.path)) from error
         self.bytes_written = start + total
+        if self.bytes_written - self._written_out >= WRITE_OUT_BYTES:
+            begin_writing_out(self._fd, self._written_out, self.bytes_written - self._written_out)
+            self._written_out = self.bytes_written
         return start
 
     def _cut_back(self, size: int) -> None:
