@@ -148,7 +148,13 @@ def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path)
     ):
         recorder.wait_said("device_opened")
         time.sleep(4.0)
-        _, found = once(logs)
+        found: dict[str, Any] = {}
+
+        def is_decoded() -> bool:  # a busy machine takes its time, and some seconds are passed over
+            found.update(once(logs)[1])
+            return "decoded" in found["sources"]["imu/main"]
+
+        wait_until(is_decoded, "messages of the inertial unit in the monitor's line")
         assert recorder.stop() == 0
     main = found["sources"]["imu/main"]
     assert main["state"] == "in gnss/rover"

@@ -9,7 +9,16 @@ import numpy as np
 
 from drivers.core.can_frames import encode_can_frame
 from drivers.core.parser import DeviceSettings, Parser
-from georef.records import ByteRows, ChunkBatch, DeviceClockSamples, ImuSamples, Int64Array, Record, StructArray
+from georef.records import (
+    IMU_DTYPE,
+    ByteRows,
+    ChunkBatch,
+    DeviceClockSamples,
+    ImuSamples,
+    Int64Array,
+    Record,
+    StructArray,
+)
 
 ACC, GYR, SAMPLE, SYNC, TEMP = 0x101, 0x102, 0x103, 0x104, 0x105
 
@@ -101,10 +110,11 @@ def feed(parser: Parser, frames: list[bytes], host_time_ns: Int64Array | None = 
 
 
 def imu_rows(records: list[Record]) -> StructArray:
-    """All `ImuSamples` rows of a list of records."""
+    """All `ImuSamples` rows of a list of records, zeros between their fields, so that bytes can be compared."""
     rows = [record.rows for record in records if isinstance(record, ImuSamples)]
     assert rows, "no samples"
-    return np.concatenate(rows)
+    together = np.zeros(sum(map(len, rows)), IMU_DTYPE)
+    return np.concatenate(rows, out=together)
 
 
 def clock_rows(records: list[Record]) -> StructArray:
