@@ -67,8 +67,11 @@ class JournalHandler(logging.Handler):
 
 
 def threads_text() -> str:
-    """Where every thread of this process stands."""
-    with os.fdopen(os.memfd_create("threads"), "w+b") as file:
-        faulthandler.dump_traceback(file)
-        file.seek(0)
-        return file.read().decode(errors="replace")
+    """Where every thread of this process stands; why it cannot be said, where it cannot."""
+    try:
+        with os.fdopen(os.memfd_create("threads"), "w+b") as file:
+            faulthandler.dump_traceback(file)
+            file.seek(0)
+            return file.read().decode(errors="replace")
+    except OSError as error:
+        return f"no word of the threads: {error}"
