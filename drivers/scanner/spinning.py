@@ -5,14 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.scanner.beams import FloatArray
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
-from georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
+from drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
+from georef.records import Int64Array, StructArray
+
+# A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` is all but the range.
+_CONTENT = np.dtype(
+    {
+        "names": ["strength", "intensity", "range"],
+        "formats": ["<u2", "u1", "<u2"],
+        "offsets": [0, 1, 2],
+        "itemsize": 4,
+    }
+)
 
 
 @dataclass(slots=True)
@@ -46,29 +55,23 @@ class Firings:
 
     def slots(self) -> ReturnSlots:
         """Their places for returns."""
-        per_slot: dict[str, NDArray[Any]] = {}
-        if self.pair is None:
-            range_raw = self.returns["range"].reshape(1, -1)
-            reflectivity = self.returns["reflectivity"].reshape(1, -1)
-        else:
-            range_raw, reflectivity, flags = pair_slots(self.returns, *self.pair)
-            per_slot["flags"] = flags | np.uint8(self.flags)
         packets = len(self.number)
-        firing = np.arange(range_raw.shape[1] // packets)
+        content = single_content(self.returns) if self.pair is None else pair_content(self.returns)
+        firing = np.arange(len(content) // packets)
         shape = (packets, len(firing))
         return ReturnSlots(
-            range_raw=range_raw,
+            content=content,
+            there=content.view("<u4") > 0xFFFF,
             range_unit_m=self.range_unit_m,
-            intensity=reflectivity,
             common=common_words((1, len(firing)), channel=self.channel[firing % len(self.channel)], flags=self.flags),
             shape=shape,
+            pulse_id=self.number * self.most,
             per_pulse={
                 "host_time_ns": (self.host_time_ns[:, np.newaxis],),
                 "device_time_ns": self.device_time_ns,
                 "encoder_rad": (self.azimuth_rad.reshape(shape),),
-                "pulse_id": ((self.number * self.most)[:, np.newaxis], firing[np.newaxis]),
             },
-            per_slot=per_slot,
+            pair=None if self.pair is None else PairRule(_strength, *self.pair),
         )
 
 
@@ -90,34 +93,31 @@ def returns_of_packets(mode: NDArray[np.uint8], most: int, firings_of: Callable[
     return table[:filled]
 
 
-def pair_slots(
-    returns: StructArray, names_strongest: bool, names_last: bool
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Dual returns as slots (2, pulses): range, reflectivity and flags.
+def single_content(returns: StructArray) -> StructArray:
+    """Single returns (packets, blocks, lasers) as slots (firings, 1)."""
+    content = np.empty(returns.shape, dtype=_CONTENT)
+    content["range"], content["intensity"] = returns["range"], returns["reflectivity"]
+    return content.reshape(-1, 1)
 
-    Equal ranges are one return, the only one: strongest and last. Of two the nearer comes first. Where the pair holds
-    the last return it is the farther; where it holds the strongest, that is the one of greater reflectivity (the second
-    block's where they are equal), since a head puts the second strongest beside a strongest that is also the other.
 
-    Args:
-        returns: (packets, blocks, lasers), a pair in neighbouring blocks, range 0 = no return.
-        names_strongest: one of the two is the strongest return.
-        names_last: one of the two is the last return.
+def pair_content(returns: StructArray) -> StructArray:
+    """Dual returns (packets, blocks, lasers), a pair in neighbouring blocks, as slots (firings, 2) of rising range.
+
+    Equal ranges are one return, the first block's. The one of greater reflectivity is the stronger, the second block's
+    where they are equal, since a head puts the second strongest beside a strongest that is also the other.
     """
-    one, other = (returns["range"][:, at::2].reshape(-1) for at in (0, 1))
-    one_light, other_light = (returns["reflectivity"][:, at::2].reshape(-1) for at in (0, 1))
-    # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
-    other_is_far = other > one
-    near, far = np.minimum(one, other), np.maximum(one, other)
-    swap = (one_light ^ other_light) * other_is_far
-    near_light, far_light = other_light ^ swap, one_light ^ swap
-    two = (near > 0) & (near != far)
-    near_strongest = (near_light > far_light) | ((near_light == far_light) & ~other_is_far)
-    alone = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
-    strongest, last = np.uint8(RETURN_FLAG_STRONGEST * names_strongest), np.uint8(RETURN_FLAG_LAST * names_last)
-    ranges, (lights, flags) = np.empty((2, len(one)), np.uint16), np.empty((2, 2, len(one)), np.uint8)
-    ranges[0], ranges[1] = near + far * (near == 0), far * two
-    lights[0], lights[1] = far_light ^ (near_light ^ far_light) * two, far_light
-    flags[0] = near_strongest * two * strongest + ~two * alone
-    flags[1] = last + ~near_strongest * strongest
-    return ranges, lights, flags
+    packets, blocks, lasers = returns.shape
+    content = np.empty((2, packets, blocks // 2, lasers), dtype=_CONTENT)
+    one, other = content.view("<u4").reshape(2, -1)  # numbers that are in order where the ranges are
+    other[:] = 1
+    one[:] = 0
+    for block in (0, 1):
+        content["range"][block] = returns["range"][:, block::2]
+        content["intensity"][block] = returns["reflectivity"][:, block::2]
+    other *= one ^ other > 0xFFFF
+    return in_order(one, other).view(_CONTENT)
+
+
+def _strength(returns: StructArray) -> NDArray[np.uint16]:
+    strength: NDArray[np.uint16] = returns["strength"]
+    return strength

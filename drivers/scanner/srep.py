@@ -30,6 +30,7 @@ from drivers.scanner.srep_layout import (
     PULSE_WIDTH_UNIT_NS,
     RANGE_UNIT_M,
     SLOT_BYTES,
+    SLOT_DTYPE,
     SrepHeader,
     encode_datagram,
     header_checks,
@@ -217,30 +218,31 @@ class SrepParser(PacketParser):
     ) -> ReturnSlots:
         """The slots of datagrams of one layout."""
         n, pulses, slots = len(units), int(header["pulses"][0]), int(header["return_slots"][0])
-        body = units[:, HEADER_BYTES : -CRC.size].view(pulse_dtype(slots))
+        # one copy at once: field by field it takes ten times as long
+        words = np.ascontiguousarray(units[:, HEADER_BYTES : -CRC.size]).view("<u8").reshape(n * pulses, 1 + slots)
+        body = words.view(pulse_dtype(slots)).reshape(n, pulses)
         angle, facet = self._scan_angle.angles(body["encoder"], int(header["encoder_counts"][0]))
         per_pulse: dict[str, tuple[NDArray[Any], ...]] = {
             "host_time_ns": (host_time_ns[:, np.newaxis],),
             "device_time_ns": (pulse_times(header, body["ticks"]),),
             "encoder_rad": (angle,),
-            "pulse_id": ((unwrapped << 16)[:, np.newaxis], np.arange(pulses)[np.newaxis]),
         }
         if facet is not None:
             per_pulse["channel"] = (facet,)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
-
-        def by_slot(name: str) -> NDArray[Any]:
-            return np.moveaxis(body["slot"][name], 2, 0).reshape(slots, -1)
-
-        width = by_slot("pulse_width") * np.float32(PULSE_WIDTH_UNIT_NS)
+        # a pulse's head lies as one more slot before its own, one that never holds a return
+        content = words.view(SLOT_DTYPE)
+        there = content["range"] != 0
+        there[:, 0] = False
         return ReturnSlots(
-            range_raw=by_slot("range"),
+            content=content,
+            there=there,
             range_unit_m=RANGE_UNIT_M,
-            intensity=by_slot("intensity"),
             common=common_words((n, 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis]),
             shape=(n, pulses),
+            pulse_id=unwrapped << 16,
             per_pulse=per_pulse,
-            per_slot={"pulse_width_ns": width},
+            pulse_width_unit_ns=np.float32(PULSE_WIDTH_UNIT_NS),
         )
 
 
