@@ -266,7 +266,7 @@ class OusterParser(PacketParser):
         beam = np.arange(self.head.beams)
         dual = self.layout.dual
         flags = 0 if dual else _SINGLE_FLAGS.get(self.head.return_order, 0)
-        content = self._pair_content(columns["pixels"]) if dual else self._content(columns["pixels"]).reshape(-1, 1)
+        content = self._content(columns["pixels"])
         return ReturnSlots(
             content=content,
             there=content.view("<u8") > 0xFFFF_FFFF,
@@ -275,25 +275,26 @@ class OusterParser(PacketParser):
             shape=(len(number), len(beam)),
             pulse_id=number * len(beam),
             per_pulse={
-                "host_time_ns": (host_time_ns[:, np.newaxis],),
-                "device_time_ns": (columns["time_ns"].reshape(-1, 1),),
-                "encoder_rad": (self._encoder_rad[columns["id"].reshape(-1, 1)],),
+                "host_time_ns": lambda at: at(host_time_ns[:, np.newaxis]),
+                "device_time_ns": lambda at: at(columns["time_ns"].reshape(-1, 1)),
+                "encoder_rad": lambda at: at(self._encoder_rad[columns["id"].reshape(-1, 1)]),
             },
             pair=self._pair if dual else None,
         )
 
-    def _content(self, pixels: NDArray[np.uint32], which: str = "") -> StructArray:
-        """(pulses,) one of the returns of all beams of all columns."""
-        content = np.empty(pixels.shape[:-1], dtype=_CONTENT)
-        content["range"] = self.layout.raw_field(pixels, f"RANGE{which}")
-        content["intensity"] = self.layout.raw_field(pixels, f"{self._light}{which}")
-        content["second"] = bool(which)
-        return content.reshape(-1)
+    def _content(self, pixels: NDArray[np.uint32]) -> StructArray:
+        """(pulses, slots) returns of all beams of all columns: two of rising range, as sent where it is equal."""
+        first = self._as_numbers(pixels)
+        if not self.layout.dual:
+            return first.view(_CONTENT).reshape(-1, 1)
+        return in_order(first, self._as_numbers(pixels, "2") | np.uint64(1 << 16)).view(_CONTENT)
 
-    def _pair_content(self, pixels: NDArray[np.uint32]) -> StructArray:
-        """(pulses, 2) returns of rising range, as sent where it is equal."""
-        first, second = (self._content(pixels, which).view("<u8") for which in ("", "2"))
-        return in_order(first, second).view(_CONTENT)
+    def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> NDArray[np.uint64]:
+        """(pulses,) one of the returns of a block as `_CONTENT` in one number."""
+        number = self.layout.raw_field(pixels, f"RANGE{which}").astype(np.uint64).reshape(-1)
+        number <<= np.uint64(32)
+        number |= self.layout.raw_field(pixels, f"{self._light}{which}").reshape(-1)
+        return number
 
 
 def _first_is_stronger(returns: StructArray) -> NDArray[np.uint16]:

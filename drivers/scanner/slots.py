@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,8 @@ BLOCK_SLOTS = 32768
 # Work is done column by column, where NumPy is quick, and rows are written once, in 64-bit words: columns of words are
 # transposed. `common_words` are the last of a row, its fields from the channel on.
 _WORDS = RETURN_DTYPE.itemsize // 8
+
+Chosen: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 @cache
@@ -75,10 +77,11 @@ class ReturnSlots:
             device's unit), ``intensity`` and whatever `pair` and `pulse_width_unit_ns` ask for.
         there: (pulses, slots) which slots hold a return.
         range_unit_m: metres of one raw unit.
-        common: `common_words` of the pulses, an array as those of ``per_pulse``.
+        common: `common_words` of the pulses, an array as those.
         shape: (m, n).
         pulse_id: (m,) of the first of n pulses; the others count on.
-        per_pulse: fields of `RETURN_DTYPE` that are the pulse's, each the sum of these arrays.
+        per_pulse: fields of `RETURN_DTYPE` that are the pulse's: what makes them of such arrays, elementwise, each
+            handed to its argument first, which spreads it over the pulses that are wanted.
         pair: flags of returns in two slots beside the common ones; None: there are none.
         pulse_width_unit_ns: nanoseconds of a unit of the field ``pulse_width``; None: unknown.
     """
@@ -89,7 +92,7 @@ class ReturnSlots:
     common: NDArray[np.uint64]
     shape: tuple[int, int]
     pulse_id: Int64Array
-    per_pulse: Mapping[str, tuple[NDArray[Any], ...]]
+    per_pulse: Mapping[str, Callable[[Chosen], NDArray[Any]]]
     pair: PairRule | None = None
     pulse_width_unit_ns: np.float32 | None = None
 
@@ -119,8 +122,8 @@ class ReturnSlots:
         """What all returns of a pulse have in common, where every pulse has one."""
         words[-1].reshape(self.shape)[:] = self.common
         _column(words, "pulse_id").reshape(self.shape)[:] = self.pulse_id[:, np.newaxis] + np.arange(self.shape[1])
-        for name, parts in self.per_pulse.items():
-            _column(words, name).reshape(self.shape)[:] = sum(parts[1:], start=parts[0])
+        for name, made_of in self.per_pulse.items():
+            _column(words, name).reshape(self.shape)[:] = made_of(lambda values: values)
 
     def _write_pulses(self, words: NDArray[np.uint64], pulse: NDArray[np.intp]) -> None:
         """The same of these pulses, in order."""
@@ -135,13 +138,9 @@ class ReturnSlots:
             return values[0].take(minor) if len(values) == 1 else values.reshape(-1).take(pulse)
 
         words[-1] = chosen(self.common)
-        np.add(np.repeat(self.pulse_id, counts), minor, out=words[_place("pulse_id")[0]].view(np.int64))
-        for name, (*parts, last) in self.per_pulse.items():
-            column, values = _column(words, name), chosen(last)
-            if parts:
-                np.add(sum(map(chosen, parts[1:]), start=chosen(parts[0])), values, out=column)
-            else:
-                column[:] = values
+        np.add(np.repeat(self.pulse_id, counts), minor, out=_column(words, "pulse_id").view(np.int64))
+        for name, made_of in self.per_pulse.items():
+            _column(words, name)[:] = made_of(chosen)
 
     def _write_numbers(
         self, words: NDArray[np.uint64], returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]

@@ -8,7 +8,7 @@ u64 counter fits.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, returns_table
 from drivers.scanner.srep_layout import (
     CRC,
     FLAG_LASER_ON,
@@ -222,18 +222,21 @@ class SrepParser(PacketParser):
         words = np.ascontiguousarray(units[:, HEADER_BYTES : -CRC.size]).view("<u8").reshape(n * pulses, 1 + slots)
         body = words.view(pulse_dtype(slots)).reshape(n, pulses)
         angle, facet = self._scan_angle.angles(body["encoder"], int(header["encoder_counts"][0]))
-        per_pulse: dict[str, tuple[NDArray[Any], ...]] = {
-            "host_time_ns": (host_time_ns[:, np.newaxis],),
-            "device_time_ns": (pulse_times(header, body["ticks"]),),
-            "encoder_rad": (angle,),
+        times_ns = pulse_times(header, body["ticks"])
+        per_pulse: dict[str, Callable[[Chosen], NDArray[Any]]] = {
+            "host_time_ns": lambda at: at(host_time_ns[:, np.newaxis]),
+            "device_time_ns": lambda at: at(times_ns),
+            "encoder_rad": lambda at: at(angle),
         }
         if facet is not None:
-            per_pulse["channel"] = (facet,)
+            per_pulse["channel"] = lambda at: at(facet)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
-        # a pulse's head lies as one more slot before its own, one that never holds a return
-        content = words.view(SLOT_DTYPE)
+        # a pulse's head lies as one more slot before its own, one that never holds a return; beside a single slot,
+        # which pulses mostly fill, it is left out
+        content = np.ascontiguousarray(words[:, 1:] if slots == 1 else words).view(SLOT_DTYPE)
         there = content["range"] != 0
-        there[:, 0] = False
+        if slots > 1:
+            there[:, 0] = False
         return ReturnSlots(
             content=content,
             there=there,
