@@ -21,6 +21,7 @@ from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.hesai_gps import GPS_BYTES, NS, GpsReader
 from drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from drivers.scanner.slots import Chosen
 from drivers.scanner.spinning import Firings, returns_of_packets
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -226,14 +227,14 @@ class HesaiParser(PacketParser):
         """The firings of packets of one return mode."""
         head, mode = self._head, int(packets["mode"][0])
         azimuth = packets["blocks"]["azimuth"][:, :: 2 if mode in DUAL_NAMES else 1]
-        firing_ns = (head.round_start_ns(azimuth.shape[1])[:, np.newaxis] + head.offset_ns).reshape(-1)
+        round_ns = (stamp_ns[:, np.newaxis] + head.round_start_ns(azimuth.shape[1])).reshape(-1, 1)
         return Firings(
             returns=packets["blocks"]["returns"],
             range_unit_m=DISTANCE_UNIT_MM * 1e-3,
             host_time_ns=host_time_ns,
             number=number,
             most=head.blocks * head.channels,
-            device_time_ns=(stamp_ns[:, np.newaxis], firing_ns[np.newaxis]),
+            device_time_ns=lambda at: at(round_ns) + at(head.offset_ns[np.newaxis]),
             azimuth_rad=_azimuths(azimuth, packets["motor_rpm"], head),
             channel=np.arange(head.channels, dtype=np.uint16),
             flags=SINGLE_FLAGS.get(mode, 0) | (RETURN_FLAG_PPS_LOCKED if self._gps.locked == 1 else 0),
@@ -241,12 +242,21 @@ class HesaiParser(PacketParser):
         )
 
 
-def _azimuths(azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: HesaiHead) -> FloatArray:
-    """Azimuths (n, rounds, channels) at each firing, radians, 0 … 2π, from those of the rounds (n, rounds)."""
-    turn = (motor_rpm * _RAD_PER_NS_AT_1_RPM)[:, np.newaxis] * head.offset_ns
-    angle: FloatArray = (azimuth * (2 * np.pi / FULL_CIRCLE))[:, :, np.newaxis] + turn[:, np.newaxis, :]
-    np.subtract(angle, 2 * np.pi, out=angle, where=angle >= 2 * np.pi)
-    return angle
+def _azimuths(
+    azimuth: NDArray[np.uint16], motor_rpm: NDArray[np.uint16], head: HesaiHead
+) -> Callable[[Chosen], FloatArray]:
+    """Azimuths at each firing, radians, 0 … 2π, made of those of the rounds (n, rounds) and of the channels' times."""
+    start = (azimuth * (2 * np.pi / FULL_CIRCLE)).reshape(-1, 1)
+    speed = np.repeat(motor_rpm * _RAD_PER_NS_AT_1_RPM, azimuth.shape[1])[:, np.newaxis]
+    offset_ns = head.offset_ns.astype(np.float64)[np.newaxis]
+
+    def made_of(at: Chosen) -> FloatArray:
+        angle = at(speed) * at(offset_ns)
+        angle += at(start)
+        angle -= (angle >= 2 * np.pi) * (2 * np.pi)
+        return angle
+
+    return made_of
 
 
 def _within(value: NDArray[np.uint8], least: int, most: int) -> BoolArray:

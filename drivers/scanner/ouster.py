@@ -13,7 +13,6 @@ it orders by range, the one with more signal is.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from drivers.scanner.ouster_layout import (
 )
 from drivers.scanner.ouster_probe import OusterProbe
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, ReturnSlots, common_words, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -49,11 +48,10 @@ from georef.records import (
     StructArray,
 )
 
-Words: TypeAlias = NDArray[np.uint32]
-WordPair: TypeAlias = tuple[Words, Words]
-
 SECOND_NS = 1_000_000_000
 LARGEST_GAP_FRAMES = 600  # half a minute to a minute; more is a head that began anew
+# A return as one 64-bit number: range, then 1 for the second of a block, then its light.
+_CONTENT = np.dtype([("intensity", "<u2"), ("second", "<u2"), ("range", "<u4")])
 _SINGLE_FLAGS = {"STRONGEST_TO_WEAKEST": RETURN_FLAG_STRONGEST, "FARTHEST_TO_NEAREST": RETURN_FLAG_LAST}
 
 
@@ -92,7 +90,8 @@ class OusterParser(PacketParser):
         self._encoder_rad = 2 * np.pi * (-np.arange(columns) % columns) / columns
         ordered = self.head.return_order == "STRONGEST_TO_WEAKEST"
         self._light = "SIGNAL" if "SIGNAL" in self.layout.profile.fields else "REFLECTIVITY"
-        self._strongest = "first" if ordered else "signal" if self._light == "SIGNAL" else "unsaid"
+        says_strongest = ordered or self._light == "SIGNAL"
+        self._pair = PairRule(_first_is_stronger if ordered else _more_light_is_stronger, says_strongest, True)
         self._thinner = SampleThinner() if clock_only else None
         self._init_id: int | None = None
         self._time_ns = 0
@@ -265,57 +264,49 @@ class OusterParser(PacketParser):
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:
         """The slots of valid columns; ``number`` is each column's, counted from the first frame on."""
         beam = np.arange(self.head.beams)
-        flags = 0
-        per_slot: dict[str, NDArray[Any]] = {}
-        range_raw, light = (self._words(columns, name) for name in ("RANGE", self._light))
-        if self.layout.dual:
-            range2, light2 = (self._words(columns, f"{name}2") for name in ("RANGE", self._light))
-            range_raw, light, per_slot["flags"] = _pair_returns((range_raw, range2), (light, light2), self._strongest)
-        else:
-            range_raw, light = range_raw[np.newaxis], light[np.newaxis]
-            flags = _SINGLE_FLAGS.get(self.head.return_order, 0)
+        dual = self.layout.dual
+        flags = 0 if dual else _SINGLE_FLAGS.get(self.head.return_order, 0)
+        content = self._content(columns["pixels"])
         return ReturnSlots(
-            range_raw=range_raw,
+            content=content,
+            there=content.view("<u8") > 0xFFFF_FFFF,
             range_unit_m=RANGE_MM * (1 << self.layout.profile.fields["RANGE"].dropped),
-            intensity=light,
             common=common_words((1, len(beam)), channel=beam, flags=flags),
             shape=(len(number), len(beam)),
+            pulse_id=number * len(beam),
             per_pulse={
-                "host_time_ns": (host_time_ns[:, np.newaxis],),
-                "device_time_ns": (columns["time_ns"].reshape(-1, 1),),
-                "encoder_rad": (self._encoder_rad[columns["id"].reshape(-1, 1)],),
-                "pulse_id": ((number * len(beam))[:, np.newaxis], beam[np.newaxis]),
+                "host_time_ns": lambda at: at(host_time_ns[:, np.newaxis]),
+                "device_time_ns": lambda at: at(columns["time_ns"].reshape(-1, 1)),
+                "encoder_rad": lambda at: at(self._encoder_rad[columns["id"].reshape(-1, 1)]),
             },
-            per_slot=per_slot,
+            pair=self._pair if dual else None,
         )
 
-    def _words(self, columns: StructArray, name: str) -> Words:
-        """(pulses,) a field of all beams of all columns."""
-        return self.layout.raw_field(columns["pixels"], name).reshape(-1)
+    def _content(self, pixels: NDArray[np.uint32]) -> StructArray:
+        """(pulses, slots) returns of all beams of all columns: two of rising range, as sent where it is equal."""
+        first = self._as_numbers(pixels)
+        if not self.layout.dual:
+            return first.view(_CONTENT).reshape(-1, 1)
+        return in_order(first, self._as_numbers(pixels, "2") | np.uint64(1 << 16)).view(_CONTENT)
+
+    def _as_numbers(self, pixels: NDArray[np.uint32], which: str = "") -> NDArray[np.uint64]:
+        """(pulses,) one of the returns of a block as `_CONTENT` in one number."""
+        number = self.layout.raw_field(pixels, f"RANGE{which}").astype(np.uint64).reshape(-1)
+        number <<= np.uint64(32)
+        number |= self.layout.raw_field(pixels, f"{self._light}{which}").reshape(-1)
+        return number
 
 
-def _pair_returns(ranges: WordPair, light: WordPair, strongest: str) -> tuple[Words, Words, NDArray[np.uint8]]:
-    """Two returns of a block, as sent, as slots (2, pulses) of rising range: range, light and flags.
+def _first_is_stronger(returns: StructArray) -> NDArray[np.uint16]:
+    """The first of the block is the stronger."""
+    strength: NDArray[np.uint16] = ~returns["second"]
+    return strength
 
-    Args:
-        ranges, light: first and second of the block, each (pulses,).
-        strongest: ``first`` of the block, the one of more ``signal``, or ``unsaid``.
-    """
-    first, second = ranges
-    near, far = np.minimum(first, second), np.maximum(first, second)
-    # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
-    two = near > 0
-    in_order = (first == near) == two  # the nearer, or the only one, is the first
-    near_strongest = in_order if strongest == "first" else (light[0] >= light[1]) == in_order
-    said = np.uint8(0 if strongest == "unsaid" else RETURN_FLAG_STRONGEST)
-    alone, last = np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST), np.uint8(RETURN_FLAG_LAST)
-    swap = (light[0] ^ light[1]) * ~in_order
-    slots, flags = np.empty((2, 2, len(first)), dtype=np.uint32), np.empty((2, len(first)), dtype=np.uint8)
-    slots[0, 0], slots[0, 1] = near + far * ~two, far * two
-    slots[1, 0], slots[1, 1] = light[0] ^ swap, light[1] ^ swap
-    flags[0] = near_strongest * two * said + ~two * alone
-    flags[1] = last + ~near_strongest * said
-    return slots[0], slots[1], flags
+
+def _more_light_is_stronger(returns: StructArray) -> NDArray[np.uint32]:
+    """The one of more light, of equal ones the first of the block."""
+    strength: NDArray[np.uint32] = (returns["intensity"].astype(np.uint32) << np.uint32(1)) + (1 - returns["second"])
+    return strength
 
 
 def _clock_parser(settings: DeviceSettings) -> OusterParser:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.records import RETURN_DTYPE, StructArray
+from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 # Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
 # call does not count.
@@ -19,6 +19,8 @@ BLOCK_SLOTS = 32768
 # Work is done column by column, where NumPy is quick, and rows are written once, in 64-bit words: columns of words are
 # transposed. `common_words` are the last of a row, its fields from the channel on.
 _WORDS = RETURN_DTYPE.itemsize // 8
+
+Chosen: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 @cache
@@ -35,31 +37,64 @@ def _column(words: NDArray[np.uint64], name: str) -> NDArray[Any]:
     return column
 
 
+@dataclass(frozen=True, slots=True)
+class PairRule:
+    """How two returns of a pulse are flagged, of which the nearer comes first; an only one is strongest and last.
+
+    Attributes:
+        strength: of returns (n,), fields as those of `ReturnSlots.content`: the greater of two is the stronger; never
+            equal.
+        names_strongest: one of the two is the strongest return, that of greater strength.
+        names_last: one of the two is the last return, the farther.
+    """
+
+    strength: Callable[[StructArray], NDArray[Any]]
+    names_strongest: bool
+    names_last: bool
+
+    def flags(self, returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(n,) of consecutive returns with their numbers, of pulses that have so many."""
+        strength = np.ascontiguousarray(self.strength(returns))
+        # choices are multiplications by 0 or 1: np.where takes ten times as long on conditions that keep changing
+        second = (number[1:] == 2).view(np.uint8)
+        near_strongest = (strength[:-1] > strength[1:]).view(np.uint8) * second
+        strongest, last = np.uint8(RETURN_FLAG_STRONGEST * self.names_strongest), np.uint8(RETURN_FLAG_LAST)
+        flags: NDArray[np.uint8] = (count == 1) * np.uint8(RETURN_FLAG_STRONGEST | RETURN_FLAG_LAST)
+        flags[:-1] += near_strongest * strongest
+        flags[1:] += (second - near_strongest) * strongest + second * (last * np.uint8(self.names_last))
+        return flags
+
+
 @dataclass(slots=True)
 class ReturnSlots:
     """The places for returns of consecutive pulses, in the order of emission.
 
     The pulses are m times n, for example packets and their pulses, so that what only one of the two tells need not be
-    spread over all pulses: such arrays are (m, 1) or (1, n), others (m, n). Arrays of slots have one row for all
-    pulses' first slots, one for their second …: long rows are what NumPy is quick with.
+    spread over all pulses: such arrays are (m, 1) or (1, n), others (m, n).
 
     Attributes:
-        range_raw: (slots, pulses), the device's unit, 0 = no return, first return first.
+        content: (pulses, slots), contiguous, of 4 or 8 bytes, which are gathered at once; fields ``range`` (the
+            device's unit), ``intensity`` and whatever `pair` and `pulse_width_unit_ns` ask for.
+        there: (pulses, slots) which slots hold a return.
         range_unit_m: metres of one raw unit.
-        intensity: (slots, pulses).
-        common: `common_words` of the pulses, an array as those of ``per_pulse``.
+        common: `common_words` of the pulses, an array as those.
         shape: (m, n).
-        per_pulse: fields of `RETURN_DTYPE` that are the pulse's, each the sum of these arrays.
-        per_slot: further fields of the return itself, each (slots, pulses).
+        pulse_id: (m,) of the first of n pulses; the others count on.
+        per_pulse: fields of `RETURN_DTYPE` that are the pulse's: what makes them of such arrays, elementwise, each
+            handed to its argument first, which spreads it over the pulses that are wanted.
+        pair: flags of returns in two slots beside the common ones; None: there are none.
+        pulse_width_unit_ns: nanoseconds of a unit of the field ``pulse_width``; None: unknown.
     """
 
-    range_raw: NDArray[Any]
+    content: StructArray
+    there: NDArray[np.bool_]
     range_unit_m: float
-    intensity: NDArray[Any]
     common: NDArray[np.uint64]
     shape: tuple[int, int]
-    per_pulse: Mapping[str, tuple[NDArray[Any], ...]]
-    per_slot: Mapping[str, NDArray[Any]]
+    pulse_id: Int64Array
+    per_pulse: Mapping[str, Callable[[Chosen], NDArray[Any]]]
+    pair: PairRule | None = None
+    pulse_width_unit_ns: np.float32 | None = None
 
     def fill(self, table: StructArray) -> int:
         """Write the returns there are, ordered by pulse, then by slot, to the head of ``table``; returns their number.
@@ -67,66 +102,84 @@ class ReturnSlots:
         Args:
             table: `RETURN_DTYPE`, at least as many rows as there are slots.
         """
-        slots, pulses = self.range_raw.shape
-        there = np.empty((pulses, slots), dtype=np.bool_)
-        np.not_equal(self.range_raw, 0, out=there.T)
-        index = np.flatnonzero(there)
+        slots, content = self.content.shape[1], self.content.reshape(-1)
+        index = np.flatnonzero(self.there)
         words = np.empty((_WORDS, len(index)), dtype=np.uint64)
-        if slots == 1 and len(index) == pulses:
+        if slots == 1 and len(index) == len(content):
             self._write_all_pulses(words)
-            self._write_slots(words, slice(None))
+            returns = content
         else:
-            pulse, place = index, index
-            if slots > 1:
-                pulse = index // slots
-                place = (index - pulse * slots) * pulses + pulse
+            pulse = index // slots if slots > 1 else index
             self._write_pulses(words, pulse)
-            self._write_slots(words, place)
-            if slots > 1:  # the two bytes after the channel's
-                words[-1].view("<u2")[1::4] = _numbers(self.range_raw != 0).reshape(-1)[place]
+            returns = content.take(index)
+            if slots > 1:
+                self._write_numbers(words, returns, *_numbers(pulse, slots))
+        self._write_returns(words, returns)
         table[: len(index)].view(np.uint64).reshape(-1, _WORDS)[:] = words.T
         return len(index)
 
     def _write_all_pulses(self, words: NDArray[np.uint64]) -> None:
         """What all returns of a pulse have in common, where every pulse has one."""
         words[-1].reshape(self.shape)[:] = self.common
-        for name, parts in self.per_pulse.items():
-            _column(words, name).reshape(self.shape)[:] = sum(parts[1:], start=parts[0])
+        _column(words, "pulse_id").reshape(self.shape)[:] = self.pulse_id[:, np.newaxis] + np.arange(self.shape[1])
+        for name, made_of in self.per_pulse.items():
+            _column(words, name).reshape(self.shape)[:] = made_of(lambda values: values)
 
     def _write_pulses(self, words: NDArray[np.uint64], pulse: NDArray[np.intp]) -> None:
-        """The same of these pulses."""
-        n = self.shape[1]
-        major = pulse // n
-        minor = pulse - major * n
+        """The same of these pulses, in order."""
+        m, n = self.shape
+        # pulses of a row are neighbours: to repeat its value takes half as long as to gather it
+        counts = np.diff(pulse.searchsorted(np.arange(m + 1) * n))
+        minor = pulse - np.repeat(np.arange(m) * n, counts)
 
         def chosen(values: NDArray[Any]) -> NDArray[Any]:
             if values.shape[1] == 1:
-                return values[:, 0].take(major)
+                return np.repeat(values[:, 0], counts)
             return values[0].take(minor) if len(values) == 1 else values.reshape(-1).take(pulse)
 
         words[-1] = chosen(self.common)
-        for name, parts in self.per_pulse.items():
-            _column(words, name)[:] = sum(map(chosen, parts[1:]), start=chosen(parts[0]))
+        np.add(np.repeat(self.pulse_id, counts), minor, out=_column(words, "pulse_id").view(np.int64))
+        for name, made_of in self.per_pulse.items():
+            _column(words, name)[:] = made_of(chosen)
 
-    def _write_slots(self, words: NDArray[np.uint64], place: NDArray[np.intp] | slice) -> None:
-        """What is the return's own, of the slots at these places."""
-        np.multiply(self.range_raw.reshape(-1)[place], self.range_unit_m, out=_column(words, "range_m"))
-        _column(words, "intensity")[:] = self.intensity.reshape(-1)[place]
-        if "pulse_width_ns" not in self.per_slot:
-            _column(words, "pulse_width_ns")[:] = 0
-        for name, values in self.per_slot.items():
-            _column(words, name)[:] = values.reshape(-1)[place]
+    def _write_numbers(
+        self, words: NDArray[np.uint64], returns: StructArray, number: NDArray[np.uint8], count: NDArray[np.uint8]
+    ) -> None:
+        """Which return of how many, and what follows from it."""
+        # the two bytes after the channel's
+        words[-1].view("<u2")[1::4] = number | count.astype(np.uint16) << 8
+        if self.pair is not None:
+            flags = _column(words, "flags")
+            flags |= self.pair.flags(returns, number, count)
+
+    def _write_returns(self, words: NDArray[np.uint64], returns: StructArray) -> None:
+        """What is the return's own."""
+        np.multiply(returns["range"], self.range_unit_m, out=_column(words, "range_m"))
+        _column(words, "intensity")[:] = returns["intensity"]
+        width = _column(words, "pulse_width_ns")
+        if self.pulse_width_unit_ns is None:
+            width[:] = 0
+        else:
+            np.multiply(returns["pulse_width"], self.pulse_width_unit_ns, out=width)
 
 
-def _numbers(there: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """return_number and, in the high byte, number_of_returns of slots (slots, pulses)."""
-    numbers = np.empty(there.shape, dtype=np.uint16)
-    count = np.zeros(there.shape[1], dtype=np.uint16)
-    for slot, number in zip(there, numbers, strict=True):
-        count += slot
-        number[:] = count
-    numbers |= count << 8
-    return numbers
+def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """return_number and number_of_returns of returns of these pulses, in order, each with so many at most."""
+    number, count = np.ones((2, len(pulse)), dtype=np.uint8)
+    for lag in range(1, slots):
+        same = (pulse[lag:] == pulse[:-lag]).view(np.uint8)
+        number[lag:] += same
+        count[lag:] += same
+        count[:-lag] += same
+    return number, count
+
+
+def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+    """Pairs (n, 2), the lesser number first."""
+    pairs = np.empty((len(one), 2), dtype=one.dtype)
+    np.minimum(one, other, out=pairs[:, 0])
+    np.maximum(one, other, out=pairs[:, 1])
+    return pairs
 
 
 def common_words(

@@ -47,7 +47,8 @@ HEADER_DTYPE = np.dtype(
 HEADER_BYTES = HEADER_DTYPE.itemsize
 CRC = struct.Struct("<I")
 PULSE_HEAD_BYTES = 8
-SLOT_BYTES = 8
+SLOT_DTYPE = np.dtype([("range", "<u4"), ("intensity", "<u2"), ("pulse_width", "<u2")])
+SLOT_BYTES = SLOT_DTYPE.itemsize
 _SECONDS = 1 << 32
 _NS = 1_000_000_000
 
@@ -55,8 +56,7 @@ _NS = 1_000_000_000
 @cache
 def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
     """Layout of one pulse record with R return slots: 8 + 8·R bytes."""
-    slot = np.dtype([("range", "<u4"), ("intensity", "<u2"), ("pulse_width", "<u2")])
-    return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", slot, (return_slots,))])
+    return np.dtype([("ticks", "<u4"), ("encoder", "<i4"), ("slot", SLOT_DTYPE, (return_slots,))])
 
 
 def datagram_bytes(pulses: int, return_slots: int) -> int:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
 from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
+from drivers.scanner.slots import Chosen
 from drivers.scanner.spinning import Firings, returns_of_packets
 from drivers.scanner.stamps import StampTracker
 from drivers.scanner.velodyne_calibration import read_calibration
@@ -228,17 +229,19 @@ class VelodyneParser(PacketParser):
         )
 
 
-def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> tuple[Int64Array, ...]:
-    """Device times (n, groups · places) of firings (9.4), as a sum."""
-    offset = (np.arange(groups)[:, np.newaxis] * head.group_ns + head.offset_ns).reshape(-1) + head.stamp_ns
-    first = stamp_us.astype(np.int64) * 1000
-    if first.max() + offset.max() >= HOUR_NS or first.min() + offset.min() < 0:
-        return ((first[:, np.newaxis] + offset) % HOUR_NS,)
-    return first[:, np.newaxis], offset[np.newaxis]
+def _firing_times(stamp_us: NDArray[np.uint32], head: SpinningHead, groups: int) -> Callable[[Chosen], Int64Array]:
+    """Device times of firings (9.4), made of those of the groups (n · groups, 1) and of the lasers' (1, places)."""
+    first = stamp_us.astype(np.int64)[:, np.newaxis] * 1000 + (np.arange(groups) * head.group_ns + head.stamp_ns)
+    group_ns, offset_ns = first.reshape(-1, 1), head.offset_ns[np.newaxis]
+    if first.max() + offset_ns.max() >= HOUR_NS or first.min() < 0:
+        return lambda at: (at(group_ns) + at(offset_ns)) % HOUR_NS
+    return lambda at: at(group_ns) + at(offset_ns)
 
 
-def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead) -> FloatArray:
-    """Azimuths (n, groups, places) in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
+def _firing_azimuths(
+    azimuth: NDArray[np.uint16], turn: FloatArray, head: SpinningHead
+) -> Callable[[Chosen], FloatArray]:
+    """Azimuths of firings in radians, 0 … 2π, turned on from the groups' own (n, groups) (9.5).
 
     The rotation is that to the packet's next group, of the last group that to it; of a packet's only group it is
     ``turn`` (n,).
@@ -254,11 +257,16 @@ def _firing_azimuths(azimuth: NDArray[np.uint16], turn: FloatArray, head: Spinni
     if odd.any():
         usual = np.where(odd, 0, gap).sum(axis=1) // np.maximum(1, (~odd).sum(axis=1))
         gap = np.where(odd, usual[:, np.newaxis], gap)
-    firing: FloatArray = gap[:, :, np.newaxis] * (head.offset_ns / head.group_ns)
-    firing += start[:, :, np.newaxis]
-    np.subtract(firing, FULL_CIRCLE, out=firing, where=firing >= FULL_CIRCLE)
-    firing *= 2 * np.pi / FULL_CIRCLE
-    return firing
+    passed = (head.offset_ns / head.group_ns)[np.newaxis]
+
+    def made_of(at: Chosen) -> FloatArray:
+        firing = at(gap.reshape(-1, 1)) * at(passed)
+        firing += at(start.reshape(-1, 1))
+        firing -= (firing >= FULL_CIRCLE) * np.float64(FULL_CIRCLE)
+        firing *= 2 * np.pi / FULL_CIRCLE
+        return firing
+
+    return made_of
 
 
 def _clock_samples(
