@@ -7,6 +7,8 @@ disk keeps the reserve and room for the whole copy. The original is not touched.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -20,15 +22,23 @@ _LOOK_AGAIN_S = 60.0
 
 def unfinished_logs(directory: Path) -> list[Path]:
     """Logs of a directory without their end and without a repaired copy, oldest first."""
-    found = []
-    for path in directory.glob("*.mcap"):
-        if path.name.endswith(".recovered.mcap") or path.with_suffix(".recovered.mcap").exists():
-            continue
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - len(MCAP_MAGIC)))
-            if file.read() != MCAP_MAGIC:
-                found.append(path)
-    return sorted(found, key=lambda path: path.stat().st_mtime)
+    found: list[tuple[float, Path]] = []
+    with contextlib.suppress(FileNotFoundError):  # the directory itself
+        for path in directory.glob("*.mcap"):
+            if path.name.endswith(".recovered.mcap") or path.with_suffix(".recovered.mcap").exists():
+                continue
+            with contextlib.suppress(OSError):  # moved away meanwhile, or not ours to read
+                if (changed_s := _left_open_since(path)) is not None:
+                    found.append((changed_s, path))
+    return [path for _, path in sorted(found)]
+
+
+def _left_open_since(path: Path) -> float | None:
+    """When a log without its end was last written to; None where it has its end."""
+    with path.open("rb") as file:
+        stat = os.fstat(file.fileno())
+        file.seek(max(0, stat.st_size - len(MCAP_MAGIC)))
+        return None if file.read() == MCAP_MAGIC else stat.st_mtime
 
 
 async def repair_left_open(
@@ -43,7 +53,12 @@ async def repair_left_open(
         if not waiting:
             return
         path = waiting[0]
-        if shutil.disk_usage(directory).free <= reserve_bytes + path.stat().st_size:
+        try:
+            room = shutil.disk_usage(directory).free > reserve_bytes + path.stat().st_size
+        except OSError:  # moved away meanwhile
+            tried.add(path)
+            continue
+        if not room:
             if not told_room:
                 told_room = True
                 text = f"{path.name} was left open by a crash; no room to repair it now"

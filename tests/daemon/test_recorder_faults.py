@@ -22,6 +22,7 @@ from daemon.acquire import MAX_SENDERS
 from daemon.errors import UserError
 from daemon.log.reader import open_logs
 from daemon.places import take_directory
+from daemon.repair import MCAP_MAGIC, unfinished_logs
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
 from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
 from tests.daemon.test_cli import swath
@@ -202,6 +203,14 @@ def test_directory_removed_while_recording(tmp_path: Path, logs: Path, numbers: 
                 content.units["scanner/left"] += [(0, row.tobytes()) for row in batch.units]
     assert found(content) == list(range(before, numbers.sent))
     assert read_events(path)[0]["code"] in ("log_gone", "part_opened")
+
+
+def test_logs_that_vanish_while_they_are_looked_for_hinder_no_repair(tmp_path: Path) -> None:
+    assert unfinished_logs(tmp_path / "gone") == []
+    (tmp_path / "moved_0.mcap").symlink_to(tmp_path / "elsewhere.mcap")  # listed, and not there when it is opened
+    (tmp_path / "left_0.mcap").write_bytes(MCAP_MAGIC + b"begun")
+    (tmp_path / "whole_0.mcap").write_bytes(MCAP_MAGIC + b"and ended" + MCAP_MAGIC)
+    assert unfinished_logs(tmp_path) == [tmp_path / "left_0.mcap"]
 
 
 def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, logs: Path) -> None:
