@@ -26,7 +26,9 @@ Chosen: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 @cache
 def _place(name: str) -> tuple[int, np.dtype[np.void]]:
     """The word a field is in, and that word as a table of this field."""
-    kind, at = RETURN_DTYPE.fields[name][:2]  # type: ignore[index]
+    fields = RETURN_DTYPE.fields
+    assert fields is not None
+    kind, at = fields[name][:2]
     return at // 8, np.dtype({"names": [name], "formats": [kind], "offsets": [at % 8], "itemsize": 8})
 
 

@@ -27,7 +27,7 @@ SK_MEMINFO_DROPS = 8
 PEER_BYTES = 16  # struct sockaddr_in
 MEMORY_BYTES = 2 << 20  # taken at once; it is given back when the last block in it is written
 LEAST_OFFERED = 32  # slots; with fewer left a read begins new memory
-FIRST_EXPECTED_BYTES = 1248
+FIRST_EXPECTED_BYTES = 1248  # a guess: if it is wrong, the first read is copied
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _MMSGHDR = np.dtype(  # struct msghdr in whole words, then msg_len
