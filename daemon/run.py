@@ -183,7 +183,7 @@ def lock_memory() -> None:
 def keep_freed_memory() -> None:
     """Have glibc use freed memory again instead of giving it back page by page, to be faulted in anew (mallopt(3)).
 
-    Set before threads start. Another C library has no such call, and does without.
+    Set before threads that receive start. Another C library has no such call, and does without.
     """
     trim_threshold, mmap_threshold = -1, -3
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
