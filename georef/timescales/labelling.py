@@ -18,7 +18,6 @@ SURE_AGE_S = 0.5  # up to this age five votes of one mind are enough
 YOUNG_AGE_S = 0.12  # below this (just after an edge, or a whole second late) only if they are …
 YOUNG_SPREAD_S = 0.02  # … that even, and …
 LEAST_AGE_S = 0.004  # … not impossibly quick
-MIN_EVEN_VOTES = 6  # so many even ones after the first are enough when it was late: its reader had just been opened
 STRADDLE_MEMORY_S = 600  # a message just before an edge makes those just after it suspect for so many edges
 LATE_AGE_S = 0.7  # a steady delay above this may be one second and a bit less or more
 LEAP_ERROR_S = 20  # a receiver that does not know GPS − UTC yet is wrong by at most all of it
@@ -122,29 +121,18 @@ class Voter:
         self.offset = None
         if len(votes) < MIN_VOTES or agreeing < MAJORITY * len(votes):
             return
-        ages = [vote.age_s for vote in votes if vote.offset == best]
+        ages = sorted(vote.age_s for vote in votes if vote.offset == best)
         if len(votes) < VOTES and not self.key.bound and (agreeing < len(votes) or not _surely_aged(ages)):
             return
         self.offset = best
-        self.late = not self.key.bound and sorted(ages)[len(ages) // 2] > LATE_AGE_S
+        self.late = not self.key.bound and ages[len(ages) // 2] > LATE_AGE_S
 
 
 def _surely_aged(ages: list[float]) -> bool:
-    """Whether ages, first message first, leave no doubt which edge was before, with few votes.
-
-    Only the first message may be uneven, and only late: one of a later message is jitter or a stall, which a delay of
-    about a second has as well, and which another few votes may show by falling before the edge.
-    """
-    if min(ages) >= YOUNG_AGE_S:
-        return max(ages) <= SURE_AGE_S
-    after_first = ages[1:]
-    if len(after_first) >= MIN_EVEN_VOTES and max(after_first) < ages[0] <= SURE_AGE_S:
-        return _even(after_first)
-    return _even(ages)
-
-
-def _even(ages: list[float]) -> bool:
-    return min(ages) >= LEAST_AGE_S and max(ages) - min(ages) <= YOUNG_SPREAD_S
+    """Whether sorted ages leave no doubt which edge was before, with few votes."""
+    if ages[0] >= YOUNG_AGE_S:
+        return ages[-1] <= SURE_AGE_S
+    return ages[0] >= LEAST_AGE_S and ages[-1] - ages[0] <= YOUNG_SPREAD_S
 
 
 class Labeller:

@@ -8,10 +8,8 @@ stamps of 1.5 µs or 300 µs; 1 % outliers of 300 µs, 2 to 10 % missing and 1 t
 from __future__ import annotations
 
 import datetime as dt
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -372,41 +370,6 @@ def test_edges_may_be_told_after_their_messages() -> None:
     assert status.offset_ns is not None
     assert abs(host + status.offset_ns - simulation.true_gps_ns(host)) < 10_000
     assert [event.code for event in clock.drain_events()] == ["second_known"]
-
-
-def rmc_with_delays(delays_s: list[float]) -> Outcome:
-    """RMC with these delays, one a second, beside edges that are all there; to the second after the last of them."""
-    senders = [
-        Sender("RMC", UTC, delay_s=delay_s, jitter_s=0.0, silent=partial(operator.ne, at))
-        for at, delay_s in enumerate(delays_s)
-    ]
-    edges = Edges(outliers=0.0, missing=0.0, spurious=0.0)
-    return run(Simulation(START, Oscillator(len(delays_s) + 3, seed=5), edges, senders, seed=11), PpsClock(18))
-
-
-def test_a_late_first_message_does_not_delay_the_label() -> None:
-    """The first message waited for its reader to be opened; six even ones after it are enough, five are not."""
-    outcome = rmc_with_delays([0.16, 0.055, 0.059, 0.055, 0.058, 0.058, 0.059, 0.056, 0.057, 0.056])
-    assert outcome.wrong_seconds == 0
-    assert outcome.codes == ["second_known"]
-    assert outcome.events[0][0] == 6
-
-
-@pytest.mark.parametrize(
-    "delays_s",
-    [
-        [1.022, 1.02, 1.021, 1.07, 1.02, 1.022, 1.021, 1.02, 0.99],  # one that stalled
-        [1.005, 1.05, 1.052, 1.051, 1.05, 1.052, 1.051, 1.05, 0.99],  # the first was the quickest
-        [1.12, 1.02, 1.022, 1.021, 1.045, 1.022, 1.021, 1.02, 0.99],  # uneven after a late first
-        [1.55, 1.02, 1.022, 1.021, 1.02, 1.022, 1.021, 1.02, 0.99],  # the first too late to say which edge it was
-        [0.99, 1.02, 1.022, 1.021, 1.02, 1.022, 1.021, 1.02, 0.99],  # the first said another second
-    ],
-)
-def test_jitter_about_a_whole_second_is_no_late_first_message(delays_s: list[float]) -> None:
-    """A delay of about one second looks young until a message falls before the edge: no label before that."""
-    outcome = rmc_with_delays([*delays_s, 1.02, 1.021, 1.022])
-    assert outcome.wrong_seconds == 0
-    assert not outcome.seconds, "never LOCKED"
 
 
 def test_names_edge_can_be_overridden() -> None:
