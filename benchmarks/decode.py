@@ -20,9 +20,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from isal.isal_zlib import crc32
+from fastcrc.crc32 import iso_hdlc as crc32
+from fastcrc.crc64 import xz as crc64_xz
 
-from drivers.core.checksums import crc64_xz
+from daemon.memory import keep_freed_memory
 from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Parser, ParserCounters
@@ -47,7 +48,7 @@ READ_BYTES = 4096  # one read of a serial port
 
 @dataclass
 class Figure:
-    """One line of the table; rates are items a second of CPU."""
+    """One line of the table; rates are items a second of CPU. ``plain`` is without compiled loops, where there are."""
 
     name: str
     item: str
@@ -55,6 +56,7 @@ class Figure:
     target: float | None
     limit: float
     limit_is: str
+    plain: float | None = None
 
 
 def rate(work: Callable[[], object], items: float, repeats: int) -> float:
@@ -127,8 +129,7 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
     ):
         settings = DeviceSettings("scanner/bench", {"mirror_factor": 2.0, **config})
         units = srep_units(*shape)
-        batches = batches_of(units)
-        rows = decode_all(lambda settings=settings: SrepParser(settings), batches)  # type: ignore[misc]
+        rows = decode_all(lambda s=settings: SrepParser(s), batches_of(units))  # type: ignore[misc]
         copy = copy_rows(RETURN_DTYPE, rows)
 
         def least(units: ByteRows = units, copy: Callable[[], object] = copy) -> None:
@@ -136,22 +137,40 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
                 crc32(unit)
             copy()
 
-        decode = rate(lambda s=settings, b=batches: decode_all(lambda: SrepParser(s), b), rows, repeats)  # type: ignore[misc]
-        yield Figure(name, "returns", decode, 15e6, rate(least, rows, repeats), "CRC-32 + copy of the rows")
+        compiled, plain = both_rates(SrepParser, settings, units, rows, repeats)
+        yield Figure(name, "returns", compiled, 15e6, rate(least, rows, repeats), "CRC-32 + copy of the rows", plain)
 
 
-def head_figure(name: str, make: Callable[[], Parser], units: ByteRows, target: float, repeats: int) -> Figure:
-    """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
+def both_rates(
+    make: Callable[[DeviceSettings], Parser], settings: DeviceSettings, units: ByteRows, rows: int, repeats: int
+) -> tuple[float, float]:
+    """Rates of decoding by compiled loops and without."""
     batches = batches_of(units)
-    rows = decode_all(make, batches)
+    compiled = replace(settings, compiled=True)
+    return (
+        rate(lambda: decode_all(lambda: make(compiled), batches), rows, repeats),
+        rate(lambda: decode_all(lambda: make(settings), batches), rows, repeats),
+    )
+
+
+def head_figure(
+    name: str,
+    make: Callable[[DeviceSettings], Parser],
+    settings: DeviceSettings,
+    units: ByteRows,
+    target: float,
+    repeats: int,
+) -> Figure:
+    """A spinning head's packets decoded, beside a copy of the packets and of the rows."""
+    rows = decode_all(lambda: make(settings), batches_of(units))
     copy, taken = copy_rows(RETURN_DTYPE, rows), np.empty(units.shape, np.uint8)
 
     def least() -> None:
         np.copyto(taken, units)
         copy()
 
-    decode = rate(lambda: decode_all(make, batches), rows, repeats)
-    return Figure(name, "returns", decode, target, rate(least, rows, repeats), "copy of packets and rows")
+    compiled, plain = both_rates(make, settings, units, rows, repeats)
+    return Figure(name, "returns", compiled, target, rate(least, rows, repeats), "copy of packets and rows", plain)
 
 
 def measure_hesai(repeats: int) -> Iterator[Figure]:
@@ -165,7 +184,7 @@ def measure_hesai(repeats: int) -> Iterator[Figure]:
         units = np.tile(units, (max(1, 3600 // len(units)), 1))
         units.view(head.packet_dtype())["sequence"][:, 0] = np.arange(1, len(units) + 1)
         settings = DeviceSettings("scanner/bench")
-        yield head_figure(name, lambda h=head, s=settings: HesaiParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
+        yield head_figure(name, lambda s, h=head: HesaiParser(s, h), settings, units, 10e6, repeats)  # type: ignore[misc]
 
 
 def velodyne_units(name: str, step_us: float) -> ByteRows:
@@ -212,7 +231,7 @@ def measure_velodyne(repeats: int) -> Iterator[Figure]:
         ("VLS-128, strongest return", VLS128, with_stamps(as_vls128(vlp32c), 159.9)),
     ):
         settings = DeviceSettings("scanner/bench")
-        yield head_figure(name, lambda h=head, s=settings: VelodyneParser(s, h), units, 10e6, repeats)  # type: ignore[misc]
+        yield head_figure(name, lambda s, h=head: VelodyneParser(s, h), settings, units, 10e6, repeats)  # type: ignore[misc]
 
 
 def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
@@ -228,7 +247,7 @@ def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:
         columns["frame_id"] = frame[:, np.newaxis]
         return units
     table["frame_id"] = frame
-    table["crc"] = crc64_xz(units[:, :-8])
+    table["crc"] = [crc64_xz(unit[:-8]) for unit in units]
     return units
 
 
@@ -242,7 +261,7 @@ def measure_ouster(repeats: int) -> Iterator[Figure]:
         file = (FIXTURES / "ouster" / f"{metadata}.json").read_bytes()
         settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
         units = ouster_units(recording, OusterParser(settings).layout)
-        yield head_figure(name, lambda s=settings: OusterParser(s), units, 8e6, repeats)  # type: ignore[misc]
+        yield head_figure(name, OusterParser, settings, units, 8e6, repeats)
 
 
 # --- CAN ------------------------------------------------------------------------------------------------------------
@@ -356,14 +375,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=15, help="measurements a figure, of which the median counts")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     arguments = parser.parse_args()
+    keep_freed_memory()  # as every command of ours does
     figures = []
-    print(f"{'decoding, one core':<30} {'rate':>10} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
+    print(f"{'decoding, one core':<30} {'no numba':>9} {'rate':>9} {'asked':>8} {'limit':>9} {'share':>6}  item, limit")
     for measure in (measure_srep, measure_velodyne, measure_hesai, measure_ouster, measure_can, measure_framing):
         for figure in measure(arguments.repeats):
             figures.append(figure)
             asked = f"{figure.target / 1e6:.0f} M/s" if figure.target else "-"
+            plain = f"{figure.plain / 1e6:.1f} M/s" if figure.plain else "-"
             print(
-                f"{figure.name:<30} {figure.rate / 1e6:>6.1f} M/s {asked:>8} {figure.limit / 1e6:>5.0f} M/s "
+                f"{figure.name:<30} {plain:>9} {figure.rate / 1e6:>5.1f} M/s {asked:>8} {figure.limit / 1e6:>5.0f} M/s "
                 f"{figure.rate / figure.limit:>6.1%}  {figure.item}; {figure.limit_is}"
             )
     if arguments.json:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import importlib.metadata
 import os
 import platform
-import resource
 import time
 import uuid
 from dataclasses import dataclass, field
@@ -23,6 +21,7 @@ from daemon.errors import ExitCode
 from daemon.events import Events
 from daemon.host_clock import HostClock
 from daemon.log.format import SessionInfo
+from daemon.memory import lock_memory
 from daemon.parts import Attachment, Parts
 from daemon.places import take_directory
 from daemon.process import RecorderProcess
@@ -35,8 +34,6 @@ from drivers.transports.uri import TransportSpec, open_transport, parse_pps
 from georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
-KEPT_BYTES = 64 << 20  # freed memory that an arena keeps
-LARGEST_KEPT_BYTES = 32 << 20  # glibc's own largest
 
 _ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp"}
 
@@ -172,26 +169,6 @@ def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wir
     )
 
 
-def lock_memory() -> None:
-    """Keep pages that are in use in memory, where the unit grants it without limit (mlockall(2), on fault)."""
-    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
-        return
-    current, future, on_fault = 1, 2, 4
-    ctypes.CDLL(None, use_errno=True).mlockall(current | future | on_fault)
-
-
-def keep_freed_memory() -> None:
-    """Have glibc use freed memory again instead of giving it back page by page, to be faulted in anew (mallopt(3)).
-
-    Set before threads that receive start. Another C library has no such call, and does without.
-    """
-    trim_threshold, mmap_threshold = -1, -3
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(trim_threshold, KEPT_BYTES)
-        mallopt(mmap_threshold, LARGEST_KEPT_BYTES)
-
-
 def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEUE_BYTES) -> ExitCode:
     """Record until SIGTERM, SIGINT or for ``seconds``.
 
@@ -207,7 +184,6 @@ def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEU
             assembly = assemble(config, queue_bytes)
         assembly.parts.lock = lock
         lock_memory()
-        keep_freed_memory()
         whole = asyncio.run(RecorderProcess(assembly, ServiceManager()).run(seconds))
         return ExitCode.OK if whole else ExitCode.PROBLEM
     finally:

@@ -22,6 +22,7 @@ from typing import Annotated
 import typer
 
 from daemon.errors import ExitCode, UserError, one_line
+from daemon.memory import keep_freed_memory
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
@@ -102,6 +103,7 @@ app = make_app()
 
 def main() -> None:
     """Run the command line and leave with its exit code."""
+    keep_freed_memory()
     sys.exit(run_app(sys.argv[1:]))
 
 

@@ -15,7 +15,7 @@ from typing import BinaryIO, TypeVar
 
 import lz4.frame
 import zstandard
-from isal.isal_zlib import crc32
+from fastcrc.crc32 import iso_hdlc as crc32
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError

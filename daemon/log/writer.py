@@ -18,7 +18,7 @@ from typing import Any
 
 import lz4.frame
 import zstandard
-from isal.isal_zlib import crc32
+from fastcrc.crc32 import iso_hdlc as crc32
 from mcap import records
 
 from daemon.log.claim import claim

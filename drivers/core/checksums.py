@@ -7,7 +7,6 @@ whole frame are 0 when it is intact. SBF has its checksum in front and lowest by
 from __future__ import annotations
 
 import binascii
-import lzma
 import zlib
 from functools import cache
 from typing import TypeAlias
@@ -131,86 +130,3 @@ def crc32_novatel(data: Bytes) -> int:
 def crc16_ccitt(data: Bytes) -> int:
     """CRC-16 of SBF (PolaRx5TR reference guide, 4.1.1): x¹⁶ + x¹² + x⁵ + 1 from 0, high bit first, no inversion."""
     return binascii.crc_hqx(data, 0)
-
-
-CRC64_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # ECMA-182's, reflected
-CRC64_BLOCK_WORDS = 16_384  # of 8 bytes, worked on at once: they stay in the second-level cache
-
-
-def crc64_xz(rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """CRC-64/XZ of each row: ECMA-182's polynomial reflected, register inverted before and after.
-
-    The register is linear in the message, so the words of a row are folded in halves: the left half, carried on over
-    the bytes of the right one, is added to it, until one word is left.
-
-    Args:
-        rows: (n, length), length at least 8.
-    """
-    words = -(-rows.shape[1] // 8)
-    step = max(1, CRC64_BLOCK_WORDS // words)
-    parts = [_crc64_block(rows[at : at + step], words) for at in range(0, len(rows), step)]
-    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint64)
-
-
-def _crc64_block(rows: NDArray[np.uint8], words: int) -> NDArray[np.uint64]:
-    length = rows.shape[1]
-    padded = np.zeros((len(rows), 8 * words), dtype=np.uint8)  # zeros before a message do not change a register of 0
-    padded[:, -length:] = rows
-    padded[:, -length : 8 - length or None] ^= np.uint8(0xFF)
-    left = padded.view("<u8")
-    while left.shape[1] > 1:
-        half = left.shape[1] // 2
-        folded = _crc64_carried(left[:, :-half], 8 * half)  # an odd word before the halves is carried along
-        folded[:, -half:] ^= left[:, -half:]
-        left = folded
-    return ~_crc64_carried(left[:, 0], 8)
-
-
-def _crc64_carried(registers: NDArray[np.uint64], zero_bytes: int) -> NDArray[np.uint64]:
-    """What registers become after so many zero bytes."""
-    tables = _crc64_tables(zero_bytes)
-    places = np.ascontiguousarray(registers).view(np.uint8).reshape(*registers.shape, 8)
-    carried: NDArray[np.uint64] = tables[0].take(places[..., 0])
-    for byte in range(1, 8):
-        carried ^= tables[byte].take(places[..., byte])
-    return carried
-
-
-@cache
-def _crc64_tables(zero_bytes: int) -> NDArray[np.uint64]:
-    """(8, 256): what the register whose k-th byte alone is set becomes after so many zero bytes."""
-    if zero_bytes > 1:
-        half = _crc64_carried(_crc64_tables(zero_bytes // 2), zero_bytes // 2)
-        return _crc64_carried(half, 1) if zero_bytes % 2 else half
-    values = np.arange(256, dtype=np.uint64)
-    shifted = values.copy()
-    for _ in range(8):
-        shifted = (shifted >> np.uint64(1)) ^ np.where(shifted & np.uint64(1), CRC64_POLYNOMIAL, np.uint64(0))
-    higher = [values << np.uint64(8 * (byte - 1)) for byte in range(1, 8)]
-    return np.stack([shifted, *higher])
-
-
-def _xz_part(content: bytes) -> bytes:
-    return content + zlib.crc32(content).to_bytes(4, "little")
-
-
-# The stream's flags say CRC-64; the block's header says no sizes and one filter, LZMA2 with the least dictionary.
-_XZ_BEGIN = b"\xfd7zXZ\0" + _xz_part(bytes([0, 4])) + _xz_part(bytes([2, 0, 0x21, 1, 0, 0, 0, 0]))
-
-
-def crc64_xz_holds(data: bytes | memoryview, crc: bytes | memoryview) -> bool:
-    """Whether this is the data's CRC-64/XZ, little-endian: a tenth of the time `crc64_xz` needs to make one.
-
-    liblzma compares it: the data is handed to it as the one stored chunk of an .xz block (The .xz File Format, 2.1,
-    3.1 and 3.4), the CRC as the block's check.
-
-    Args:
-        data: 1 to 65536 bytes.
-        crc: 8 bytes.
-    """
-    chunk = (b"\x01", (len(data) - 1).to_bytes(2, "big"), data, bytes(1 + -len(data) % 4))
-    try:
-        lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(b"".join((_XZ_BEGIN, *chunk, crc)))
-    except lzma.LZMAError:
-        return False
-    return True

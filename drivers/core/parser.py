@@ -115,11 +115,14 @@ class DeviceSettings:
         source: ``kind/name``.
         config: the device's table of the configuration, defaults filled in.
         files: contents of the files it names, by key (``dbc``, ``geometry``), from disk or from a log's attachments.
+        compiled: returns are decoded by compiled loops, which want numba (``swath[process]``): the same rows, faster
+            where there are millions.
     """
 
     source: str
     config: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
+    compiled: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.hesai_gps import GPS_BYTES, NS, GpsReader
 from drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import Chosen
+from drivers.scanner.slots import Chosen, filler
 from drivers.scanner.spinning import Firings, returns_of_packets
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -118,6 +118,7 @@ class HesaiParser(PacketParser):
         self._gps = GpsReader(self.counters)
         self._tracker = SequenceTracker(self.counters.errors)
         self._thinner = SampleThinner() if clock_only else None
+        self._fill = filler(compiled=settings.compiled and not clock_only)
         self._unnumbered = 0
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
@@ -199,6 +200,7 @@ class HesaiParser(PacketParser):
                 packets["mode"],
                 self._head.blocks * self._head.channels,
                 lambda part: self._firings(host_time_ns[part], packets[part], stamp_ns[part], number[part]),
+                self._fill,
             )
             if len(rows):
                 records.append(ScannerReturns(rows))

@@ -33,7 +33,7 @@ from drivers.scanner.ouster_layout import (
 )
 from drivers.scanner.ouster_probe import OusterProbe
 from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, filler, in_order, returns_table
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -93,6 +93,7 @@ class OusterParser(PacketParser):
         says_strongest = ordered or self._light == "SIGNAL"
         self._pair = PairRule(_first_is_stronger if ordered else _more_light_is_stronger, says_strongest, True)
         self._thinner = SampleThinner() if clock_only else None
+        self._fill = filler(compiled=settings.compiled and not clock_only)
         self._init_id: int | None = None
         self._time_ns = 0
         self._health = HealthReader(self.layout)
@@ -258,7 +259,7 @@ class OusterParser(PacketParser):
             valid = self.layout.valid(columns)
             if not valid.all():
                 columns, number, host = columns[valid], number[valid], host[valid]
-            filled += self._block(columns, number.reshape(-1), host.reshape(-1)).fill(table[filled:])
+            filled += self._fill(self._block(columns, number.reshape(-1), host.reshape(-1)), table[filled:])
         return table[:filled]
 
     def _block(self, columns: StructArray, number: Int64Array, host_time_ns: Int64Array) -> ReturnSlots:

@@ -15,9 +15,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from fastcrc.crc64 import xz as crc64_xz
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.checksums import crc64_xz, crc64_xz_holds
 from drivers.core.parser import DriverSettingsError
 from drivers.scanner.ouster_head import FILE, FUSA_PROFILE, LARGEST_PACKET_BYTES, OusterHead
 from georef.records import StructArray
@@ -299,8 +299,7 @@ class LidarLayout:
 
 def with_crc(packet: bytes) -> bytes:
     """A packet whose last eight bytes are its CRC."""
-    body = np.frombuffer(packet[:-8], dtype=np.uint8).reshape(1, -1)
-    return packet[:-8] + int(crc64_xz(body)[0]).to_bytes(8, "little")
+    return packet[:-8] + crc64_xz(packet[:-8]).to_bytes(8, "little")
 
 
 def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -308,6 +307,5 @@ def crc_holds(units: NDArray[np.uint8]) -> NDArray[np.bool_]:
     said = np.ascontiguousarray(units[:, -8:]).view("<u8")[:, 0]
     holds: NDArray[np.bool_] = np.isin(said, np.array(NO_CRC, dtype=np.uint64))
     for row in np.flatnonzero(~holds).tolist():
-        packet = units[row].data
-        holds[row] = crc64_xz_holds(packet[:-8], packet[-8:])
+        holds[row] = crc64_xz(units[row, :-8].data) == said[row]
     return holds

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drivers.core.parser import DriverSettingsError
 from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 # Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
@@ -21,6 +22,7 @@ BLOCK_SLOTS = 32768
 _WORDS = RETURN_DTYPE.itemsize // 8
 
 Chosen: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
+Fill: TypeAlias = "Callable[[ReturnSlots, StructArray], int]"
 
 
 @cache
@@ -174,6 +176,21 @@ def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], ND
         count[lag:] += same
         count[:-lag] += same
     return number, count
+
+
+def filler(*, compiled: bool) -> Fill:
+    """`ReturnSlots.fill`, or the same compiled.
+
+    Raises:
+        DriverSettingsError: numba is not installed.
+    """
+    if not compiled:
+        return ReturnSlots.fill
+    try:
+        from drivers.compiled.rows import fill
+    except ImportError as error:
+        raise DriverSettingsError(f"compiled decoding wants numba, of pip install 'swath[process]': {error}") from error
+    return fill
 
 
 def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:

@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.scanner.beams import FloatArray
-from drivers.scanner.slots import BLOCK_SLOTS, Chosen, PairRule, ReturnSlots, common_words, in_order, returns_table
+from drivers.scanner.slots import (
+    BLOCK_SLOTS,
+    Chosen,
+    Fill,
+    PairRule,
+    ReturnSlots,
+    common_words,
+    in_order,
+    returns_table,
+)
 from georef.records import Int64Array, StructArray
 
 # A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` is all but the range.
@@ -76,13 +85,16 @@ class Firings:
         )
 
 
-def returns_of_packets(mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings]) -> StructArray:
+def returns_of_packets(
+    mode: NDArray[np.uint8], most: int, firings_of: Callable[[slice], Firings], fill: Fill
+) -> StructArray:
     """Returns of all packets in order, worked on in blocks of one return mode.
 
     Args:
         mode: (n,) return mode of each packet.
         most: returns a packet holds at most.
         firings_of: makes the firings of a slice of the packets.
+        fill: writes their rows.
     """
     edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(mode)]
     table = returns_table(len(mode) * most)
@@ -90,7 +102,7 @@ def returns_of_packets(mode: NDArray[np.uint8], most: int, firings_of: Callable[
     for start, stop in pairwise(edges):
         for at in range(start, stop, BLOCK_SLOTS // most):
             part = slice(at, min(at + BLOCK_SLOTS // most, stop))
-            filled += firings_of(part).slots().fill(table[filled:])
+            filled += fill(firings_of(part).slots(), table[filled:])
     return table[:filled]
 
 

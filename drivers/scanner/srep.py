@@ -13,12 +13,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from isal.isal_zlib import crc32
+from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, returns_table
+from drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, filler, returns_table
 from drivers.scanner.srep_layout import (
     CRC,
     FLAG_LASER_ON,
@@ -81,21 +81,22 @@ class ScanAngle:
 
     def angles(
         self, encoder: NDArray[np.int32], encoder_counts: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64] | None]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint16] | None]:
         """Scan angles (n, N) in radians and, of a polygon, facets (n, N) of readings (n, N)."""
+        turned = encoder.astype(np.float64)
         if not self._facets:
-            angle = encoder.astype(np.float64)
-            angle *= 2 * np.pi * self._factor / encoder_counts
-            return angle, None
-        turned = encoder.astype(np.int64)
+            turned *= 2 * np.pi * self._factor / encoder_counts
+            return turned, None
+        # Whole numbers below 2⁴⁸, of which every difference and product here is exact, and the floor of a quotient too:
+        # where it is not whole it is further from one than its rounding goes. np.divmod takes ten times as long.
         turned *= self._facets
-        facet = turned // encoder_counts  # np.divmod takes several times as long
+        facet = np.floor(turned / encoder_counts)
         turned -= facet * encoder_counts
-        angle = turned / encoder_counts
-        angle -= 0.5
-        angle *= 4 * np.pi / self._facets  # 2 · (shaft angle − facet centre)
-        facet -= facet // self._facets * self._facets
-        return angle, facet
+        turned /= encoder_counts
+        turned -= 0.5
+        turned *= 4 * np.pi / self._facets  # 2 · (shaft angle − facet centre)
+        facet -= np.floor(facet / self._facets) * self._facets
+        return turned, facet.astype(np.uint16)
 
 
 class SrepParser(PacketParser):
@@ -112,6 +113,7 @@ class SrepParser(PacketParser):
         self._scan_angle = ScanAngle(settings.config)
         self._tracker = SequenceTracker(self.counters.errors)
         self._thinner = SampleThinner() if clock_only else None
+        self._fill = filler(compiled=settings.compiled and not clock_only)
         self._last_sequence: int | None = None
         self._newest = -LATE_DATAGRAMS - 1
         self._last_status: tuple[int, ...] | None = None
@@ -210,7 +212,7 @@ class SrepParser(PacketParser):
             part = slice(start, stop)
             if header["pulses"][start]:
                 block = self._block(host_time_ns[part], header[part], units[part], unwrapped[part])
-                filled += block.fill(table[filled:])
+                filled += self._fill(block, table[filled:])
         return table[:filled]
 
     def _block(

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
 from drivers.scanner.beams import BeamTable, FloatArray
 from drivers.scanner.sequence import BoolArray, SampleThinner
-from drivers.scanner.slots import Chosen
+from drivers.scanner.slots import Chosen, filler
 from drivers.scanner.spinning import Firings, returns_of_packets
 from drivers.scanner.stamps import StampTracker
 from drivers.scanner.velodyne_calibration import read_calibration
@@ -109,6 +109,7 @@ class VelodyneParser(PacketParser):
         self._flags = [head.used_block_flags(dual=dual) for dual in (False, True)]
         self._position = PositionReader(self.counters)
         self._thinner = SampleThinner() if clock_only else None
+        self._fill = filler(compiled=settings.compiled and not clock_only)
         self._stamps = StampTracker(self.counters.errors, HOUR_US, MAX_SILENCE_US)
         self._last_stamp_us: int | None = None
         self._last_azimuth = 0
@@ -146,6 +147,7 @@ class VelodyneParser(PacketParser):
                 packets["mode"],
                 BLOCKS * PLACES,
                 lambda part: self._firings(host_time_ns[part], packets[part], turn[part], number[part]),
+                self._fill,
             )
             if len(rows):
                 records.append(ScannerReturns(rows))

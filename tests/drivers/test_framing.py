@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import functools
-import lzma
 import operator
 import random
-import zlib
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,9 +23,6 @@ from drivers.core.checksums import (
     crc16_ccitt,
     crc24q,
     crc24q_marks,
-    crc32_novatel,
-    crc64_xz,
-    crc64_xz_holds,
     nmea_xor,
     ubx_fletcher,
 )
@@ -124,47 +118,6 @@ def test_crc24q_marks_are_equal_where_a_good_frame_begins_and_ends_and_nowhere_e
 def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
-
-
-def crc64_reference(data: bytes) -> int:
-    """The check of a block as liblzma writes it (The .xz File Format, 2.1.2 and 3.4)."""
-    packed = lzma.compress(data, check=lzma.CHECK_CRC64)
-    index_bytes = 4 * (int.from_bytes(packed[-8:-4], "little") + 1)
-    end = len(packed) - 12 - index_bytes
-    return int.from_bytes(packed[end - 8 : end], "little")
-
-
-@pytest.mark.parametrize("length", [8, 9, 15, 16, 17, 23, 24, 25, 444, 8440, 24_824])
-def test_crc64_of_rows_joins_their_words(length: int) -> None:
-    rows = np.frombuffer(random.Random(length).randbytes(5 * length), dtype=np.uint8).reshape(5, length)
-    assert crc64_xz(rows).tolist() == [crc64_reference(row.tobytes()) for row in rows]
-    assert crc64_xz(rows[::2]).tolist() == [crc64_reference(row.tobytes()) for row in rows[::2]]
-    assert crc64_xz(rows[:0]).tolist() == []
-
-
-@pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 6, 444, 8440, 65_536])
-def test_crc64_holds_of_whole_data_only(length: int) -> None:
-    data = random.Random(length).randbytes(length)
-    crc = crc64_reference(data).to_bytes(8, "little")
-    assert crc64_xz_holds(data, crc)
-    for bit in random.Random(1).sample(range(8 * length), min(8 * length, 40)):
-        flipped = bytearray(data)
-        flipped[bit // 8] ^= 1 << bit % 8
-        assert not crc64_xz_holds(bytes(flipped), crc)
-    for bit in range(64):
-        assert not crc64_xz_holds(data, (int.from_bytes(crc, "little") ^ 1 << bit).to_bytes(8, "little"))
-
-
-def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
-    """OEM7 manual, "32-bit CRC": register 0, polynomial 0xEDB88320, low bit first, no inversion."""
-    data = random.Random(3).randbytes(500)
-    register = 0
-    for byte in data:
-        register ^= byte
-        for _ in range(8):
-            register = register >> 1 ^ (0xEDB88320 if register & 1 else 0)
-    assert crc32_novatel(data) == register != zlib.crc32(data)
-    assert crc32_novatel(data + register.to_bytes(4, "little")) == 0
 
 
 # --- every recording ---

@@ -97,7 +97,7 @@ def _measured(target: Target, data: bytes) -> Iterable[str]:
 
 
 def fuzz(target: Target, *, seconds: float, seed: int = 0, executions: int | None = None) -> Report:
-    """Run for so many seconds of processor time, which other work cannot shorten, or until so many inputs were tried."""
+    """Run for so many seconds of processor time, which no other work takes from it, or for so many inputs."""
     report = Report(target.name)
     corpus = list(target.seeds) or [b""]
     started = time.process_time()

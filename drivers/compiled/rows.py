@@ -1,0 +1,113 @@
+"""The loop that writes rows, compiled by numba: what `ReturnSlots.fill` does column by column, in one go.
+
+numba comes with ``swath[process]``. The recorder does without: this module is imported where `DeviceSettings.compiled`
+asks for it, and nowhere else. To compile takes about a second for each kind of slots a process meets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from drivers.scanner.slots import ReturnSlots
+from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
+
+# A row's last word is written as one number, as `slots.common_words` begins it.
+_WORDS = RETURN_DTYPE.itemsize // 8
+_NUMBER_SHIFT, _COUNT_SHIFT = np.uint64(16), np.uint64(24)
+_STRONGEST, _LAST = np.uint64(RETURN_FLAG_STRONGEST << 40), np.uint64(RETURN_FLAG_LAST << 40)
+_NO_FLAG, _ONLY = np.uint64(0), _STRONGEST | _LAST
+_NOT_NUMBERS = ~np.uint64(0xFFFF0000)
+
+
+def fill(slots: ReturnSlots, table: StructArray) -> int:
+    """As `ReturnSlots.fill`, bit for bit."""
+    content, pair, width_unit_ns = slots.content, slots.pair, slots.pulse_width_unit_ns
+    of_pulse = {
+        name: np.broadcast_to(made_of(lambda values: values), slots.shape) for name, made_of in slots.per_pulse.items()
+    }
+    intensity = content["intensity"]
+    return _write_rows(
+        table,
+        table.view(np.uint64).reshape(-1, _WORDS),
+        slots.there.reshape(content.shape),
+        content["range"],
+        slots.range_unit_m,
+        intensity,
+        intensity if width_unit_ns is None else content["pulse_width"],
+        np.float32(0) if width_unit_ns is None else width_unit_ns,
+        intensity if pair is None else pair.strength(content),
+        _NO_FLAG if pair is None else _ONLY,
+        _STRONGEST if pair is not None and pair.names_strongest else _NO_FLAG,
+        _LAST if pair is not None and pair.names_last else _NO_FLAG,
+        slots.pulse_id,
+        np.broadcast_to(slots.common & _NOT_NUMBERS, slots.shape),
+        of_pulse["host_time_ns"],
+        of_pulse["device_time_ns"],
+        of_pulse["encoder_rad"],
+        of_pulse.get("channel"),
+    )
+
+
+def _rows_written(
+    table: Any,
+    words: Any,
+    there: Any,
+    ranges: Any,
+    range_unit_m: float,
+    intensity: Any,
+    pulse_width: Any,
+    pulse_width_unit_ns: np.float32,
+    strength: Any,
+    of_an_only_one: np.uint64,
+    of_the_strongest: np.uint64,
+    of_the_last: np.uint64,
+    pulse_id: Any,
+    common: Any,
+    host_time_ns: Any,
+    device_time_ns: Any,
+    encoder_rad: Any,
+    channel: Any,
+) -> int:
+    """Slots (m · n, s), what is the pulse's (m, n), ``pulse_id`` (m,); ``words`` are the table's."""
+    filled = 0
+    for i in range(host_time_ns.shape[0]):
+        for j in range(host_time_ns.shape[1]):
+            pulse = i * host_time_ns.shape[1] + j
+            count, number, nearer = np.uint64(0), np.uint64(0), 0
+            for slot in range(there.shape[1]):
+                count += np.uint64(there[pulse, slot])
+            last_word = common[i, j] | count << _COUNT_SHIFT
+            if channel is not None:
+                last_word |= np.uint64(channel[i, j])
+            for slot in range(there.shape[1]):
+                if not there[pulse, slot]:
+                    continue
+                number += np.uint64(1)
+                flags = _NO_FLAG
+                if count == 1:
+                    flags = of_an_only_one
+                elif number == 1:
+                    nearer = slot
+                elif strength[pulse, nearer] > strength[pulse, slot]:
+                    words[filled - 1, _WORDS - 1] |= of_the_strongest
+                    flags = of_the_last
+                else:
+                    flags = of_the_strongest | of_the_last
+                row = table[filled]
+                row["host_time_ns"] = host_time_ns[i, j]
+                row["device_time_ns"] = device_time_ns[i, j]
+                row["range_m"] = ranges[pulse, slot] * range_unit_m
+                row["encoder_rad"] = encoder_rad[i, j]
+                row["pulse_id"] = pulse_id[i] + j
+                row["intensity"] = intensity[pulse, slot]
+                row["pulse_width_ns"] = pulse_width[pulse, slot] * pulse_width_unit_ns
+                words[filled, _WORDS - 1] = last_word | number << _NUMBER_SHIFT | flags
+                filled += 1
+    return filled
+
+
+_write_rows: Callable[..., int] = numba.njit(nogil=True)(_rows_written)
