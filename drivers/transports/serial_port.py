@@ -24,7 +24,7 @@ from drivers.transports.uri import TransportSpec
 
 DEFAULT_BAUD = 115200
 READ_BYTES = 65536
-BATCH_S = 0.008  # after the first byte, so that a fast port is not read byte by byte; 740 bytes at 921600 baud,
+BATCH_S = 0.010  # after the first byte, so that a fast port is not read byte by byte; 920 bytes at 921600 baud,
 BATCH_BYTES = 2048  # but no more than half of what a terminal holds (4096, n_tty(4))
 SEND_TIMEOUT_S = 2.0
 
