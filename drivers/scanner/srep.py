@@ -87,15 +87,15 @@ class ScanAngle:
         if not self._facets:
             turned *= 2 * np.pi * self._factor / encoder_counts
             return turned, None
-        # Whole numbers below 2⁴⁸, of which every difference and product here is exact, and the floor of a quotient too:
-        # where it is not whole it is further from one than its rounding goes. np.divmod takes ten times as long.
+        # Whole and half numbers below 2⁴⁸, of which every sum, difference and product here is exact, and the floor of a
+        # quotient too: one that is not whole is further from the next than its rounding goes. np.divmod takes ten times
+        # as long.
         turned *= self._facets
         facet = np.floor(turned / encoder_counts)
-        turned -= facet * encoder_counts
-        turned /= encoder_counts
-        turned -= 0.5
-        turned *= 4 * np.pi / self._facets  # 2 · (shaft angle − facet centre)
-        facet -= np.floor(facet / self._facets) * self._facets
+        turned -= (facet + 0.5) * encoder_counts
+        turned *= 4 * np.pi / self._facets / encoder_counts  # 2 · (shaft angle − facet centre)
+        if facet.min(initial=0) < 0 or facet.max(initial=0) >= self._facets:  # readings beyond one turn
+            facet -= np.floor(facet / self._facets) * self._facets
         return turned, facet.astype(np.uint16)
 
 
