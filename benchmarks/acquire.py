@@ -1,6 +1,6 @@
 """What recording costs: CPU of the recorder's process, losses and memory, beside the machine's own limits.
 
-python -m benchmarks.acquire [--seconds 60] [--repeats 3] [--json FILE]
+python -m benchmarks.acquire [--seconds 60] [--repeats 3] [--only LINE] [--json FILE]
 
 The limit beside each figure is what the bare building blocks cost in the same run: recvmmsg into slots and one
 writev a batch to a file, without stamps, log format, checksums or index. Sender and receiver share the machine.
@@ -23,7 +23,7 @@ import tempfile
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -300,16 +300,21 @@ def _write_serial(fd: int, bytes_per_s: float, seconds: float) -> None:
         time.sleep(0.001)
 
 
-def measure(seconds: float) -> list[Figure]:
-    """Every line of the table once."""
-    figures: list[Figure] = []
-    for length, rate in ((1206, 20000.0), (8448, 5000.0)):
-        figure = record_udp(length, rate, seconds)
-        figure.limit_cpu_percent = bare_udp(length, rate, min(seconds, 15.0))
-        figures.append(figure)
-    figure = record_udp(1206, 110000.0, 10.0)
-    figure.limit_cpu_percent = bare_udp(1206, 110000.0, 5.0)
-    return [*figures, figure, stall(6.0), with_others(seconds), no_data(10.0)]
+def sustained(length: int, rate: float, seconds: float, bare_seconds: float) -> Figure:
+    """Datagrams of one length and rate, beside the building blocks' cost of the same."""
+    figure = record_udp(length, rate, seconds)
+    figure.limit_cpu_percent = bare_udp(length, rate, bare_seconds)
+    return figure
+
+
+LOADS: dict[str, Callable[[float], Figure]] = {
+    "small": lambda seconds: sustained(1206, 20000.0, seconds, min(seconds, 15.0)),
+    "large": lambda seconds: sustained(8448, 5000.0, seconds, min(seconds, 15.0)),
+    "fast": lambda seconds: sustained(1206, 110000.0, 10.0, 5.0),
+    "stall": lambda seconds: stall(6.0),
+    "others": with_others,
+    "idle": lambda seconds: no_data(10.0),
+}
 
 
 def median(runs: list[Figure]) -> Figure:
@@ -327,11 +332,13 @@ def median(runs: list[Figure]) -> Figure:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the two sustained loads")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the sustained loads")
+    parser.add_argument("--only", choices=LOADS, action="append", help="this line of the table")
     parser.add_argument("--repeats", type=int, default=3, help="runs; the table gives their medians")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     arguments = parser.parse_args()
-    runs = [measure(arguments.seconds) for _ in range(arguments.repeats)]
+    chosen = [load for name, load in LOADS.items() if name in (arguments.only or LOADS)]
+    runs = [[load(arguments.seconds) for load in chosen] for _ in range(arguments.repeats)]
     figures = [median(list(lines)) for lines in zip(*runs, strict=True)]
     print(f"{'load':<38} {'sent':>10} {'recorded':>10} {'CPU %':>6} {'bare %':>7} {'RSS MB':>7}  note")
     for figure in figures:
