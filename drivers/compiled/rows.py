@@ -25,7 +25,7 @@ _NOT_NUMBERS = ~np.uint64(0xFFFF0000)
 
 def fill(slots: ReturnSlots, table: StructArray) -> int:
     """As `ReturnSlots.fill`, bit for bit."""
-    content, pair, width_unit_ns = slots.content, slots.pair, slots.pulse_width_unit_ns
+    content, pair, width_unit_ns = slots.content[:, slots.others :], slots.pair, slots.pulse_width_unit_ns
     of_pulse = {
         name: np.broadcast_to(made_of(lambda values: values), slots.shape) for name, made_of in slots.per_pulse.items()
     }
@@ -33,7 +33,6 @@ def fill(slots: ReturnSlots, table: StructArray) -> int:
     return _write_rows(
         table,
         table.view(np.uint64).reshape(-1, _WORDS),
-        slots.there.reshape(content.shape),
         content["range"],
         slots.range_unit_m,
         intensity,
@@ -55,7 +54,6 @@ def fill(slots: ReturnSlots, table: StructArray) -> int:
 def _rows_written(
     table: Any,
     words: Any,
-    there: Any,
     ranges: Any,
     range_unit_m: float,
     intensity: Any,
@@ -78,13 +76,13 @@ def _rows_written(
         for j in range(host_time_ns.shape[1]):
             pulse = i * host_time_ns.shape[1] + j
             count, number, nearer = np.uint64(0), np.uint64(0), 0
-            for slot in range(there.shape[1]):
-                count += np.uint64(there[pulse, slot])
+            for slot in range(ranges.shape[1]):
+                count += np.uint64(ranges[pulse, slot] != 0)
             last_word = common[i, j] | count << _COUNT_SHIFT
             if channel is not None:
                 last_word |= np.uint64(channel[i, j])
-            for slot in range(there.shape[1]):
-                if not there[pulse, slot]:
+            for slot in range(ranges.shape[1]):
+                if ranges[pulse, slot] == 0:
                     continue
                 number += np.uint64(1)
                 flags = _NO_FLAG

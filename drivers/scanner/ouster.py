@@ -270,7 +270,6 @@ class OusterParser(PacketParser):
         content = self._content(columns["pixels"])
         return ReturnSlots(
             content=content,
-            there=content.view("<u8") > 0xFFFF_FFFF,
             range_unit_m=RANGE_MM * (1 << self.layout.profile.fields["RANGE"].dropped),
             common=common_words((1, len(beam)), channel=beam, flags=flags),
             shape=(len(number), len(beam)),

@@ -78,8 +78,8 @@ class ReturnSlots:
 
     Attributes:
         content: (pulses, slots), contiguous, of 4 or 8 bytes, which are gathered at once; fields ``range`` (the
-            device's unit), ``intensity`` and whatever `pair` and `pulse_width_unit_ns` ask for.
-        there: (pulses, slots) which slots hold a return.
+            device's unit, 0 where there is no return), ``intensity`` and whatever `pair` and `pulse_width_unit_ns` ask
+            for.
         range_unit_m: metres of one raw unit.
         common: `common_words` of the pulses, an array as those.
         shape: (m, n).
@@ -88,10 +88,10 @@ class ReturnSlots:
             handed to its argument first, which spreads it over the pulses that are wanted.
         pair: flags of returns in two slots beside the common ones; None: there are none.
         pulse_width_unit_ns: nanoseconds of a unit of the field ``pulse_width``; None: unknown.
+        others: slots at the front of each pulse that hold something else.
     """
 
     content: StructArray
-    there: NDArray[np.bool_]
     range_unit_m: float
     common: NDArray[np.uint64]
     shape: tuple[int, int]
@@ -99,6 +99,7 @@ class ReturnSlots:
     per_pulse: Mapping[str, Callable[[Chosen], NDArray[Any]]]
     pair: PairRule | None = None
     pulse_width_unit_ns: np.float32 | None = None
+    others: int = 0
 
     def fill(self, table: StructArray) -> int:
         """Write the returns there are, ordered by pulse, then by slot, to the head of ``table``; returns their number.
@@ -107,7 +108,10 @@ class ReturnSlots:
             table: `RETURN_DTYPE`, at least as many rows as there are slots.
         """
         slots, content = self.content.shape[1], self.content.reshape(-1)
-        index = np.flatnonzero(self.there)
+        there = content["range"] != 0
+        if self.others:
+            there.reshape(-1, slots)[:, : self.others] = False
+        index = np.flatnonzero(there)
         words = np.empty((_WORDS, len(index)), dtype=np.uint64)
         if slots == 1 and len(index) == len(content):
             self._write_all_pulses(words)

@@ -71,7 +71,6 @@ class Firings:
         host_time_ns = np.repeat(self.host_time_ns, rounds)[:, np.newaxis]
         return ReturnSlots(
             content=content,
-            there=content.view("<u4") > 0xFFFF,
             range_unit_m=self.range_unit_m,
             common=common_words((1, lasers), channel=self.channel, flags=self.flags),
             shape=(packets * rounds, lasers),

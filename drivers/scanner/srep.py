@@ -233,21 +233,18 @@ class SrepParser(PacketParser):
         if facet is not None:
             per_pulse["channel"] = lambda at: at(facet)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
-        # a pulse's head lies as one more slot before its own, one that never holds a return; beside a single slot,
-        # which pulses mostly fill, it is left out
+        # a pulse's head lies as one more slot before its own; beside a single slot, which pulses mostly fill, it is
+        # left out
         content = np.ascontiguousarray(words[:, 1:] if slots == 1 else words).view(SLOT_DTYPE)
-        there = content["range"] != 0
-        if slots > 1:
-            there[:, 0] = False
         return ReturnSlots(
             content=content,
-            there=there,
             range_unit_m=RANGE_UNIT_M,
             common=common_words((n, 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis]),
             shape=(n, pulses),
             pulse_id=unwrapped << 16,
             per_pulse=per_pulse,
             pulse_width_unit_ns=np.float32(PULSE_WIDTH_UNIT_NS),
+            others=0 if slots == 1 else 1,
         )
 
 

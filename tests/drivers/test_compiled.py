@@ -85,7 +85,6 @@ def random_slots(slots: int, named: tuple[bool, bool] | None, seed: int) -> Retu
     channel = random.integers(0, 1 << 16, (1, 30))
     return ReturnSlots(
         content=numbers.view(CONTENT),
-        there=numbers > 0xFFFF_FFFF,
         range_unit_m=0.002,
         common=common_words((40, 30), channel=channel, mta_zone=zone, flags=4),
         shape=(40, 30),
