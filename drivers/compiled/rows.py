@@ -20,6 +20,7 @@ _WORDS = RETURN_DTYPE.itemsize // 8
 _NUMBER_SHIFT, _COUNT_SHIFT = np.uint64(16), np.uint64(24)
 _STRONGEST, _LAST = np.uint64(RETURN_FLAG_STRONGEST << 40), np.uint64(RETURN_FLAG_LAST << 40)
 _NO_FLAG, _ONLY = np.uint64(0), _STRONGEST | _LAST
+_ONE = np.uint64(1)
 _NOT_NUMBERS = ~np.uint64(0xFFFF0000)
 
 
@@ -71,27 +72,29 @@ def _rows_written(
     channel: Any,
 ) -> int:
     """Slots (m · n, s), what is the pulse's (m, n), ``pulse_id`` (m,); ``words`` are the table's."""
-    filled = 0
+    filled = np.uint64(0)  # unsigned, as the pulse: a signed index is looked at for counting from the end
     for i in range(host_time_ns.shape[0]):
         for j in range(host_time_ns.shape[1]):
-            pulse = i * host_time_ns.shape[1] + j
+            pulse = np.uint64(i * host_time_ns.shape[1] + j)
             count, number, nearer = np.uint64(0), np.uint64(0), 0
             for slot in range(ranges.shape[1]):
                 count += np.uint64(ranges[pulse, slot] != 0)
+            if count == 0:
+                continue
             last_word = common[i, j] | count << _COUNT_SHIFT
             if channel is not None:
                 last_word |= np.uint64(channel[i, j])
             for slot in range(ranges.shape[1]):
                 if ranges[pulse, slot] == 0:
                     continue
-                number += np.uint64(1)
+                number += _ONE
                 flags = _NO_FLAG
                 if count == 1:
                     flags = of_an_only_one
                 elif number == 1:
                     nearer = slot
                 elif strength[pulse, nearer] > strength[pulse, slot]:
-                    words[filled - 1, _WORDS - 1] |= of_the_strongest
+                    words[filled - _ONE, _WORDS - 1] |= of_the_strongest
                     flags = of_the_last
                 else:
                     flags = of_the_strongest | of_the_last
@@ -104,8 +107,8 @@ def _rows_written(
                 row["intensity"] = intensity[pulse, slot]
                 row["pulse_width_ns"] = pulse_width[pulse, slot] * pulse_width_unit_ns
                 words[filled, _WORDS - 1] = last_word | number << _NUMBER_SHIFT | flags
-                filled += 1
-    return filled
+                filled += _ONE
+    return int(filled)
 
 
 _write_rows: Callable[..., int] = numba.njit(nogil=True)(_rows_written)
