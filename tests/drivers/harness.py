@@ -79,7 +79,7 @@ def canonical(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if value == value else "nan"
     if fields := fields_of(kind):  # type: ignore[arg-type]
-        return (kind.__name__, *[canonical(getattr(value, field)) for field in fields])
+        return (kind.__name__, *[(field, canonical(getattr(value, field))) for field in fields])
     if isinstance(value, np.ndarray):
         return (value.dtype.str, value.shape, *packed_rows(value.reshape(-1)))
     if isinstance(value, dict):
