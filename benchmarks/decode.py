@@ -221,11 +221,13 @@ def as_vls128(units: ByteRows) -> ByteRows:
 
 
 def measure_velodyne(repeats: int) -> Iterator[Figure]:
-    """VLP-16 in both return modes and VLP-32C, real packets; the VLP-32C's as dual ones and as a VLS-128's too."""
+    """VLP-16 in both modes and VLP-32C, real packets; single ones as dual ones too, VLP-32C's as a VLS-128's."""
+    vlp16 = velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)
     vlp32c = velodyne_units("nebula_vlp32.pcap.gz", 663.552)
     for name, head, units in (
-        ("VLP-16, strongest return", VLP16, velodyne_units("mrpt_vlp16_gps.pcap.gz", 1327.104)),
-        ("VLP-16, dual return", VLP16, velodyne_units("nebula_vlp16.pcap.gz", 663.552)),
+        ("VLP-16, strongest return", VLP16, vlp16),
+        ("VLP-16, dual, 26 % used", VLP16, velodyne_units("nebula_vlp16.pcap.gz", 663.552)),
+        ("VLP-16, dual, 67 % used", VLP16, with_stamps(as_dual(vlp16), 663.552)),
         ("VLP-32C, strongest return", VLP32C, vlp32c),
         ("VLP-32C, dual return", VLP32C, with_stamps(as_dual(vlp32c), 331.776)),
         ("VLS-128, strongest return", VLS128, with_stamps(as_vls128(vlp32c), 159.9)),
