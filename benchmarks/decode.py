@@ -17,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -129,7 +130,7 @@ def measure_srep(repeats: int) -> Iterator[Figure]:
     ):
         settings = DeviceSettings("scanner/bench", {"mirror_factor": 2.0, **config})
         units = srep_units(*shape)
-        rows = decode_all(lambda s=settings: SrepParser(s), batches_of(units))  # type: ignore[misc]
+        rows = decode_all(partial(SrepParser, settings), batches_of(units))
         copy = copy_rows(RETURN_DTYPE, rows)
 
         def least(units: ByteRows = units, copy: Callable[[], object] = copy) -> None:
@@ -184,7 +185,7 @@ def measure_hesai(repeats: int) -> Iterator[Figure]:
         units = np.tile(units, (max(1, 3600 // len(units)), 1))
         units.view(head.packet_dtype())["sequence"][:, 0] = np.arange(1, len(units) + 1)
         settings = DeviceSettings("scanner/bench")
-        yield head_figure(name, lambda s, h=head: HesaiParser(s, h), settings, units, 10e6, repeats)  # type: ignore[misc]
+        yield head_figure(name, partial(HesaiParser, head=head), settings, units, 10e6, repeats)
 
 
 def velodyne_units(name: str, step_us: float) -> ByteRows:
@@ -233,7 +234,7 @@ def measure_velodyne(repeats: int) -> Iterator[Figure]:
         ("VLS-128, strongest return", VLS128, with_stamps(as_vls128(vlp32c), 159.9)),
     ):
         settings = DeviceSettings("scanner/bench")
-        yield head_figure(name, lambda s, h=head: VelodyneParser(s, h), settings, units, 10e6, repeats)  # type: ignore[misc]
+        yield head_figure(name, partial(VelodyneParser, head=head), settings, units, 10e6, repeats)
 
 
 def ouster_units(recording: str, layout: LidarLayout) -> ByteRows:

@@ -87,10 +87,8 @@ class TimeKeeper:
         def feed(log_time_ns: Int64Array, block: UnitBlock) -> None:
             time_source = self._sources[source]
             time_source.units_ns = int(log_time_ns[-1])
-            try:  # at every read: entering a context manager takes as long as parsing a sentence
+            with self._defects_told(source):
                 self._take(time_source, time_source.parser.feed_batch(ChunkBatch(source, log_time_ns, block.units)))
-            except Exception as error:
-                self._tell_defect(source, error)
 
         return feed
 
@@ -100,13 +98,10 @@ class TimeKeeper:
         try:
             yield
         except Exception as error:
-            self._tell_defect(source, error)
-
-    def _tell_defect(self, source: str, error: Exception) -> None:
-        if source not in self._failed:
-            self._failed.add(source)
-            text = f"time keeping failed, bytes are recorded all the same: {type(error).__name__}: {error}"
-            self._events.post(Severity.ERROR, source, "time_parser_failed", text)
+            if source not in self._failed:
+                self._failed.add(source)
+                text = f"time keeping failed, bytes are recorded all the same: {type(error).__name__}: {error}"
+                self._events.post(Severity.ERROR, source, "time_parser_failed", text)
 
     def _take(self, time_source: _TimeSource, records: list[Record]) -> None:
         messages = [record for record in records if isinstance(record, TimeMessage)]

@@ -73,12 +73,12 @@ PLAIN = frozenset({int, str, bytes, bool, type(None)})
 
 def canonical(value: Any) -> Any:
     """A value that compares by content: arrays by dtype, shape and bytes, NaN equal to NaN, dataclasses by fields."""
-    kind = type(value)
+    kind: Any = type(value)
     if kind in PLAIN:
         return value
     if isinstance(value, float | np.floating):
         return float(value) if value == value else "nan"
-    if fields := fields_of(kind):  # type: ignore[arg-type]
+    if fields := fields_of(kind):
         return (kind.__name__, *[(field, canonical(getattr(value, field))) for field in fields])
     if isinstance(value, np.ndarray):
         return (value.dtype.str, value.shape, *packed_rows(value.reshape(-1)))

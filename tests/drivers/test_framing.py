@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 import random
+import zlib
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -23,6 +24,7 @@ from drivers.core.checksums import (
     crc16_ccitt,
     crc24q,
     crc24q_marks,
+    crc32_novatel,
     nmea_xor,
     ubx_fletcher,
 )
@@ -118,6 +120,18 @@ def test_crc24q_marks_are_equal_where_a_good_frame_begins_and_ends_and_nowhere_e
 def test_fletcher_of_long_data_joins_its_steps(length: int) -> None:
     data = random.Random(length).randbytes(length)
     assert bytes(ubx_fletcher(data)) == fletcher_reference(data)
+
+
+def test_crc32_novatel_is_the_manuals_bitwise_rule() -> None:
+    """OEM7 manual, "32-bit CRC": register 0, polynomial 0xEDB88320, low bit first, no inversion."""
+    data = random.Random(3).randbytes(500)
+    register = 0
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0xEDB88320 if register & 1 else 0)
+    assert crc32_novatel(data) == register != zlib.crc32(data)
+    assert crc32_novatel(data + register.to_bytes(4, "little")) == 0
 
 
 # --- every recording ---
