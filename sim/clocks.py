@@ -1,0 +1,80 @@
+"""Clocks of the virtual aircraft: devices' oscillators, the pulse per second, randomness that a name owns.
+
+Time in `sim` is ``time_s``: seconds since the plan's start, true GPS time, float64 (1e-13 s at 1000 s). The plan
+starts on a whole second, so true edges stand at whole ``time_s``.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.plan_tables import OscillatorTable, PpsTable
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+WANDER_PERIOD_S = 600.0
+
+
+def generator(seed: int, *names: str | int) -> np.random.Generator:
+    """Random numbers of one purpose: no other purpose's draws change them."""
+    return np.random.default_rng([seed, zlib.crc32("/".join(map(str, names)).encode())])
+
+
+class Oscillator:
+    """A counter driven by an oscillator of its own, with offset, drift and a slow wave of frequency."""
+
+    def __init__(self, tick_hz: int, table: OscillatorTable) -> None:
+        self.tick_hz = tick_hz
+        self._table = table
+
+    def phase(self, time_s: FloatArray) -> FloatArray:
+        """(n,) the counter as a real number, at true times (n,)."""
+        table = self._table
+        gained = table.offset_ppm * time_s + table.drift_ppm_per_h * time_s**2 / 7200.0
+        turn = 2 * np.pi / WANDER_PERIOD_S
+        gained += table.wander_ppm * (1.0 - np.cos(turn * time_s)) / turn
+        phase: FloatArray = self.tick_hz * (time_s + 1e-6 * gained)
+        return phase
+
+    def ticks(self, time_s: FloatArray) -> IntArray:
+        """(n,) the counter's reading: whole ticks, `OscillatorTable.ticks_at_start` at the plan's start."""
+        return np.floor(self.phase(time_s)).astype(np.int64) + self._table.ticks_at_start
+
+    def time_of(self, ticks: FloatArray) -> FloatArray:
+        """(n,) true times at which the counter reaches ``ticks`` counted from the plan's start."""
+        time_s = np.asarray(ticks, np.float64) / self.tick_hz
+        for _ in range(4):  # the map differs from the identity by parts per million: each step gains five digits
+            time_s = time_s + (ticks - self.phase(time_s)) / self.tick_hz
+        return time_s
+
+
+class PulsePerSecond:
+    """The pulse of a receiver: edges at whole seconds, each with its own jitter; everything wired to it sees the same.
+
+    Args:
+        table: of the plan.
+        seed, name: of its jitter.
+        noise: False: no jitter.
+    """
+
+    def __init__(self, table: PpsTable, seed: int, name: str, *, noise: bool) -> None:
+        self._sigma_s = 1e-9 * table.jitter_ns if noise else 0.0
+        self._seed, self._name = seed, name
+        self._jitter_s: FloatArray = np.zeros(0)
+
+    def edges(self, seconds: IntArray) -> FloatArray:
+        """(n,) true times of the edges of these seconds, 0 being the plan's start."""
+        seconds = np.asarray(seconds, np.int64)
+        if len(seconds) and seconds.max() >= len(self._jitter_s):
+            draws = generator(self._seed, "pps", self._name).standard_normal(2 * int(seconds.max()) + 64)
+            self._jitter_s = self._sigma_s * draws
+        return seconds + self._jitter_s[seconds]
+
+    def latest(self, time_s: FloatArray) -> IntArray:
+        """(n,) the second of the newest edge at or before each time; −1 before the first."""
+        nearest = np.maximum(np.rint(time_s).astype(np.int64), 0)
+        return np.where(self.edges(nearest) <= time_s, nearest, nearest - 1)

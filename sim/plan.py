@@ -1,0 +1,111 @@
+"""Plans: TOML files (or presets by name) into tables, each error one line that names the plan's key."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from georef.timescales import gps_ns_from_unix, table_leap_seconds
+from sim.errors import PlanError
+from sim.plan_tables import Tables
+
+PRESETS = ("small", "calibration", "corridor", "block", "bench")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A plan whose keys are all right; whether it can be flown is for `sim.flight` and `sim.scene` to say.
+
+    Attributes:
+        tables: every key.
+        folder: that paths in it are relative to.
+        text: as it was read.
+        leap_seconds: GPS − UTC on its day.
+        start_gps_ns: GPS time of its start, from which all ``_s`` count.
+    """
+
+    tables: Tables
+    folder: Path
+    text: str
+    leap_seconds: int
+    start_gps_ns: int
+
+    def with_seed(self, seed: int) -> Plan:
+        """The same flight on another day: other noise."""
+        return self.changed({"flight": {"seed": seed}})
+
+    def changed(self, changes: dict[str, Any]) -> Plan:
+        """With other values: nested tables as in the file; lists are replaced whole."""
+        return replace(self, tables=_validated(_merged(self.tables.model_dump(exclude_unset=True), changes)))
+
+
+def load_plan(name: str | Path) -> Plan:
+    """A preset by its name, else a file.
+
+    Raises:
+        PlanError: no such plan, not TOML, or a key is wrong; one line.
+    """
+    path = Path(name)
+    if str(name) in PRESETS and not path.is_file():
+        text = (resources.files("sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+        return parse_plan(text, Path.cwd())
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "is not UTF-8"
+        presets = ", ".join(PRESETS)
+        raise PlanError(str(name), f"{reason}; want a plan's file or one of the presets {presets}") from None
+    return parse_plan(text, path.resolve().parent)
+
+
+def parse_plan(text: str, folder: Path) -> Plan:
+    """A plan from its text; raises `PlanError`."""
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise PlanError("plan", f"not TOML: {str(error).splitlines()[0]}") from None
+    tables = _validated(document)
+    start = tables.flight.start
+    if start.tzinfo is None:
+        raise PlanError("flight.start", f"{start} has no offset; want UTC, as {start.isoformat()}Z")
+    leap_seconds, _ = table_leap_seconds(start.date())
+    start_gps_ns = gps_ns_from_unix(round(start.timestamp()) * 1_000_000_000, leap_seconds)
+    return Plan(tables, folder, text, leap_seconds, start_gps_ns)
+
+
+def _validated(document: dict[str, Any]) -> Tables:
+    try:
+        return Tables.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise PlanError(_key(first["loc"]), _what(first)) from None
+
+
+def _key(location: Sequence[int | str]) -> str:
+    key = ""
+    for part in location:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
+    return key or "plan"
+
+
+def _what(error: Any) -> str:
+    if error["type"] == "extra_forbidden":
+        return "no such key"
+    if error["type"] == "missing":
+        return "is missing"
+    text = str(error["msg"]).removeprefix("Input should be ")
+    return f"got {error['input']!r}, want {text}"
+
+
+def _merged(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(document)
+    for key, value in changes.items():
+        there = merged.get(key)
+        merged[key] = _merged(there, value) if isinstance(there, dict) and isinstance(value, dict) else value
+    return merged

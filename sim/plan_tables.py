@@ -1,0 +1,421 @@
+"""Every key of a plan: its type, unit (in the name), bounds and default. Names are those of the configuration.
+
+Positions on the ground are metres east and north of the origin, in the plane that touches the ellipsoid there (the
+site frame of `sim.site`). Heights are ellipsoidal.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Roof = Literal["flat", "gabled", "hipped"]
+
+
+def _zero() -> list[float]:
+    return [0.0, 0.0, 0.0]
+
+
+def _identity() -> list[list[float]]:
+    return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def _all_roofs() -> list[Roof]:
+    return ["gabled", "hipped", "flat"]
+
+
+class Section(BaseModel):
+    """A table of the plan."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+# ---------------------------------------------------------------------------------------------- flight
+
+
+class FlightTable(Section):
+    """``[flight]``: where, when and how."""
+
+    name: Name = Field(description="begins the name of the log")
+    seed: int = Field(1, ge=0, lt=2**63, description="same seed, same bytes")
+    start: dt.datetime = Field(
+        default=dt.datetime(2026, 6, 15, 9, 0, 0, tzinfo=dt.UTC), description="when recording begins, with its offset"
+    )
+    origin_deg: Point = Field(default_factory=lambda: [47.5, 8.9], description="latitude, longitude of the site")
+    crs: str = Field("EPSG:25832", min_length=1, description="of the products, for the configuration that is written")
+    speed_mps: float = Field(60.0, ge=10.0, le=150.0, description="over the ground, where a line says none")
+    bank_max_deg: float = Field(25.0, ge=5.0, le=60.0, description="in turns")
+    climb_max_mps: float = Field(5.0, ge=0.5, le=30.0, description="between lines, up and down")
+    pitch_deg: float = Field(2.0, ge=-10.0, le=15.0, description="nose above the path in level flight")
+    wind_mps: Point = Field(default_factory=lambda: [0.0, 0.0], description="east, north: towards where the air moves")
+    turbulence: Literal["none", "light", "moderate", "severe"] = Field("light", description="of the air")
+    noise: bool = Field(True, description="false: every sensor without noise, biases and jitter; counts stay whole")
+    lead_s: float = Field(4.0, ge=0.0, le=60.0, description="straight and level before and behind each line")
+
+
+class GroundStart(Section):
+    """``[ground]``: the flight begins on the ground; absent: in the air, on the way to the first line."""
+
+    runway_m: Point = Field(description="east, north of the point where the take-off run begins")
+    heading_deg: float = Field(0.0, ge=0.0, le=360.0, description="of the runway")
+    height_m: float | None = Field(None, description="of the runway; absent: the terrain's there")
+    static_s: float = Field(120.0, ge=0.0, le=3600.0, description="standing, engine running, for alignment")
+    taxi_m: float = Field(200.0, ge=0.0, le=5000.0, description="taxied along the runway's heading before the run")
+
+
+class LineTable(Section):
+    """``[[line]]``: a flight line, level and straight."""
+
+    name: Name
+    from_m: Point = Field(description="east, north")
+    to_m: Point = Field(description="east, north")
+    height_m: float = Field(description="ellipsoidal")
+    speed_mps: float | None = Field(None, ge=10.0, le=150.0, description="over the ground")
+
+
+# ---------------------------------------------------------------------------------------------- terrain
+
+
+class VillageTable(Section):
+    """``[[terrain.village]]``: houses along roads that cross."""
+
+    center_m: Point
+    size_m: Point = Field(description="east, north extent")
+    heading_deg: float = Field(0.0, description="of its streets")
+    houses: int = Field(60, ge=1, le=100_000)
+    roofs: list[Roof] = Field(default_factory=_all_roofs, min_length=1)
+
+
+class BuildingTable(Section):
+    """``[[terrain.building]]``: one building on a level floor at the terrain's height."""
+
+    center_m: Point
+    size_m: Point = Field(description="along, across its ridge")
+    heading_deg: float = Field(0.0, description="of its ridge")
+    eaves_m: Positive = Field(6.0, description="above the terrain")
+    roof: Roof = "gabled"
+    roof_pitch_deg: float = Field(35.0, gt=0.0, le=70.0)
+
+
+class RoadTable(Section):
+    """``[[terrain.road]]``: asphalt with painted lines along its edges and middle."""
+
+    points_m: list[Point] = Field(min_length=2)
+    width_m: Positive = 6.0
+    markings: bool = True
+
+
+class WaterTable(Section):
+    """``[[terrain.water]]``: a level lake; most pulses give no return."""
+
+    center_m: Point
+    radius_m: Positive
+    returns: float = Field(0.1, ge=0.0, le=1.0, description="share of pulses that come back near nadir")
+
+
+class ForestTable(Section):
+    """``[[terrain.forest]]``: trees at random."""
+
+    center_m: Point
+    size_m: Point
+    trees_per_ha: Positive = 150.0
+    height_m: Positive = 18.0
+
+
+class WireTable(Section):
+    """``[[terrain.wire]]``: a conductor between two masts."""
+
+    from_m: Point
+    to_m: Point
+    height_m: Positive = Field(20.0, description="of its ends above the terrain")
+    sag_m: NotNegative = 4.0
+    diameter_m: Positive = 0.03
+
+
+class CarTable(Section):
+    """``[[terrain.car]]``: drives from one point to the other and back again."""
+
+    from_m: Point
+    to_m: Point
+    speed_mps: NotNegative = 14.0
+
+
+class TerrainTable(Section):
+    """``[terrain]``: the ground and what stands on it."""
+
+    height_m: float = Field(450.0, ge=-500.0, le=9000.0, description="ellipsoidal, at the origin")
+    slope_percent: float = Field(0.0, ge=0.0, le=100.0, description="of the whole site")
+    slope_towards_deg: float = Field(0.0, description="azimuth it falls towards")
+    relief_m: float = Field(0.0, ge=0.0, le=2000.0, description="height of hills above valleys")
+    wavelength_m: float = Field(800.0, ge=50.0, description="from hill to hill")
+    raster: str = Field("", description="GeoTIFF of ellipsoidal heights instead; relative to the plan")
+    cell_m: float = Field(5.0, ge=0.25, le=100.0, description="of the grid the ground is kept in")
+    reflectance: float = Field(0.35, gt=0.0, le=1.0, description="of the ground")
+    village: list[VillageTable] = Field(default_factory=list)
+    building: list[BuildingTable] = Field(default_factory=list)
+    road: list[RoadTable] = Field(default_factory=list)
+    water: list[WaterTable] = Field(default_factory=list)
+    forest: list[ForestTable] = Field(default_factory=list)
+    wire: list[WireTable] = Field(default_factory=list)
+    car: list[CarTable] = Field(default_factory=list)
+
+
+class ControlTable(Section):
+    """``[control]``: ground control points on flat places in the open."""
+
+    points: int = Field(20, ge=0, le=10_000)
+    sigma_m: float = Field(0.01, ge=0.0, le=10.0, description="of the survey, one sigma each of three axes")
+
+
+# ---------------------------------------------------------------------------------------------- clocks, PPS, air
+
+
+class HostTable(Section):
+    """``[host]``: the recording computer's clock and its stamps."""
+
+    clock_ppm: float = Field(-12.0, ge=-200.0, le=200.0, description="its oscillator runs fast by this")
+    utc_offset_s: float = Field(0.02, ge=-5.0, le=5.0, description="its wall clock is ahead of UTC by this")
+    pps_jitter_us: float = Field(1.0, ge=0.0, le=1000.0, description="one sigma of its stamps of edges")
+    udp_jitter_us: float = Field(30.0, ge=0.0, le=10_000.0, description="mean delay of its stamps of datagrams")
+    can_jitter_us: float = Field(60.0, ge=0.0, le=10_000.0, description="mean delay of its stamps of frames")
+    serial_read_ms: float = Field(10.0, gt=0.0, le=100.0, description="how often a serial port is read")
+
+
+class PpsTable(Section):
+    """``[pps.<name>]``: a pulse per second wired to the host and to the devices that name it."""
+
+    jitter_ns: float = Field(20.0, ge=0.0, le=100_000.0, description="of the pulse itself, one sigma")
+
+
+class OscillatorTable(Section):
+    """A device's own oscillator; ``oscillator = {…}`` of IMU and scanners."""
+
+    offset_ppm: float = Field(0.0, ge=-1000.0, le=1000.0)
+    drift_ppm_per_h: float = Field(0.0, ge=-100.0, le=100.0)
+    wander_ppm: float = Field(0.0, ge=0.0, le=10.0, description="size of a slow wave of ten minutes")
+    ticks_at_start: int = Field(0, ge=0, lt=2**63, description="so that a counter wraps when it should")
+
+
+class AtmosphereTable(Section):
+    """``[atmosphere]``: what the light does on its way; keys as in the configuration."""
+
+    ranges: Literal["corrected", "vacuum"] = Field("corrected", description="vacuum: the scanner counts with c")
+    model: Literal["standard", "measured"] = "standard"
+    temperature_c: float = Field(15.0, ge=-80.0, le=60.0)
+    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0)
+    humidity_percent: float = Field(50.0, ge=0.0, le=100.0)
+    height_m: float = Field(0.0, ge=-500.0, le=12_000.0)
+    refraction: Literal["none", "ardc", "spherical"] = "none"
+    visibility_km: float = Field(23.0, gt=0.0, description="dims what is far away")
+
+
+# ---------------------------------------------------------------------------------------------- GNSS and IMU
+
+
+class OutageTable(Section):
+    """``[[gnss.<name>.outage]]``: no satellites."""
+
+    at_s: NotNegative
+    for_s: Positive
+
+
+class JumpTable(Section):
+    """``[[gnss.<name>.jump]]``: a wrong fix, as after a cycle slip."""
+
+    at_s: NotNegative
+    for_s: Positive
+    offset_l_m: Vector = Field(description="north, east, down")
+
+
+class GnssTable(Section):
+    """``[gnss.<name>]``: a receiver."""
+
+    protocol: Literal["novatel", "ubx", "nmea"] = "novatel"
+    pps: Name | None = "main"
+    baud: int = Field(460_800, ge=4800, le=4_000_000)
+    grade: Literal["rtk", "ppk", "spp"] = "rtk"
+    rate_hz: Literal[1, 2, 5, 10, 20] = 5
+    lever_arm_m: Vector = Field(default_factory=lambda: [0.10, -0.05, -1.20], description="x_a^b")
+    secondary_lever_arm_m: Vector | None = Field(None, description="second antenna: heading and pitch are sent too")
+    ins: bool = Field(False, description="novatel: solutions of its own INS at 100 Hz, INSPVAX once a second")
+    latency_ms: float = Field(60.0, ge=0.0, le=2000.0, description="from an epoch to its first byte")
+    undulation_m: float = Field(48.0, ge=-120.0, le=120.0, description="geoid above the ellipsoid, as it says it")
+    outage: list[OutageTable] = Field(default_factory=list)
+    jump: list[JumpTable] = Field(default_factory=list)
+
+
+class ImuNoiseTable(Section):
+    """``[imu.<name>.noise]``: keys of the configuration, and what only a simulator knows; they override the grade."""
+
+    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0)
+    velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(None, ge=0.0)
+    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0)
+    accel_bias_mg: float | None = Field(None, ge=0.0)
+    gyro_bias_instability_deg_per_h: float | None = Field(None, ge=0.0)
+    accel_bias_instability_mg: float | None = Field(None, ge=0.0)
+    bias_correlation_h: float | None = Field(None, gt=0.0)
+    gyro_scale_ppm: float | None = Field(None, ge=0.0)
+    accel_scale_ppm: float | None = Field(None, ge=0.0)
+    misalignment_mrad: float | None = Field(None, ge=0.0)
+
+
+class ImuTable(Section):
+    """``[imu.<name>]``: an IMU on CAN, described by a DBC of its own."""
+
+    grade: Literal["navigation", "tactical", "mems", "perfect"] = "tactical"
+    rate_hz: int = Field(200, ge=10, le=2000)
+    pps: Name | None = "main"
+    rotation_b_imu: Matrix = Field(default_factory=_identity)
+    tick_hz: int = Field(1_000_000, ge=1000, le=100_000_000)
+    tick_bits: Literal[16, 24, 32] = 32
+    latency_us: float = Field(0.0, ge=-100_000.0, le=100_000.0, description="its stamps are late: imu_latency")
+    oscillator: OscillatorTable = Field(default_factory=OscillatorTable)
+    noise: ImuNoiseTable = Field(default_factory=ImuNoiseTable)
+
+
+# ---------------------------------------------------------------------------------------------- scanners
+
+
+class ParameterTable(Section):
+    """``[scanner.<name>.true]`` and ``[…nominal]``: keys, signs and units of a calibration file."""
+
+    omega_deg: float = 0.0
+    phi_deg: float = 0.0
+    kappa_deg: float = 0.0
+    range_offset_m: float = 0.0
+    range_scale_ppm: float = 0.0
+    scan_angle_offset_deg: float = 0.0
+    scan_angle_scale_ppm: float = 0.0
+    scan_plane_tilt_deg: float = 0.0
+    lever_arm_x_m: float = 0.12
+    lever_arm_y_m: float = -0.03
+    lever_arm_z_m: float = 0.28
+    time_offset_us: float = 0.0
+    imu_latency_us: float = 0.0
+    encoder_latency_us: float = 0.0
+    torsion_us2: float = 0.0
+    pitch_slope_ppm: float = 0.0
+
+
+class IbrcTable(Section):
+    """``[scanner.<name>.ibrc]``: what intensity does to the range; keys of a calibration file."""
+
+    intensity: list[float] = Field(min_length=2)
+    correction_m: list[float] = Field(min_length=2)
+
+
+class FacetTable(Section):
+    """``[[scanner.<name>.facet]]``: a facet's own tilt (pyramid error)."""
+
+    index: int = Field(ge=0)
+    tilt_deg: float
+
+
+class BeamErrorTable(Section):
+    """``[[scanner.<name>.beam]]``: corrections of one beam of a multi-beam head."""
+
+    channel: int = Field(ge=0)
+    azimuth_deg: float = 0.0
+    elevation_deg: float = 0.0
+    range_m: float = 0.0
+
+
+class RangeNoiseTable(Section):
+    """``[scanner.<name>.range_noise]``: one sigma of a range, by intensity and incidence."""
+
+    sigma_m: float = Field(0.015, ge=0.0, description="at a tenth of full intensity, perpendicular")
+    footprint: float = Field(0.25, ge=0.0, description="share of the footprint's depth on a slope that is added")
+
+
+ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley", "vlp16", "os1"]
+
+
+class ScannerTable(Section):
+    """``[scanner.<name>]``: a scanner; what a kind does not use is ignored for it, and named in docs/simulation.md."""
+
+    kind: ScannerKind = "oscillating"
+    motion: Literal["sine", "triangle"] = Field("sine", description="oscillating: of the mirror")
+    pps: Name | None = "main"
+    prf_hz: float = Field(100_000.0, ge=100.0, le=2_000_000.0, description="pulses a second; vlp16, os1: their own")
+    scan_hz: float = Field(
+        40.0, gt=0.0, le=1000.0, description="oscillations, or turns of the shaft or head, a second; os1: 10 or 20"
+    )
+    half_angle_deg: float = Field(
+        30.0, gt=0.0, le=89.0, description="of the scan, from its middle; multi-beam: ignored"
+    )
+    facets: int = Field(4, ge=2, le=64, description="polygon")
+    nutation_deg: float = Field(7.0, gt=0.0, le=20.0, description="nutating: of the mirror's normal from its shaft")
+    wedge_deg: Point = Field(default_factory=lambda: [10.0, 10.0], description="risley: of the two prisms")
+    refractive_index: float = Field(1.51, gt=1.0, le=4.0, description="risley")
+    prism_ratio: float = Field(-0.7265, description="risley: turns of the second prism a turn of the first")
+    encoder_counts: int = Field(4_194_304, ge=1000, le=2**30, description="a turn of the shaft")
+    tick_hz: int = Field(10_000_000, ge=100_000, le=1_000_000_000)
+    oscillator: OscillatorTable = Field(default_factory=OscillatorTable)
+    return_slots: int = Field(3, ge=1, le=7)
+    pulses_per_datagram: int = Field(100, ge=1, le=4000)
+    zone: Literal["resolved", "apparent"] = Field(
+        "resolved", description="pulses in air: ranges are whole, or count from the last emission before the echo"
+    )
+    dual_return: bool = Field(False, description="vlp16, os1")
+    wavelength_nm: float = Field(1064.0, ge=300.0, le=2000.0)
+    divergence_mrad: float = Field(0.5, ge=0.0, le=10.0, description="full angle")
+    pulse_ns: float = Field(3.0, gt=0.0, le=50.0, description="length: nearer echoes are one")
+    range_min_m: float = Field(20.0, ge=0.0)
+    range_max_m: float = Field(3000.0, gt=0.0)
+    reference_range_m: float = Field(1000.0, gt=0.0, description="where full reflectance gives full intensity")
+    model: str = "SIM"
+    serial: str = "1"
+    installation: Matrix = Field(default_factory=_identity, description="T, b from s")
+    true: ParameterTable = Field(default_factory=ParameterTable, description="what the scanner really is")
+    nominal: ParameterTable = Field(default_factory=ParameterTable, description="what its papers say")
+    ibrc: IbrcTable | None = None
+    facet: list[FacetTable] = Field(default_factory=list)
+    beam: list[BeamErrorTable] = Field(default_factory=list)
+    range_noise: RangeNoiseTable = Field(default_factory=RangeNoiseTable)
+    on_lines_only: bool = Field(True, description="the laser is off in turns; false: it is always on")
+
+
+# ---------------------------------------------------------------------------------------------- faults
+
+FaultKind = Literal[
+    "silent", "late", "corrupted", "duplicated", "reordered", "unplugged", "pps_lost", "pps_spurious", "clock_step"
+]
+
+
+class FaultTable(Section):
+    """``[[fault]]``: something goes wrong with a source for a while."""
+
+    source: str = Field(
+        pattern=r"^(host|(gnss|imu|scanner|pps)/[A-Za-z0-9_-]+(/aux)?)$", description="kind/name, or host"
+    )
+    kind: FaultKind
+    at_s: NotNegative = Field(description="seconds after the start")
+    for_s: NotNegative = Field(0.0, description="how long; 0: at that moment only")
+    delay_s: float = Field(0.5, gt=0.0, le=60.0, description="late: by how much")
+    share: float = Field(1.0, gt=0.0, le=1.0, description="of the units that are hit")
+    step_s: float = Field(3600.0, ge=-100_000.0, le=100_000.0, description="clock_step: of the wall clock")
+
+
+class Tables(Section):
+    """The whole plan."""
+
+    flight: FlightTable
+    ground: GroundStart | None = None
+    line: list[LineTable] = Field(min_length=1)
+    terrain: TerrainTable = Field(default_factory=TerrainTable)
+    control: ControlTable = Field(default_factory=ControlTable)
+    host: HostTable = Field(default_factory=HostTable)
+    pps: dict[Name, PpsTable] = Field(default_factory=lambda: {"main": PpsTable()})
+    atmosphere: AtmosphereTable = Field(default_factory=AtmosphereTable)
+    gnss: dict[Name, GnssTable] = Field(default_factory=lambda: {"rover": GnssTable()})
+    imu: dict[Name, ImuTable] = Field(default_factory=lambda: {"main": ImuTable()})
+    scanner: dict[Name, ScannerTable] = Field(default_factory=lambda: {"left": ScannerTable()})
+    fault: list[FaultTable] = Field(default_factory=list)

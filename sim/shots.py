@@ -1,0 +1,90 @@
+"""What the parts of a scanner hand to each other, in batches: pulses, their echoes, what is measured of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+SURFACES = ("none", "ground", "roof", "wall", "road", "marking", "water", "leaves", "wire", "car")
+NO_SURFACE, GROUND, ROOF, WALL, ROAD, MARKING, WATER, LEAVES, WIRE, CAR = range(len(SURFACES))
+
+
+@dataclass(frozen=True, slots=True)
+class Pulses:
+    """Pulses as they leave, in order of emission.
+
+    Attributes:
+        number: (n,) since power-on.
+        time_s: (n,) true time of emission, seconds since the plan's start.
+        encoder: (n,) what the encoder says: counts (SREP), or hundredths of a degree or ticks of a spinning head.
+        channel: (n,) facet or beam.
+        origin_s: (n, 3) where the beam starts, metres, sensor frame; zeros for line scanners.
+        direction_s: (n, 3) unit vectors, sensor frame, as the light really leaves.
+        phi_extra_rad: (n,) what the pitch slope adds to φ.
+        fired: (n,) bool, False: the laser was off; the pulse has a record and no echo.
+    """
+
+    number: IntArray
+    time_s: FloatArray
+    encoder: IntArray
+    channel: NDArray[np.uint16]
+    origin_s: FloatArray
+    direction_s: FloatArray
+    phi_extra_rad: FloatArray
+    fired: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Number of pulses."""
+        return len(self.number)
+
+
+@dataclass(frozen=True, slots=True)
+class Echoes:
+    """What comes back of n pulses in R slots, nearest first; slots without an echo are at the end, range nan.
+
+    Attributes:
+        range_m: (n, R) true geometric distance along the beam's axis.
+        reflectance: (n, R) apparent: of the surface times its share of the footprint times the cosine of incidence.
+        incidence_rad: (n, R) between the beam and the surface's normal.
+        surface: (n, R) index into `SURFACES`.
+    """
+
+    range_m: FloatArray
+    reflectance: FloatArray
+    incidence_rad: FloatArray
+    surface: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the scanner's receiver makes of echoes; (n, R), slots as in `Echoes`, range 0: no return.
+
+    Attributes:
+        range_m: as the device says it, before quantisation, whole (pulses in air resolved).
+        intensity: 0 … 65535 (line scanners) or 0 … 255 (spinning heads), whole numbers.
+        pulse_width_ns: length of the echo.
+    """
+
+    range_m: FloatArray
+    intensity: FloatArray
+    pulse_width_ns: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class WireUnit:
+    """One unit on its way to the recorder: a datagram, a CAN frame, the bytes of one read, or a PPS edge (no bytes).
+
+    Attributes:
+        time_s: true time at which the host stamps it, seconds since the plan's start.
+        source: ``kind/name``, with ``/aux`` for a head's second port.
+        data: its bytes.
+    """
+
+    time_s: float
+    source: str
+    data: bytes
