@@ -26,7 +26,6 @@ class Pulses:
         origin_s: (n, 3) where the beam starts, metres, sensor frame; zeros for line scanners.
         direction_s: (n, 3) unit vectors, sensor frame, as the light really leaves.
         phi_extra_rad: (n,) what the pitch slope adds to φ.
-        fired: (n,) bool, False: the laser was off; the pulse has a record and no echo.
     """
 
     number: IntArray
@@ -36,7 +35,6 @@ class Pulses:
     origin_s: FloatArray
     direction_s: FloatArray
     phi_extra_rad: FloatArray
-    fired: NDArray[np.bool_]
 
     def __len__(self) -> int:
         """Number of pulses."""
