@@ -83,7 +83,7 @@ class TruthWriter:
     def _pack(self, archive: zipfile.ZipFile, table: str, field: str) -> None:
         self._parts[table, field].close()
         base, shape = self._tables[table][field].base, self._tables[table][field].shape
-        header = {"descr": np.lib.format.dtype_to_descr(base), "fortran_order": False}
+        header: dict[str, Any] = {"descr": np.lib.format.dtype_to_descr(base), "fortran_order": False}
         header["shape"] = (self.rows[table], *shape)
         with archive.open(_member(f"{table}.{field}.npy"), "w", force_zip64=True) as member:
             np.lib.format.write_array_header_1_0(member, header)

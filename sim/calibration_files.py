@@ -1,0 +1,60 @@
+"""Calibration files of a plan's scanners: what they really are, and what their papers say (CONVENTIONS)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sim.plan import Plan
+from sim.plan_tables import ScannerTable
+from sim.toml_text import toml_text
+
+CONVENTIONS_VERSION = 1
+SPINNING = ("vlp16", "os1")
+
+
+def mirror_factor(table: ScannerTable) -> float:
+    """Beam angle per encoder angle: 2 for a flat mirror that swings about an axis in its plane, else 1."""
+    return 2.0 if table.kind == "oscillating" else 1.0
+
+
+def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
+    """A calibration file: the true one with every error there is, or the nominal one."""
+    table = plan.tables.scanner[scanner]
+    document: dict[str, Any] = {
+        "calibration": _header(plan, scanner, table, "true" if true else "nominal"),
+        "parameters": (table.true if true else table.nominal).model_dump(),
+    }
+    if true:
+        document |= _tables(table)
+    return toml_text(document)
+
+
+def _header(plan: Plan, scanner: str, table: ScannerTable, which: str) -> dict[str, Any]:
+    flight, air = plan.tables.flight, plan.tables.atmosphere
+    return {
+        "id": f"{flight.name}-{flight.seed}-{scanner}-{which}",
+        "scanner": scanner,
+        "created": flight.start,
+        "conventions": CONVENTIONS_VERSION,
+        "scanner_model": table.model,
+        "scanner_serial": table.serial,
+        "imu_serial": "",
+        "installation": f"virtual/{scanner}",
+        "installation_matrix": table.installation,
+        "mirror_factor": mirror_factor(table),
+        "ranges": air.ranges,
+        "refraction": air.refraction,
+        "method": "nominal",
+        "variance_factor": 1.0,
+        "redundancy": 0,
+    }
+
+
+def _tables(table: ScannerTable) -> dict[str, Any]:
+    tables: dict[str, Any] = {
+        "facet": [row.model_dump() for row in table.facet],
+        "beam": [row.model_dump() for row in table.beam],
+    }
+    if table.ibrc is not None:
+        tables["ibrc"] = table.ibrc.model_dump()
+    return {name: rows for name, rows in tables.items() if rows}

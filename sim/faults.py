@@ -1,0 +1,149 @@
+"""Faults on demand: what a script in the plan does to the units of a source on their way to the recorder."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sim.clocks import generator
+from sim.errors import PlanError
+from sim.plan import Plan
+from sim.plan_tables import FaultTable, Tables
+from sim.shots import WireUnit
+
+Window = tuple[float, float]
+
+
+def check_faults(tables: Tables) -> None:
+    """Refuse what makes no sense; raises `PlanError` with the fault's key."""
+    wired = {f"{kind}/{name}" for kind in ("gnss", "imu", "scanner", "pps") for name in getattr(tables, kind)}
+    wired |= {f"scanner/{name}/aux" for name, table in tables.scanner.items() if table.kind == "vlp16"}
+    for number, fault in enumerate(tables.fault):
+        key = f"fault[{number}]"
+        if (fault.kind == "clock_step") != (fault.source == "host"):
+            raise PlanError(f"{key}.source", f'"{fault.source}" and kind "{fault.kind}": clock_step is of "host" only')
+        if fault.source != "host" and fault.source not in wired:
+            raise PlanError(
+                f"{key}.source", f'the plan has no "{fault.source}"; want one of {", ".join(sorted(wired))}'
+            )
+        if fault.kind == "pps_spurious" and not fault.source.startswith("pps/"):
+            raise PlanError(f"{key}.source", f'"{fault.source}": spurious edges are of a pps/… only')
+        if fault.kind == "pps_lost" and fault.source.startswith("gnss/"):
+            text = f'"{fault.source}": the receiver makes the edges; want pps/…, imu/… or scanner/…'
+            raise PlanError(f"{key}.source", text)
+
+
+def windows(tables: Tables, source: str, *kinds: str) -> list[Window]:
+    """When a source suffers from faults of these kinds."""
+    return [(f.at_s, f.at_s + f.for_s) for f in tables.fault if f.source == source and f.kind in kinds]
+
+
+def with_faults(plan: Plan, source: str, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
+    """A source's units in order of time, with everything the plan does to them, in the order of its faults."""
+    stream = iter(units)
+    for number, fault in enumerate(plan.tables.fault):
+        on_host = fault.kind != "pps_lost" or source.startswith("pps/")  # else it is the device that gets no edge
+        if fault.source == source and fault.kind in _ACTIONS and on_host:
+            rng = generator(plan.tables.flight.seed, "fault", number)
+            stream = _ACTIONS[fault.kind](stream, _Hits(fault, rng))
+    return stream
+
+
+class _Hits:
+    """Which units a fault hits: those of its window, or, where that has no length, the first one after it."""
+
+    def __init__(self, fault: FaultTable, rng: np.random.Generator) -> None:
+        self.fault, self.rng = fault, rng
+        self._single = fault.for_s == 0.0
+
+    def hit(self, unit: WireUnit) -> bool:
+        """Whether this unit is; to be asked once for each."""
+        fault = self.fault
+        if unit.time_s < fault.at_s:
+            return False
+        if fault.for_s == 0.0:
+            single, self._single = self._single, False
+            return single
+        return unit.time_s < fault.at_s + fault.for_s and (fault.share >= 1.0 or self.rng.random() < fault.share)
+
+
+def _dropped(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    for unit in units:
+        if not hits.hit(unit):
+            yield unit
+
+
+def _late(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    """Units that wait let others pass."""
+    waiting: list[tuple[float, int, WireUnit]] = []
+    for number, unit in enumerate(units):
+        while waiting and waiting[0][0] <= unit.time_s:
+            yield heapq.heappop(waiting)[2]
+        if hits.hit(unit):
+            late = replace(unit, time_s=unit.time_s + hits.fault.delay_s)
+            heapq.heappush(waiting, (late.time_s, number, late))
+        else:
+            yield unit
+    yield from (heapq.heappop(waiting)[2] for _ in range(len(waiting)))
+
+
+def _corrupted(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    for unit in units:
+        if unit.data and hits.hit(unit):
+            data = bytearray(unit.data)
+            data[int(hits.rng.integers(len(data)))] ^= int(hits.rng.integers(1, 256))
+            unit = replace(unit, data=bytes(data))
+        yield unit
+
+
+def _duplicated(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    for unit in units:
+        yield unit
+        if hits.hit(unit):
+            yield unit
+
+
+def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    """A unit that is hit changes places with the next one."""
+    held: WireUnit | None = None
+    for unit in units:
+        if held is not None:
+            yield replace(unit, time_s=held.time_s)
+            yield replace(held, time_s=unit.time_s)
+            held = None
+        elif hits.hit(unit):
+            held = unit
+        else:
+            yield unit
+    if held is not None:
+        yield held
+
+
+def _spurious(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
+    """Behind an edge that is hit another one, where no second begins."""
+    extra: WireUnit | None = None
+    for unit in units:
+        if extra is not None:
+            yield extra
+            extra = None
+        yield unit
+        if hits.hit(unit):
+            extra = replace(unit, time_s=unit.time_s + float(hits.rng.uniform(0.05, 0.95)))
+    if extra is not None:
+        yield extra
+
+
+_Action = Callable[[Iterator[WireUnit], _Hits], Iterator[WireUnit]]
+_ACTIONS: dict[str, _Action] = {
+    "silent": _dropped,
+    "unplugged": _dropped,
+    "pps_lost": _dropped,
+    "late": _late,
+    "corrupted": _corrupted,
+    "duplicated": _duplicated,
+    "reordered": _reordered,
+    "pps_spurious": _spurious,
+}
