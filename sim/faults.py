@@ -41,12 +41,12 @@ def windows(tables: Tables, source: str, *kinds: str) -> list[Window]:
     return [(f.at_s, f.at_s + f.for_s) for f in tables.fault if f.source == source and f.kind in kinds]
 
 
-def with_faults(plan: Plan, source: str, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
-    """A source's units in order of time, with everything the plan does to them, in the order of its faults."""
+def with_faults(plan: Plan, units: Iterable[WireUnit]) -> Iterator[WireUnit]:
+    """Units in order of time, with everything the plan does to those of each source, in the order of its faults."""
     stream = iter(units)
     for number, fault in enumerate(plan.tables.fault):
-        on_host = fault.kind != "pps_lost" or source.startswith("pps/")  # else it is the device that gets no edge
-        if fault.source == source and fault.kind in _ACTIONS and on_host:
+        of_device = fault.kind == "pps_lost" and not fault.source.startswith("pps/")  # it gets no edge, and sends
+        if fault.kind in _ACTIONS and not of_device:
             rng = generator(plan.tables.flight.seed, "fault", number)
             stream = _ACTIONS[fault.kind](stream, _Hits(fault, rng))
     return stream
@@ -62,7 +62,7 @@ class _Hits:
     def hit(self, unit: WireUnit) -> bool:
         """Whether this unit is; to be asked once for each."""
         fault = self.fault
-        if unit.time_s < fault.at_s:
+        if unit.source != fault.source or unit.time_s < fault.at_s:
             return False
         if fault.for_s == 0.0:
             single, self._single = self._single, False
@@ -107,10 +107,13 @@ def _duplicated(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
 
 
 def _reordered(units: Iterator[WireUnit], hits: _Hits) -> Iterator[WireUnit]:
-    """A unit that is hit changes places with the next one."""
+    """A unit that is hit changes places with the next one, where both are of one source."""
     held: WireUnit | None = None
     for unit in units:
-        if held is not None:
+        if held is not None and held.source != unit.source:
+            yield from (held, unit)
+            held = None
+        elif held is not None:
             yield replace(unit, time_s=held.time_s)
             yield replace(held, time_s=unit.time_s)
             held = None

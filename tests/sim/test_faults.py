@@ -37,7 +37,7 @@ def units(source: str = "scanner/left", count: int = 1000) -> list[WireUnit]:
 
 def flown(*faults: dict[str, Any], source: str = "scanner/left") -> list[WireUnit]:
     """What is left of them."""
-    return list(with_faults(plan(*faults), source, iter(units(source))))
+    return list(with_faults(plan(*faults), iter(units(source))))
 
 
 def test_another_sources_units_pass_as_they_are() -> None:
@@ -96,7 +96,7 @@ def test_reordered_units_change_places() -> None:
 def edges(*faults: dict[str, Any]) -> list[float]:
     """Times of ten edges."""
     pulses = (WireUnit(float(second), "pps/main", b"") for second in range(10))
-    return [unit.time_s for unit in with_faults(plan(*faults), "pps/main", pulses)]
+    return [unit.time_s for unit in with_faults(plan(*faults), pulses)]
 
 
 def test_lost_edges_are_lost_to_the_host() -> None:

@@ -1,0 +1,112 @@
+"""Which objects stand where: square cells that list them, and how high each cell reaches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.terrain import Ground
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+CELL_M = 20.0
+
+
+class Cells(NamedTuple):
+    """Cells from the ground's south-west corner on; rows go north.
+
+    Attributes:
+        west, south, size: of the cells, metres.
+        top: (rows, columns) site z that nothing in a cell exceeds; ``ground_top``: the ground alone.
+        first, item: cell c lists ``item[first[c] : first[c + 1]]``; an item is what `listed` was given.
+        first_cover, cover: likewise, of what covers the ground without standing on it.
+    """
+
+    west: float
+    south: float
+    size: float
+    top: FloatArray
+    ground_top: FloatArray
+    first: IntArray
+    item: IntArray
+    first_cover: IntArray
+    cover: IntArray
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Objects to be listed.
+
+    Attributes:
+        item: (n,) code of each.
+        box: (n, 4) west, south, east, north of where it may be met; one object may have several.
+        top_z: (n,) site z that it does not exceed.
+    """
+
+    item: IntArray
+    box: FloatArray
+    top_z: FloatArray
+
+
+def build_cells(ground: Ground, things: list[Listed], covers: list[Listed]) -> Cells:
+    """The lists of all cells over the ground."""
+    size = (ground.east_m - ground.west_m, ground.north_m - ground.south_m)
+    columns, rows = (max(1, int(np.ceil(length / CELL_M))) for length in size)
+    ground_top = _ground_top(ground, rows, columns)
+    cell, item, top_z = _spread(ground, _joined(things), rows, columns)
+    top = ground_top.ravel().copy()
+    np.maximum.at(top, cell, top_z)
+    lists = _lists(cell, item, rows * columns)
+    cell, cover, _ = _spread(ground, _joined(covers), rows, columns)
+    cover_lists = _lists(cell, cover, rows * columns)
+    return Cells(ground.west_m, ground.south_m, CELL_M, top.reshape(rows, columns), ground_top, *lists, *cover_lists)
+
+
+def _joined(listed: list[Listed]) -> Listed:
+    return Listed(*(np.concatenate([getattr(one, name) for one in listed]) for name in ("item", "box", "top_z")))
+
+
+def _ground_top(ground: Ground, rows: int, columns: int) -> FloatArray:
+    """(rows, columns) the highest node of each cell and of the patches that it cuts."""
+
+    def spans(count: int, nodes: int) -> tuple[IntArray, IntArray]:
+        edge = np.arange(count + 1) * CELL_M / ground.cell_m
+        first = np.clip(np.floor(edge[:-1] - 1e-6).astype(np.int64), 0, nodes - 2)
+        last = np.clip(np.ceil(edge[1:] + 1e-6).astype(np.int64), 1, nodes - 1)
+        return first, last
+
+    def highest(z: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
+        """Over rows first … last of each span."""
+        top = z[first]
+        for step in range(1, int(np.max(last - first)) + 1):
+            top = np.maximum(top, z[np.minimum(first + step, last)])
+        return top
+
+    by_rows = highest(ground.z, *spans(rows, ground.z.shape[0]))
+    return np.ascontiguousarray(highest(by_rows.T, *spans(columns, ground.z.shape[1])).T)
+
+
+def _spread(ground: Ground, listed: Listed, rows: int, columns: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """(cell, item, top_z) of every cell that every box touches; what lies off the grid is left out."""
+    origin = np.array([ground.west_m, ground.south_m])
+    low = np.floor((listed.box[:, :2] - origin) / CELL_M).astype(np.int64)
+    high = np.floor((listed.box[:, 2:] - origin) / CELL_M).astype(np.int64)
+    low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
+    extent = np.maximum(high - low + 1, 0)
+    count = extent[:, 0] * extent[:, 1]
+    which = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    row, column = low[which, 1] + number // extent[which, 0], low[which, 0] + number % extent[which, 0]
+    return row * columns + column, listed.item[which], listed.top_z[which]
+
+
+def _lists(cell: IntArray, item: IntArray, cells: int) -> tuple[IntArray, IntArray]:
+    """First item of each cell (cells + 1,), and the items, each once a cell."""
+    width = int(np.max(item, initial=0)) + 1
+    pairs = np.unique(cell * width + item)
+    first = np.searchsorted(pairs, width * np.arange(cells + 1, dtype=np.int64))
+    return first.astype(np.int64), pairs % width

@@ -1,0 +1,148 @@
+"""Echoes of pulses, compiled: what the axis and the rim of a beam meet, put in order, merged and cut to the slots."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.casting import RIM_SHARE, SPENT, SceneArrays, march
+from sim.rays import NEVER, Ray
+from sim.shots import NO_SURFACE
+
+FloatArray = NDArray[np.float64]
+
+SOFT_HITS = 24
+# Columns of soft hits: distance, share of the energy that comes so far, reflectance, cosine of incidence, surface.
+# Columns of echoes: distance, apparent reflectance, cosine of incidence, surface, 1 if on the axis.
+
+
+@numba.njit(cache=True)
+def in_order(rows: FloatArray, count: int) -> None:
+    """Sort the first rows by distance; they are few."""
+    for i in range(1, count):
+        for j in range(i, 0, -1):
+            if rows[j - 1, 0] <= rows[j, 0]:
+                break
+            for k in range(5):
+                rows[j - 1, k], rows[j, k] = rows[j, k], rows[j - 1, k]
+
+
+@numba.njit(cache=True)
+def energy_at(soft: FloatArray, count: int, at: float) -> float:
+    """What soft hits, in order, leave of a pulse's energy for a distance."""
+    energy = 1.0
+    for k in range(count):
+        if soft[k, 0] >= at:
+            break
+        energy *= 1.0 - soft[k, 1]
+    return energy if energy >= SPENT else 0.0
+
+
+@numba.njit(cache=True)
+def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, surface: float, on_axis: float) -> int:
+    """One more echo, if there is any of it."""
+    if at < NEVER and strength > 0.0 and count < len(echo):
+        echo[count, 0], echo[count, 1], echo[count, 2], echo[count, 3], echo[count, 4] = (
+            at,
+            strength,
+            cos,
+            surface,
+            on_axis,
+        )
+        return count + 1
+    return count
+
+
+@numba.njit(cache=True)
+def rim(ray: Ray, spread: float, side: int) -> Ray:
+    """One of four rays that leave with a beam's axis, ``spread`` radians from it."""
+    ox, oy, oz, dx, dy, dz = ray
+    if abs(dx) < 0.8:
+        ax, ay, az = 0.0, dz, -dy  # d × x
+    else:
+        ax, ay, az = -dz, 0.0, dx  # d × y
+    length = math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax / length, ay / length, az / length
+    if side >= 2:
+        ax, ay, az = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+    aside = math.tan(spread) if side % 2 == 0 else -math.tan(spread)
+    scale = 1.0 / math.sqrt(1.0 + aside * aside)
+    return ox, oy, oz, scale * (dx + aside * ax), scale * (dy + aside * ay), scale * (dz + aside * az)
+
+
+@numba.njit(cache=True)
+def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
+    """Echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger one."""
+    kept = 0
+    for k in range(1, count):
+        if echo[k, 0] - echo[kept, 0] < pulse_m:
+            strength = echo[kept, 1] + echo[k, 1]
+            if echo[k, 4] > echo[kept, 4] or (echo[k, 4] == echo[kept, 4] and echo[k, 1] > echo[kept, 1]):
+                echo[kept] = echo[k]
+            echo[kept, 1] = strength
+        else:
+            kept += 1
+            echo[kept] = echo[k]
+    return kept + 1 if count else 0
+
+
+@numba.njit(cache=True)
+def echoes_of(
+    scene: SceneArrays,
+    ray: Ray,
+    time_s: float,
+    number: int,
+    spread: float,
+    soft: FloatArray,
+    echo: FloatArray,
+    box: FloatArray,
+) -> int:
+    """All echoes of a pulse, in order of distance; returns how many."""
+    at, surface, reflectance, cos, edge, softs = march(scene, ray, time_s, number, spread, soft, 0, box)
+    in_order(soft, softs)
+    count = 0
+    for k in range(softs):
+        if soft[k, 0] < at:
+            strength = energy_at(soft, softs, soft[k, 0]) * soft[k, 1] * soft[k, 2] * soft[k, 3]
+            count = add(echo, count, soft[k, 0], strength, soft[k, 3], soft[k, 4], 1.0)
+    rims = spread > 0.0 and edge <= at < NEVER
+    share = 1.0 - 4.0 * RIM_SHARE if rims else 1.0
+    count = add(echo, count, at, energy_at(soft, softs, at) * share * reflectance * cos, cos, float(surface), 1.0)
+    if rims:
+        for side in range(4):
+            t, s, r, c, _, _ = march(scene, rim(ray, spread, side), time_s, number, 0.0, soft, -1, box)
+            if s != NO_SURFACE:
+                count = add(echo, count, t, energy_at(soft, softs, t) * RIM_SHARE * r * c, c, float(s), 0.0)
+        in_order(echo, count)
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def cast_pulses(
+    scene: SceneArrays,
+    origin: FloatArray,
+    direction: FloatArray,
+    time_s: FloatArray,
+    number: NDArray[np.int64],
+    spread: float,
+    pulse_m: float,
+    range_m: FloatArray,
+    reflectance: FloatArray,
+    incidence_rad: FloatArray,
+    surface: NDArray[np.uint8],
+) -> None:
+    """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
+    soft, echo, box = np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 6, 5)), np.empty((5, 6))
+    slots = range_m.shape[1]
+    for i in range(len(origin)):
+        ray = origin[i, 0], origin[i, 1], origin[i, 2], direction[i, 0], direction[i, 1], direction[i, 2]
+        count = merged(echo, echoes_of(scene, ray, time_s[i], number[i], spread, soft, echo, box), pulse_m)
+        for slot in range(min(count, slots)):
+            k = count - 1 if slot == slots - 1 else slot
+            range_m[i, slot] = echo[k, 0]
+            reflectance[i, slot] = echo[k, 1]
+            incidence_rad[i, slot] = math.acos(min(echo[k, 2], 1.0))
+            surface[i, slot] = np.uint8(echo[k, 3])

@@ -1,0 +1,200 @@
+"""What a GNSS receiver puts on its serial line, as the recorder reads it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from georef.records import FixType
+from sim.clocks import PulsePerSecond, generator
+from sim.errors import PlanError
+from sim.gnss.calendar import Calendar
+from sim.gnss.nmea import NmeaMessages
+from sim.gnss.noise import Noise
+from sim.gnss.novatel import NovatelMessages
+from sim.gnss.pulse import Pulse
+from sim.gnss.serial_line import BITS_PER_BYTE, SerialLine
+from sim.gnss.ubx import UbxMessages
+from sim.plan import Plan
+from sim.plan_tables import GnssTable
+from sim.satellites import INS_RATE_HZ, Epochs, InsEpochs, Receiver
+from sim.shots import WireUnit
+
+VARIATION_S = 0.002  # one sigma of what an epoch takes longer than the least
+GREATEST_VARIATION_S = 0.010
+NAMING_S = 0.9  # FORMULAS 12: later than this a message may be taken for the next second's
+SLACK = 1.1  # room on the line: numbers grow digits
+STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000)
+
+
+class Messages(Protocol):
+    """A protocol's encoder."""
+
+    def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
+        """All messages of a solution, in the order they are sent."""
+
+    def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
+        """All messages of an inertial solution."""
+
+
+PROTOCOLS: dict[str, Callable[[GnssTable, Calendar, Pulse], Messages]] = {
+    "novatel": NovatelMessages,
+    "ubx": UbxMessages,
+    "nmea": NmeaMessages,
+}
+
+
+class GnssWire:
+    """The bytes of a receiver, ``gnss/<name>``, cut wherever a read falls.
+
+    Args:
+        plan: of the flight.
+        name: of the receiver in it.
+        receiver: its solutions.
+        pulse: what it drives; None: nothing is wired to it.
+
+    Raises:
+        PlanError: the messages do not fit on the line, come too late to name their second, or the protocol has no
+            message for what is asked.
+    """
+
+    def __init__(self, plan: Plan, name: str, receiver: Receiver, pulse: PulsePerSecond | None) -> None:
+        table, flight, host = receiver.table, plan.tables.flight, plan.tables.host
+        _check_protocol(table, name)
+        self._source, self._table, self._receiver = f"gnss/{name}", table, receiver
+        calendar = Calendar(plan.start_gps_ns, plan.leap_seconds)
+        self._messages = PROTOCOLS[table.protocol](table, calendar, Pulse(pulse))
+        read_s = host.serial_read_ms / 1000.0
+        _check_line(table, name, self._typical_second(), read_s)
+        first_read_s = read_s * generator(flight.seed, "gnss", name, "reads").random()
+        self._line = SerialLine(table.baud, read_s, first_read_s)
+        variation_s = VARIATION_S if flight.noise else 0.0
+        self._variation = [
+            Noise(flight.seed, ("gnss", name, "latency", part), (variation_s,), 0.0, 1.0) for part in ("fix", "ins")
+        ]
+        self._stop_tick = math.ceil(receiver.trajectory.end_s * INS_RATE_HZ)  # of the last epoch, at INS_RATE_HZ
+        self._second = 0  # epochs before it are sent
+        self._until_s = 0.0
+
+    def units(self, start_s: float, stop_s: float) -> list[WireUnit]:
+        """The reads with ``start_s`` <= time < ``stop_s`` that have bytes; a call goes on where the last one ended.
+
+        Raises:
+            ValueError: it does not.
+        """
+        if start_s != self._until_s:
+            raise ValueError(f"units from {start_s} s on, but the last ones ended at {self._until_s} s")
+        self._until_s = stop_s
+        while self._second < stop_s:  # whole seconds at a time, so that rounding too is the same however time is cut
+            first_tick = self._second * INS_RATE_HZ
+            for time_s, data in self._bursts(first_tick, min(first_tick + INS_RATE_HZ, self._stop_tick)):
+                self._line.send(time_s, data)
+            self._second += 1
+        return [WireUnit(time_s, self._source, data) for time_s, data in self._line.read_until(stop_s)]
+
+    def _bursts(self, first_tick: int, stop_tick: int) -> Iterator[tuple[float, bytes]]:
+        """Bytes of the epochs in these ticks, in the order they are sent, and when at the earliest."""
+        ticks = INS_RATE_HZ // self._table.rate_hz
+        first, stop = -(-first_tick // ticks), -(-stop_tick // ticks)
+        bursts: list[tuple[int, int, float, bytes]] = []  # tick, part, delay
+        if stop > first:
+            epochs = self._receiver.epochs(first, stop - first)
+            delays_s = self._delays_s(0, first, stop - first)
+            for row, delay_s in enumerate(delays_s):
+                bursts.append(((first + row) * ticks, 0, delay_s, b"".join(self._messages.epoch(epochs, row))))
+        if self._table.ins and stop_tick > first_tick:
+            ins = self._receiver.ins_epochs(first_tick, stop_tick - first_tick)
+            delays_s = self._delays_s(1, first_tick, stop_tick - first_tick)
+            for row, delay_s in enumerate(delays_s):
+                bursts.append((first_tick + row, 1, delay_s, b"".join(self._messages.ins_epoch(ins, row))))
+        for tick, _, delay_s, data in sorted(bursts):
+            yield tick / INS_RATE_HZ + delay_s, data
+
+    def _delays_s(self, part: int, first: int, count: int) -> list[float]:
+        """From an epoch to its first byte."""
+        variation_s = np.minimum(np.abs(self._variation[part].rows(first, count)[:, 0]), GREATEST_VARIATION_S)
+        delays_s: list[float] = (self._table.latency_ms / 1000.0 + variation_s).tolist()
+        return delays_s
+
+    def _typical_second(self) -> list[tuple[float, int]]:
+        """(time, bytes) of a second's epochs while there are satellites."""
+        epochs = self._receiver.epochs(0, self._table.rate_hz)
+        epochs = replace(epochs, fix=np.full_like(epochs.fix, FixType.SINGLE))
+        sizes = [(float(t), _size(self._messages.epoch(epochs, row))) for row, t in enumerate(epochs.time_s)]
+        if self._table.ins:
+            ins = self._receiver.ins_epochs(0, INS_RATE_HZ)
+            sizes += [(float(t), _size(self._messages.ins_epoch(ins, row))) for row, t in enumerate(ins.time_s)]
+        return sorted(sizes)
+
+
+def config_table(table: GnssTable, name: str, transport: str, leap_seconds: int | None = None) -> dict[str, Any]:
+    """``[gnss.<name>]`` of the configuration that records it (CONFIG).
+
+    Args:
+        table: of the plan.
+        name: of the receiver.
+        transport: URI of its serial line.
+        leap_seconds: GPS − UTC, for a protocol that does not say it; None: the configuration's default.
+    """
+    config: dict[str, Any] = {"transport": transport, "protocol": table.protocol}
+    if table.pps is not None:
+        config["pps"] = table.pps
+    config["lever_arm_m"] = list(table.lever_arm_m)
+    if table.secondary_lever_arm_m is not None:
+        config["secondary_lever_arm_m"] = list(table.secondary_lever_arm_m)
+    if leap_seconds is not None and table.protocol == "nmea":
+        config["leap_seconds"] = leap_seconds
+    return config
+
+
+def _size(messages: list[bytes]) -> int:
+    return sum(map(len, messages))
+
+
+def _check_protocol(table: GnssTable, name: str) -> None:
+    if table.ins and table.protocol != "novatel":
+        raise PlanError(f"gnss.{name}.ins", f'"{table.protocol}" has no such messages; want protocol = "novatel"')
+    if table.secondary_lever_arm_m is not None and table.protocol == "ubx":
+        text = '"ubx" sends no heading here; want protocol = "novatel" or "nmea"'
+        raise PlanError(f"gnss.{name}.secondary_lever_arm_m", text)
+
+
+def _check_line(table: GnssTable, name: str, second: list[tuple[float, int]], read_s: float) -> None:
+    """Refuse a line on which messages pile up, or name their second too late."""
+    bytes_per_s = math.ceil(SLACK * sum(size for _, size in second))
+
+    def late_s(baud: int) -> float:
+        return _lateness_s(table, second, read_s, baud)
+
+    def carries(baud: int) -> bool:
+        return BITS_PER_BYTE * bytes_per_s <= baud
+
+    if carries(table.baud) and late_s(table.baud) < NAMING_S:
+        return
+    better = next((baud for baud in STANDARD_BAUDS if carries(baud) and late_s(baud) < NAMING_S), None)
+    if better is not None and not carries(table.baud):
+        text = f"{table.baud} is too slow for {bytes_per_s} bytes a second; want {better} or more, or a lower rate_hz"
+        raise PlanError(f"gnss.{name}.baud", text)
+    baud = table.baud if carries(table.baud) else STANDARD_BAUDS[-1]
+    late = f"messages would come {late_s(baud):.2f} s after the second they name"
+    if better is not None:
+        text = f"{baud}: {late}; want {better} or more, or less latency_ms"
+        raise PlanError(f"gnss.{name}.baud", text)
+    most_ms = math.floor(table.latency_ms - 1000.0 * (late_s(baud) - NAMING_S)) - 1
+    raise PlanError(f"gnss.{name}.latency_ms", f"{table.latency_ms:g}: {late}; want at most {max(most_ms, 0)}")
+
+
+def _lateness_s(table: GnssTable, second: list[tuple[float, int]], read_s: float, baud: int) -> float:
+    """When the last byte of a whole second's messages is read, at the latest, if every second is as this one."""
+    free_s = latest_s = 0.0
+    for start_s in range(3):
+        for time_s, size in second:
+            leaves_s = start_s + time_s + table.latency_ms / 1000.0 + GREATEST_VARIATION_S
+            free_s = max(free_s, leaves_s) + SLACK * size * BITS_PER_BYTE / baud
+            if time_s == 0.0:
+                latest_s = max(latest_s, free_s - start_s + read_s)
+    return latest_s

@@ -1,0 +1,123 @@
+"""How good an inertial unit is: grades as data sheets say them, and the same in SI units.
+
+A grade gives what the plan leaves unsaid under ``[imu.<name>.noise]``. Figures are one sigma; "instability" is the
+greatest Allan deviation of the drifting part of a bias, which is what data sheets read off their curves' floor.
+
+- navigation: Honeywell HG9900 (brochure: 0.0035 °/h, 0.002 °/√h, 25 µg, 5 and 100 ppm); its sheet has no velocity
+  random walk: 8 µg/√Hz of the accelerometers in its class (iMAR iNAV-RQH).
+- tactical: iMAR IMU-FSAS (0.75 °/h, 0.1 °/√h, 1 mg, 0.03 m/s/√h, 300 ppm), Honeywell HG1700 and HG1900 beside it
+  (1 °/h, 0.09 to 0.125 °/√h, 1 mg).
+- mems: Analog Devices ADIS16488 (in run 6 °/h and 0.1 mg, 0.3 °/√h, 0.029 m/s/√h, axes to 0.05°), its bias at turn-on
+  that of a unit calibrated over temperature and not the sheet's repeatability over years; so are its scale factors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.plan_tables import ImuNoiseTable, ImuTable
+
+STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
+RAD = np.pi / 180.0
+
+GRADES = {
+    "navigation": ImuNoiseTable(
+        angle_random_walk_deg_per_sqrt_h=0.002,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.005,
+        gyro_bias_deg_per_h=0.0035,
+        accel_bias_mg=0.025,
+        gyro_bias_instability_deg_per_h=0.001,
+        accel_bias_instability_mg=0.003,
+        bias_correlation_h=1.0,
+        gyro_scale_ppm=5.0,
+        accel_scale_ppm=100.0,
+        misalignment_mrad=0.01,
+    ),
+    "tactical": ImuNoiseTable(
+        angle_random_walk_deg_per_sqrt_h=0.1,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.03,
+        gyro_bias_deg_per_h=0.75,
+        accel_bias_mg=1.0,
+        gyro_bias_instability_deg_per_h=0.1,
+        accel_bias_instability_mg=0.03,
+        bias_correlation_h=1.0,
+        gyro_scale_ppm=300.0,
+        accel_scale_ppm=300.0,
+        misalignment_mrad=0.1,
+    ),
+    "mems": ImuNoiseTable(
+        angle_random_walk_deg_per_sqrt_h=0.3,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.03,
+        gyro_bias_deg_per_h=36.0,
+        accel_bias_mg=3.0,
+        gyro_bias_instability_deg_per_h=6.0,
+        accel_bias_instability_mg=0.1,
+        bias_correlation_h=1.0,
+        gyro_scale_ppm=1000.0,
+        accel_scale_ppm=1000.0,
+        misalignment_mrad=0.5,
+    ),
+    "perfect": ImuNoiseTable(
+        angle_random_walk_deg_per_sqrt_h=0.0,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.0,
+        gyro_bias_deg_per_h=0.0,
+        accel_bias_mg=0.0,
+        gyro_bias_instability_deg_per_h=0.0,
+        accel_bias_instability_mg=0.0,
+        bias_correlation_h=1.0,
+        gyro_scale_ppm=0.0,
+        accel_scale_ppm=0.0,
+        misalignment_mrad=0.0,
+    ),
+}
+
+
+def noise_of(table: ImuTable) -> dict[str, float]:
+    """Every key of `ImuNoiseTable` with its value: the plan's, else the grade's."""
+    return GRADES[table.grade].model_dump() | table.noise.model_dump(exclude_none=True)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorGrade:
+    """One triad, gyroscopes (base unit rad/s) or accelerometers (m/s²), in SI units, one sigma.
+
+    Attributes:
+        random_walk: white noise of the output, base unit · √s.
+        bias: at turn-on, base unit.
+        instability: greatest Allan deviation of the drift, base unit.
+        correlation_s: longest time constant of the drift.
+        scale: of a scale factor.
+        misalignment_rad: of the angles that axes lean towards each other.
+    """
+
+    random_walk: float
+    bias: float
+    instability: float
+    correlation_s: float
+    scale: float
+    misalignment_rad: float
+
+
+def sensor_grades(table: ImuTable) -> tuple[SensorGrade, SensorGrade]:
+    """Accelerometers and gyroscopes of a unit of the plan."""
+    noise = noise_of(table)
+    correlation_s, misalignment_rad = 3600.0 * noise["bias_correlation_h"], 1e-3 * noise["misalignment_mrad"]
+    accelerometers = SensorGrade(
+        random_walk=noise["velocity_random_walk_m_per_s_per_sqrt_h"] / 60.0,
+        bias=noise["accel_bias_mg"] * 1e-3 * STANDARD_GRAVITY,
+        instability=noise["accel_bias_instability_mg"] * 1e-3 * STANDARD_GRAVITY,
+        correlation_s=correlation_s,
+        scale=1e-6 * noise["accel_scale_ppm"],
+        misalignment_rad=misalignment_rad,
+    )
+    gyroscopes = SensorGrade(
+        random_walk=noise["angle_random_walk_deg_per_sqrt_h"] * RAD / 60.0,
+        bias=noise["gyro_bias_deg_per_h"] * RAD / 3600.0,
+        instability=noise["gyro_bias_instability_deg_per_h"] * RAD / 3600.0,
+        correlation_s=correlation_s,
+        scale=1e-6 * noise["gyro_scale_ppm"],
+        misalignment_rad=misalignment_rad,
+    )
+    return accelerometers, gyroscopes

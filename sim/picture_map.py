@@ -1,0 +1,274 @@
+"""The map of a plan's picture: shaded ground, what stands on it, swaths, lines and the way between them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import LightSource, LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import ScaledTranslation
+from pyproj import Transformer
+
+from sim.coverage import FloatArray, Strip, Survey
+
+INK, MUTED = "#22262b", "#5a6068"
+ROOFS, WATER, TREES, ROAD, MAST, CAR = "#a65f4a", "#8fbfdc", "#7fa65e", "#8d8d89", "#3b3b3b", "#c23b22"
+LINE_COLOURS = (
+    "#1f6fb4",
+    "#d9541e",
+    "#228b57",
+    "#8e4fb0",
+    "#c2358a",
+    "#8c6d1f",
+    "#0f8c9a",
+    "#b5352b",
+    "#5661c9",
+    "#5f7d12",
+)
+LAND = LinearSegmentedColormap.from_list("land", ["#c9d9b5", "#e3e7c8", "#f1e8cf", "#e4d3b3", "#d3ba97"])
+HALO = (withStroke(linewidth=2.6, foreground="white", alpha=0.85),)
+SHADE_CELLS = 420
+
+
+def colour_of(number: int) -> str:
+    """Of a flight line."""
+    return LINE_COLOURS[number % len(LINE_COLOURS)]
+
+
+def page_of(axes: Axes) -> Figure:
+    """That a panel is on."""
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def nice_step(size: float, *, up: bool = False) -> float:
+    """The largest of 1, 2, 5 × 10ⁿ not above a size; ``up``: the smallest not below it."""
+    if size <= 0.0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(size))
+    steps = [factor * power for factor in (1.0, 2.0, 5.0, 10.0)]
+    return min(step for step in steps if step >= size) if up else max(step for step in steps if step <= size)
+
+
+def draw_map(axes: Axes, survey: Survey, track: FloatArray, low: FloatArray, high: FloatArray, stretch: float) -> None:
+    """The map between two corners.
+
+    Args:
+        axes: to draw in.
+        survey: the plan, flown.
+        track: (n, 4) time, east, north and height of the aircraft.
+        low, high: (2,) east and north of the corners.
+        stretch: north is drawn larger than east by this.
+    """
+    _relief(axes, survey, low, high)
+    draw_ground(axes, survey)
+    for number, strip in enumerate(survey.strips):
+        _swath(axes, survey.edges(strip), colour_of(number), 0.16 if len(survey.strips) < 5 else 0.09)
+    axes.plot(track[:, 1], track[:, 2], color=INK, lw=0.8, ls=(0, (5, 2)), alpha=0.75, zorder=5)
+    axes.plot(*track[0, 1:3], marker="o", ms=5, color="white", mec=INK, mew=1.2, zorder=8)
+    axes.plot(*track[-1, 1:3], marker="s", ms=5, color=INK, mec="white", mew=0.8, zorder=8)
+    for number, strip in enumerate(survey.strips):
+        _line(axes, strip, colour_of(number))
+    control = survey.scene.control_points(survey.plan.tables.control.points, survey.plan.tables.flight.seed)
+    axes.plot(control[:, 0], control[:, 1], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7, zorder=7)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set_xlabel("east of the origin (m)", fontsize=8, color=MUTED)
+    axes.set_ylabel("north of the origin (m)", fontsize=8, color=MUTED)
+    axes.grid(color="white", lw=0.6, alpha=0.55, zorder=1)
+    _scale_bar(axes, low, high)
+    _north_arrow(axes)
+    _legend(axes, survey)
+    _origin(axes, survey, stretch)
+
+
+def _relief(axes: Axes, survey: Survey, low: FloatArray, high: FloatArray) -> None:
+    """Heights as soft colours with shadows, and contour lines."""
+    size = high - low
+    shape = np.maximum((SHADE_CELLS * size / size.max()).astype(int), 40)
+    east_m, north_m = (np.linspace(low[axis], high[axis], shape[axis]) for axis in (0, 1))
+    east, north = np.meshgrid(east_m, north_m)
+    ground_m = survey.scene.ground_m(east.ravel(), north.ravel()).reshape(east.shape)
+    extent = (low[0], high[0], low[1], high[1])
+    relief_m = float(np.ptp(ground_m))
+    if relief_m < 1.0:
+        axes.set_facecolor("#e6e8cf")
+        return
+    step_m = size / shape
+    slope = np.hypot(*np.gradient(ground_m, step_m[1], step_m[0]))
+    exaggeration = float(np.clip(0.3 / slope.mean(), 0.5, 15.0))
+    light = LightSource(315.0, 45.0).hillshade(ground_m, exaggeration, dx=float(step_m[0]), dy=-float(step_m[1]))
+    tint = LAND((ground_m - ground_m.min()) / relief_m)[:, :, :3]
+    image = np.clip(tint * (0.78 + 0.32 * light[:, :, np.newaxis]), 0.0, 1.0)
+    axes.imshow(image, extent=extent, origin="lower", aspect="auto", interpolation="bilinear", zorder=0)
+    step = nice_step(relief_m / 8.0, up=True)
+    levels = step * np.arange(math.ceil(ground_m.min() / step), math.floor(ground_m.max() / step) + 1)
+    if len(levels):
+        lines = axes.contour(east_m, north_m, ground_m, levels=levels, colors="#8a7752", linewidths=0.45, alpha=0.7)
+        axes.clabel(lines, fmt="%g", fontsize=6, inline_spacing=2)
+
+
+def draw_ground(axes: Axes, survey: Survey, *, outlines: bool = False) -> None:
+    """What stands on the ground; ``outlines``: over colours that are not to be hidden."""
+    terrain = survey.plan.tables.terrain
+    fill: dict[str, Any] = {"facecolor": "none", "lw": 0.4, "alpha": 0.7} if outlines else {"lw": 0.5}
+    for lake in terrain.water:
+        colours: dict[str, Any] = {"edgecolor": "#4d88ad"} | ({} if outlines else {"facecolor": WATER})
+        axes.add_patch(Circle((lake.center_m[0], lake.center_m[1]), lake.radius_m, zorder=2, **fill | colours))
+    for forest in terrain.forest:
+        corners = np.array(forest.center_m) + np.array(forest.size_m) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+        colours = {"edgecolor": "#4f7a35"} | ({} if outlines else {"facecolor": TREES, "alpha": 0.65})
+        axes.add_patch(Polygon(corners, zorder=2, **fill | colours))
+    for road in terrain.road:
+        points = np.array(road.points_m)
+        axes.plot(*points.T, color=ROAD, lw=0.5 if outlines else 2.2, solid_joinstyle="round", zorder=2.2)
+        if not outlines:
+            axes.plot(*points.T, color="#f4f2ec", lw=1.0, solid_joinstyle="round", zorder=2.3)
+    roofs: dict[str, Any] = {"facecolors": "none"} if outlines else {"facecolors": ROOFS}
+    axes.add_collection(
+        PolyCollection(
+            survey.scene.buildings,
+            edgecolors="#555555" if outlines else "#6b3a2c",
+            linewidths=0.25,
+            zorder=2.5,
+            **roofs,
+        ),
+        autolim=False,
+    )
+    wires = [[wire.from_m, wire.to_m] for wire in terrain.wire]
+    axes.add_collection(LineCollection(wires, colors=MAST, linewidths=0.5 if outlines else 0.9, zorder=2.6))
+    if outlines:
+        return
+    for wire in wires:
+        axes.plot(*np.array(wire).T, ls="", marker="P", ms=3.2, color=MAST, mew=0.0, zorder=2.7)
+    for car in terrain.car:
+        axes.plot(*np.array([car.from_m, car.to_m]).T, color=CAR, lw=0.9, ls=(0, (1, 1.2)), zorder=2.8)
+
+
+def _swath(axes: Axes, outline: FloatArray, colour: str, alpha: float) -> None:
+    axes.add_patch(Polygon(outline, facecolor=colour, alpha=alpha, lw=0, zorder=1.5))
+    axes.add_patch(Polygon(outline, facecolor="none", edgecolor=colour, lw=0.7, alpha=0.7, zorder=3.5))
+
+
+def _line(axes: Axes, strip: Strip, colour: str) -> None:
+    """A line with an arrow and its name behind its beginning; a little to its right, where a pilot keeps."""
+    aside = np.array([strip.ahead[1], -strip.ahead[0]]) * 1.4 / 72.0
+    moved = axes.transData + ScaledTranslation(aside[0], aside[1], page_of(axes).dpi_scale_trans)
+    start, end = strip.from_m, strip.from_m + strip.length_m * strip.ahead
+    axes.plot([start[0], end[0]], [start[1], end[1]], color=colour, lw=2.0, transform=moved, zorder=6)
+    turned = math.degrees(math.atan2(strip.ahead[1], strip.ahead[0]))
+    for part in (0.3, 0.75):
+        tip = start + part * (end - start)
+        arrow = (3, 0, turned - 90.0)
+        axes.plot(*tip, marker=arrow, ms=9, color=colour, mec="white", mew=0.7, transform=moved, zorder=6.2)
+    upright = (turned + 90.0) % 180.0 - 90.0
+    forward = abs(turned - upright) < 1.0
+    axes.annotate(
+        strip.name,
+        xy=(start[0], start[1]),
+        xytext=(-6.0 * strip.ahead[0], -6.0 * strip.ahead[1]),
+        textcoords="offset points",
+        rotation=upright,
+        rotation_mode="anchor",
+        ha="right" if forward else "left",
+        va="center",
+        fontsize=8,
+        weight="bold",
+        color=colour,
+        path_effects=HALO,
+        zorder=9,
+    )
+
+
+def _scale_bar(axes: Axes, low: FloatArray, high: FloatArray) -> None:
+    """In metres or kilometres, a fifth of the map at most."""
+    length_m = nice_step(0.2 * float(high[0] - low[0]))
+    part = length_m / float(high[0] - low[0])
+    place = axes.transAxes
+    x, y = 0.03, 0.035
+    for number in range(4):
+        piece = [x + number * part / 4, x + (number + 1) * part / 4], [y, y]
+        for colour, width in ((INK, 5.5), (INK if number % 2 == 0 else "white", 3.5)):
+            axes.plot(*piece, transform=place, color=colour, lw=width, solid_capstyle="butt", zorder=10)
+    text = f"  {length_m / 1000:g} km" if length_m >= 1000.0 else f"  {length_m:g} m"
+    axes.text(x + part, y, text, transform=place, fontsize=8, color=INK, va="center", path_effects=HALO, zorder=11)
+
+
+def _north_arrow(axes: Axes) -> None:
+    axes.annotate(
+        "N",
+        xy=(0.965, 0.965),
+        xytext=(0.0, -34.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=11,
+        weight="bold",
+        color=INK,
+        arrowprops={"arrowstyle": "-|>,head_width=0.35,head_length=0.8", "color": INK, "lw": 1.6},
+        path_effects=HALO,
+        zorder=11,
+    )
+
+
+def _legend(axes: Axes, survey: Survey) -> None:
+    """Below the map: what of it there is."""
+    terrain, control = survey.plan.tables.terrain, survey.plan.tables.control
+    entries: list[tuple[Any, str, Any]] = [
+        (True, "flight line", Line2D([], [], color=LINE_COLOURS[0], lw=2)),
+        (True, "swath", Patch(facecolor=LINE_COLOURS[0], alpha=0.3)),
+        (True, "way between", Line2D([], [], color=INK, lw=0.8, ls=(0, (5, 2)))),
+        (True, "begin", Line2D([], [], ls="", marker="o", ms=5, color="white", mec=INK, mew=1.2)),
+        (True, "end", Line2D([], [], ls="", marker="s", ms=5, color=INK)),
+        (control.points, "control point", Line2D([], [], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7)),
+        (len(survey.scene.buildings), "building", Patch(facecolor=ROOFS)),
+        (terrain.road, "road", Line2D([], [], color=ROAD, lw=2.2)),
+        (terrain.water, "water", Patch(facecolor=WATER)),
+        (terrain.forest, "trees", Patch(facecolor=TREES, alpha=0.65)),
+        (terrain.wire, "wire", Line2D([], [], color=MAST, lw=0.9, marker="P", ms=3.2)),
+        (terrain.car, "cars", Line2D([], [], color=CAR, lw=0.9, ls=(0, (1, 1.2)))),
+    ]
+    shown = [(handle, text) for there, text, handle in entries if there]
+    axes.legend(
+        [handle for handle, _ in shown],
+        [text for _, text in shown],
+        loc="upper left",
+        bbox_to_anchor=(0.0, 0.0),
+        bbox_transform=axes.transAxes + ScaledTranslation(0.0, -0.48, page_of(axes).dpi_scale_trans),
+        ncols=len(shown),
+        fontsize=7.5,
+        frameon=False,
+        borderaxespad=0.0,
+        handlelength=1.6,
+        handletextpad=0.5,
+        columnspacing=1.1,
+        labelcolor=MUTED,
+    )
+
+
+def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
+    """Where the site is on earth."""
+    lat_deg, lon_deg = survey.plan.tables.flight.origin_deg
+    crs = survey.plan.tables.flight.crs
+    east_m, north_m = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon_deg, lat_deg)[:2]
+    text = (
+        f"origin {abs(lat_deg):.5f}° {'N' if lat_deg >= 0 else 'S'}, {abs(lon_deg):.5f}° {'E' if lon_deg >= 0 else 'W'}"
+    )
+    text += f"   {crs} {east_m:.1f}, {north_m:.1f}"
+    if stretch > 1.0:
+        text += f"   north drawn {stretch:.3g} × larger than east"
+    heading(axes, text, 3.0, x=1.0, fontsize=7.5, color=MUTED, ha="right")
+
+
+def heading(axes: Axes, text: str, above: float, *, x: float = 0.0, **style: Any) -> None:
+    """A line of text so many points above a panel."""
+    look: dict[str, Any] = {"fontsize": 9.5, "color": INK, "va": "bottom"} | style
+    axes.annotate(text, (x, 1.0), xytext=(0.0, above), xycoords="axes fraction", textcoords="offset points", **look)

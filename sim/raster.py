@@ -1,0 +1,181 @@
+"""Ground from a GeoTIFF of ellipsoidal heights, read by rasterio (``swath[raster]``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from sim.errors import PlanError
+from sim.plan import Plan
+from sim.site import Site, geodetic_from_e
+
+FloatArray = NDArray[np.float64]
+Place = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+
+KEY = "terrain.raster"
+_CORNERS = ("south-west", "south-east", "north-west", "north-east")
+
+
+class RasterHeights:
+    """Heights of a raster on the grid of the ground, bilinear between the centres of its pixels.
+
+    Args:
+        plan: names the raster and, in ``flight.crs``, the CRS it must have.
+        site: of the grid.
+        east_m, north_m: first and last column and row.
+        of_height: makes a smooth function of place and height quick on that grid (`sim.terrain.OfHeight`).
+
+    Raises:
+        PlanError: ``terrain.raster``, one line: no rasterio, no such file, another CRS, a corner not covered; when
+            called, a pixel without data.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        site: Site,
+        east_m: tuple[float, float],
+        north_m: tuple[float, float],
+        of_height: Callable[[Place], Any],
+    ) -> None:
+        self._to_crs = _Projected(site, _plan_crs(plan))
+        corners = np.array([[x, y] for y in north_m for x in east_m])
+        pixels = _read(plan, self._to_crs, corners, plan.tables.terrain.height_m)
+        self._pixels = pixels
+        self._height_m = plan.tables.terrain.height_m
+        self._column = of_height(lambda x, y, height: pixels.at(*self._to_crs(x, y, height))[0])
+        self._row = of_height(lambda x, y, height: pixels.at(*self._to_crs(x, y, height))[1])
+
+    def __call__(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """(rows, columns) ellipsoidal heights at east (columns,) and north (rows,).
+
+        Where a place is on the map depends a little on its height: 0.8 m of 500 m at 10 km. Three turns settle it.
+        """
+        height_m: FloatArray | float = self._height_m
+        for _ in range(3):
+            column, row = (pixel(east_m, north_m, height_m) for pixel in (self._column, self._row))
+            height_m = self._pixels.sample(column, row)
+        assert isinstance(height_m, np.ndarray)
+        if not np.isfinite(height_m).all():
+            at_row, at_column = np.argwhere(~np.isfinite(height_m))[0]
+            place = [np.array([value]) for value in (east_m[at_column], north_m[at_row], self._height_m)]
+            easting, northing = self._to_crs(*place)
+            raise PlanError(
+                KEY, f"has no data at {easting[0]:.1f}, {northing[0]:.1f}; want heights all over the lines' swaths"
+            )
+        return height_m
+
+
+@dataclass(frozen=True)
+class _Projected:
+    """Easting and northing of site places."""
+
+    site: Site
+    crs: CRS
+
+    def __call__(self, east_m: FloatArray, north_m: FloatArray, height_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        points = self.site.site_from_ground(east_m, north_m, height_m)
+        lat_rad, lon_rad, _ = geodetic_from_e(self.site.e_from_site(points))
+        to_map = Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
+        easting, northing = to_map.transform(np.degrees(lon_rad), np.degrees(lat_rad))
+        return np.asarray(easting), np.asarray(northing)
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """A window of the raster: values (rows, columns), nan where there is none; ``inverse`` takes the map to pixels."""
+
+    values: FloatArray
+    inverse: Any
+
+    def at(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Column and row, whole at the pixels' centres."""
+        column, row = self.inverse * (easting, northing)
+        return column - 0.5, row - 0.5
+
+    def sample(self, column: FloatArray, row: FloatArray) -> FloatArray:
+        """Bilinear; in the outer half of the outermost pixels as at their centres."""
+        rows, columns = self.values.shape
+        column, row = np.clip(column, 0.0, columns - 1), np.clip(row, 0.0, rows - 1)
+        left = np.minimum(column.astype(np.int64), max(columns - 2, 0))
+        upper = np.minimum(row.astype(np.int64), max(rows - 2, 0))
+        right, lower = np.minimum(left + 1, columns - 1), np.minimum(upper + 1, rows - 1)
+        u, v = column - left, row - upper
+        above = (1 - u) * self.values[upper, left] + u * self.values[upper, right]
+        below = (1 - u) * self.values[lower, left] + u * self.values[lower, right]
+        value: FloatArray = (1 - v) * above + v * below
+        return value
+
+
+def _plan_crs(plan: Plan) -> CRS:
+    try:
+        crs = CRS(plan.tables.flight.crs)
+    except CRSError:
+        raise PlanError("flight.crs", f"PROJ knows no {plan.tables.flight.crs!r}; want as EPSG:25832") from None
+    return _horizontal(crs)
+
+
+def _horizontal(crs: CRS) -> CRS:
+    return CRS(crs.sub_crs_list[0]) if crs.is_compound else crs.to_2d()
+
+
+def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) -> _Pixels:
+    """The pixels under the corners (4, 2) of the grid."""
+    try:
+        import rasterio
+        from rasterio.windows import Window
+    except ImportError:
+        raise PlanError(KEY, "rasters need rasterio; want pip install 'swath[raster]', or no raster") from None
+    path = plan.folder / plan.tables.terrain.raster
+    if not path.is_file():
+        raise PlanError(KEY, f"there is no file {path}; want a GeoTIFF, its path relative to the plan")
+    try:
+        with rasterio.open(path) as source:
+            _check_crs(source.crs, to_crs.crs, path)
+            easting, northing = to_crs(corners[:, 0], corners[:, 1], np.full(4, height_m))
+            column, row = ~source.transform * (easting, northing)
+            _check_cover(np.stack([column, row], axis=1), (source.width, source.height), easting, northing, path)
+            first = np.floor([min(column), min(row)]).astype(int) - 2
+            last = np.ceil([max(column), max(row)]).astype(int) + 2
+            first, last = np.maximum(first, 0), np.minimum(last, [source.width, source.height])
+            window = Window(*map(int, first), *map(int, last - first))
+            values = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+            return _Pixels(values, ~source.window_transform(window))
+    except rasterio.errors.RasterioError as error:
+        reason = str(error).splitlines()[0]
+        raise PlanError(KEY, f"{path} cannot be read: {reason}; want a GeoTIFF of heights") from None
+
+
+def _check_crs(found: Any, wanted: CRS, path: Path) -> None:
+    if not found:
+        raise PlanError(KEY, f"{path} has no CRS; want flight.crs, {_name(wanted)}")
+    crs = _horizontal(CRS.from_wkt(found.to_wkt()))
+    same_code = crs.to_epsg() is not None and crs.to_epsg() == wanted.to_epsg()
+    if not same_code and not crs.equals(wanted, ignore_axis_order=True):
+        raise PlanError(KEY, f"{path} is in {_name(crs)}; want flight.crs, {_name(wanted)}")
+
+
+def _name(crs: CRS) -> str:
+    code = crs.to_epsg()
+    return f"EPSG:{code}" if code else f"{crs.name!r}"
+
+
+def _check_cover(
+    pixels: FloatArray, size: tuple[int, int], easting: FloatArray, northing: FloatArray, path: Path
+) -> None:
+    """Corners of the grid (4, 2) as columns and rows, against the raster's edges."""
+    inside = np.all((pixels >= 0.0) & (pixels <= size), axis=1)
+    for name, there, e, n in zip(_CORNERS, inside, easting, northing, strict=True):
+        if not there:
+            raise PlanError(
+                KEY,
+                f"{path} does not reach the {name} corner at {e:.0f}, {n:.0f}; want heights under all swaths and "
+                "100 m around",
+            )

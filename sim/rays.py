@@ -1,0 +1,207 @@
+"""Where a ray meets one thing: compiled functions of plain numbers.
+
+A ray is ``(x, y, z, dx, dy, dz)``: origin and unit direction in the site frame. Distances along it are metres from the
+origin; infinity: never.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Ray = tuple[float, float, float, float, float, float]
+
+NEVER = math.inf
+UNDERGROUND = -1.0
+_MIX_1, _MIX_2, _GOLDEN = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB), np.uint64(0x9E3779B97F4A7C15)
+_S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31)
+
+
+@numba.njit(cache=True)
+def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
+    """A number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al. 2014)."""
+    state = np.uint64(seed)
+    for name in (number, purpose, draw):
+        state = (state ^ np.uint64(name)) + _GOLDEN
+        state = (state ^ (state >> _S30)) * _MIX_1
+        state = (state ^ (state >> _S27)) * _MIX_2
+        state = state ^ (state >> _S31)
+    return np.float64(state >> _S11) * 2.0**-53
+
+
+@numba.njit(cache=True)
+def patch_root(height: float, slope: float, bend: float) -> float:
+    """Smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a patch."""
+    inside = slope * slope - 4.0 * bend * height
+    if inside < 0.0:
+        return NEVER
+    if slope < 0.0:
+        return 2.0 * height / (math.sqrt(inside) - slope)
+    if bend < 0.0:
+        return -0.5 * (slope + math.sqrt(inside)) / bend
+    return NEVER
+
+
+@numba.njit(cache=True)
+def boundary(at: float, step: float, low: float, size: float, index: int) -> float:
+    """Distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
+    if step > 0.0:
+        return (low + (index + 1) * size - at) / step
+    if step < 0.0:
+        return (low + index * size - at) / step
+    return NEVER
+
+
+@numba.njit(cache=True)
+def slice_at(value: float, low: float, size: float, count: int) -> int:
+    """Index of the slice that holds a value, the nearest one beyond the ends."""
+    return min(max(math.floor((value - low) / size), 0), count - 1)
+
+
+@numba.njit(cache=True)
+def ground_entry(
+    z: FloatArray, west: float, south: float, cell: float, ray: Ray, start: float, stop: float, fresh: bool
+) -> float:
+    """Where a ray goes below the bilinear ground between two distances.
+
+    Within a cell the height of the ray above the patch is a quadratic of the distance; it is set up at the ray's entry
+    into the cell, so that nothing large cancels. `UNDERGROUND` where a ``fresh`` ray begins below.
+    """
+    ox, oy, oz, dx, dy, dz = ray
+    columns, rows = z.shape[1] - 1, z.shape[0] - 1
+    column = slice_at(ox + start * dx, west, cell, columns)
+    row = slice_at(oy + start * dy, south, cell, rows)
+    at = start
+    while True:
+        leave_x, leave_y = boundary(ox, dx, west, cell, column), boundary(oy, dy, south, cell, row)
+        leave = max(at, min(stop, leave_x, leave_y))
+        z00, z10, z01, z11 = z[row, column], z[row, column + 1], z[row + 1, column], z[row + 1, column + 1]
+        here = oz + at * dz
+        if min(here, oz + leave * dz) <= max(z00, z10, z01, z11) + 1e-6:
+            a, b, twist = z10 - z00, z01 - z00, z11 - z10 - z01 + z00
+            u, v = (ox + at * dx - west) / cell - column, (oy + at * dy - south) / cell - row
+            du, dv = dx / cell, dy / cell
+            height = here - (z00 + a * u + b * v + twist * u * v)
+            if height <= 0.0:
+                return UNDERGROUND if fresh and height < -1e-9 else at
+            step = patch_root(height, dz - a * du - b * dv - twist * (u * dv + v * du), -twist * du * dv)
+            if step <= leave - at + 1e-9:
+                return at + step
+        if leave >= stop:
+            return NEVER
+        fresh = False
+        at = leave
+        if leave_x <= leave_y:
+            column += 1 if dx > 0.0 else -1
+        else:
+            row += 1 if dy > 0.0 else -1
+        if column < 0 or row < 0 or column >= columns or row >= rows:
+            return NEVER
+
+
+@numba.njit(cache=True)
+def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> tuple[float, float]:
+    """Slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
+    column = slice_at(x, west, cell, z.shape[1] - 1)
+    row = slice_at(y, south, cell, z.shape[0] - 1)
+    z00, z10, z01, z11 = z[row, column], z[row, column + 1], z[row + 1, column], z[row + 1, column + 1]
+    u, v = (x - west) / cell - column, (y - south) / cell - row
+    twist = z11 - z10 - z01 + z00
+    return (z10 - z00 + twist * v) / cell, (z01 - z00 + twist * u) / cell
+
+
+@numba.njit(cache=True)
+def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> float:
+    """Site z of the bilinear ground at a place."""
+    column = slice_at(x, west, cell, z.shape[1] - 1)
+    row = slice_at(y, south, cell, z.shape[0] - 1)
+    u, v = (x - west) / cell - column, (y - south) / cell - row
+    southern = (1.0 - u) * z[row, column] + u * z[row, column + 1]
+    northern = (1.0 - u) * z[row + 1, column] + u * z[row + 1, column + 1]
+    return float((1.0 - v) * southern + v * northern)
+
+
+@numba.njit(cache=True)
+def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
+    """Distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
+    ox, oy, oz, dx, dy, dz = ray
+    wx, wy, wz = x - ox, y - oy, z - oz
+    along = wx * dx + wy * dy + wz * dz
+    if wx * wx + wy * wy + wz * wz - along * along > radius * radius or along < -radius:
+        return NEVER
+    return along
+
+
+@numba.njit(cache=True)
+def solid_entry(plane: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float]:
+    """Where a ray enters the body behind planes ``first … last − 1``: distance, plane, distance of an edge in reach.
+
+    The last is finite where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
+    """
+    ox, oy, oz, dx, dy, dz = ray
+    enter, leave, wide_enter, wide_leave, through = -NEVER, NEVER, -NEVER, NEVER, -1
+    for k in range(first, last):
+        speed = plane[k, 0] * dx + plane[k, 1] * dy + plane[k, 2] * dz
+        gap = plane[k, 3] - (plane[k, 0] * ox + plane[k, 1] * oy + plane[k, 2] * oz)
+        if speed == 0.0:
+            if gap < -grow:
+                return NEVER, -1, NEVER
+            if gap < 0.0:
+                enter = NEVER
+            continue
+        at = gap / speed
+        if speed < 0.0:
+            wide_enter = max(wide_enter, at + grow / speed)
+            if at > enter:
+                enter, through = at, k
+        else:
+            leave, wide_leave = min(leave, at), min(wide_leave, at + grow / speed)
+    if wide_enter > wide_leave or wide_leave < 0.0:
+        return NEVER, -1, NEVER
+    if enter >= leave or enter <= 0.0:
+        return NEVER, -1, max(wide_enter, 0.0)
+    cos = -(plane[through, 0] * dx + plane[through, 1] * dy + plane[through, 2] * dz)
+    x, y, z, reach = ox + enter * dx, oy + enter * dy, oz + enter * dz, grow / max(cos, 0.02)
+    for k in range(first, last):
+        if k != through and plane[k, 3] - (plane[k, 0] * x + plane[k, 1] * y + plane[k, 2] * z) < reach:
+            return enter, through, enter
+    return enter, through, NEVER
+
+
+@numba.njit(cache=True)
+def crown_span(tree: FloatArray, ray: Ray) -> tuple[float, float]:
+    """Where a ray enters and leaves an upright ellipsoid (row of `Things.tree`)."""
+    ox, oy, oz, dx, dy, dz = ray
+    radius, half = tree[3], tree[4]
+    px, py, pz = (ox - tree[0]) / radius, (oy - tree[1]) / radius, (oz - tree[2]) / half
+    ux, uy, uz = dx / radius, dy / radius, dz / half
+    a = ux * ux + uy * uy + uz * uz
+    b = px * ux + py * uy + pz * uz
+    inside = b * b - a * (px * px + py * py + pz * pz - 1.0)
+    if inside <= 0.0:
+        return NEVER, NEVER
+    root = math.sqrt(inside)
+    return (-b - root) / a, (root - b) / a
+
+
+@numba.njit(cache=True)
+def wire_passage(wire: FloatArray, ray: Ray) -> tuple[float, float, float]:
+    """Where a ray passes a piece of wire: distance, miss distance, cosine of incidence; beside its ends it does not."""
+    ox, oy, oz, dx, dy, dz = ray
+    ux, uy, uz = wire[3] - wire[0], wire[4] - wire[1], wire[5] - wire[2]
+    wx, wy, wz = ox - wire[0], oy - wire[1], oz - wire[2]
+    square = ux * ux + uy * uy + uz * uz
+    along, ahead, behind = dx * ux + dy * uy + dz * uz, dx * wx + dy * wy + dz * wz, ux * wx + uy * wy + uz * wz
+    across = square - along * along
+    if across <= 1e-12 * square:
+        return NEVER, NEVER, 0.0
+    share = (behind - along * ahead) / across
+    at = (along * behind - square * ahead) / across
+    if share < 0.0 or share >= 1.0 or at <= 0.0:
+        return NEVER, NEVER, 0.0
+    mx, my, mz = wx + at * dx - share * ux, wy + at * dy - share * uy, wz + at * dz - share * uz
+    return at, math.sqrt(mx * mx + my * my + mz * mz), math.sqrt(across / square)

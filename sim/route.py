@@ -1,0 +1,237 @@
+"""The way of the aircraft before it is smoothed: straights and circles in the site plane, with times.
+
+Between two lines the way is the shortest of Dubins' six words (L. E. Dubins, "On curves of minimal length with a
+constraint on average curvature", Am. J. Math. 79, 1957), in the closed form of A. M. Shkel and V. Lumelsky,
+"Classification of the Dubins set", Robotics and Autonomous Systems 34, 2001. Courses are clockwise from north (y of
+the site), so that their "left" is right here; a right turn has positive curvature.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+TURN = 2.0 * math.pi
+_NO_TURN_RAD = 1e-9  # an angle this little short of a whole turn is rounding
+_EXTENSIONS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A place in the site plane, metres, and a course, clockwise from north."""
+
+    east_m: float
+    north_m: float
+    course_rad: float
+
+    def ahead(self, distance_m: float) -> Pose:
+        """So far straight on, or back."""
+        return Arc(self, distance_m, 0.0).end
+
+
+@dataclass(frozen=True, slots=True)
+class Arc:
+    """Part of a circle, or a straight.
+
+    Attributes:
+        start: where it begins.
+        length_m: of it.
+        curvature_per_m: positive to the right, 0: straight.
+    """
+
+    start: Pose
+    length_m: float
+    curvature_per_m: float
+
+    def positions(self, along_m: FloatArray) -> FloatArray:
+        """(n, 2) east, north at distances (n,) from the start, beyond either end too: chord and half the turn."""
+        half_turn = 0.5 * self.curvature_per_m * along_m
+        chord_m = along_m * np.sinc(half_turn / math.pi)
+        course = self.start.course_rad + half_turn
+        return np.stack(
+            [self.start.east_m + chord_m * np.sin(course), self.start.north_m + chord_m * np.cos(course)], axis=-1
+        )
+
+    @property
+    def end(self) -> Pose:
+        """Where it ends."""
+        east_m, north_m = self.positions(np.array([self.length_m]))[0]
+        turned = self.start.course_rad + self.curvature_per_m * self.length_m
+        return Pose(float(east_m), float(north_m), turned)
+
+
+Way = tuple[Arc, ...]
+
+
+def length_m(way: Way) -> float:
+    """Of a whole way."""
+    return sum(arc.length_m for arc in way)
+
+
+@dataclass(frozen=True, slots=True)
+class Turning:
+    """How tightly one can turn.
+
+    Attributes:
+        radius_m: of any turn.
+        reversal_radius_m: of a turn that another to the other side follows at once.
+        reversal_gap_m: straight between two opposite turns that makes them two.
+    """
+
+    radius_m: float
+    reversal_radius_m: float
+    reversal_gap_m: float
+
+
+def shortest_way(start: Pose, end: Pose, turning: Turning) -> Way:
+    """The shortest way from pose to pose; of no arc where both are the same."""
+    ways = list(_ways(start, end, turning))
+    return min(ways, key=length_m)
+
+
+def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> Way:
+    """The shortest way, made at least ``least_m`` long: by whole circles first, the rest by turning later."""
+    shortest = shortest_way(start, end, turning)
+    missing_m = least_m - length_m(shortest)
+    if missing_m <= 0.0:
+        return shortest
+    circle_m = TURN * turning.radius_m
+    circles = math.floor(missing_m / circle_m)
+    choices = [(*_circles(start, shortest, turning, circles + 1), *shortest)]
+    for on_m in np.linspace(0.0, 0.5 * circle_m, _EXTENSIONS + 1)[1:].tolist():
+        late, early = start.ahead(on_m), end.ahead(-on_m)
+        turn = shortest_way(late, early, turning)
+        longer = (Arc(start, on_m, 0.0), *_circles(late, turn, turning, circles), *turn, Arc(early, on_m, 0.0))
+        if length_m(longer) >= least_m:
+            choices.append(longer)
+    return min(choices, key=length_m)
+
+
+def _circles(start: Pose, way: Way, turning: Turning, count: int) -> Way:
+    """Whole circles, to the side to which the way turns next."""
+    if count == 0:
+        return ()
+    curvature = next((arc.curvature_per_m for arc in way if arc.curvature_per_m != 0.0), 1.0)
+    return (Arc(start, count * TURN * turning.radius_m, math.copysign(1.0 / turning.radius_m, curvature)),)
+
+
+def _ways(start: Pose, end: Pose, turning: Turning) -> Iterator[Way]:
+    """Every word there is, with the radius it must be flown with."""
+    for side in (1, -1):
+        for radius_m in (turning.radius_m, turning.reversal_radius_m):
+            distance_m = math.hypot(end.east_m - start.east_m, end.north_m - start.north_m)
+            bearing = math.atan2(end.east_m - start.east_m, end.north_m - start.north_m)
+            words = _words(
+                side * (start.course_rad - bearing), side * (end.course_rad - bearing), distance_m / radius_m
+            )
+            for turns, parts in words:
+                wide_m = _radius_of(turns, parts[1] * radius_m, turning)
+                if radius_m >= wide_m:
+                    yield _way(start, [side * turn for turn in turns], parts, radius_m)
+
+
+def _radius_of(turns: tuple[int, int, int], middle_m: float, turning: Turning) -> float:
+    """Of a word whose middle part is so long."""
+    reverses = turns[1] != 0 or (turns[0] != turns[2] and middle_m < turning.reversal_gap_m)
+    return turning.reversal_radius_m if reverses else turning.radius_m
+
+
+def _words(
+    alpha: float, beta: float, distance: float
+) -> Iterator[tuple[tuple[int, int, int], tuple[float, float, float]]]:
+    """LSL, LSR and LRL of Shkel and Lumelsky, lengths in radii; their mirror images are the other three."""
+    x, y = distance + math.sin(alpha) - math.sin(beta), math.cos(beta) - math.cos(alpha)
+    between, heading = math.hypot(x, y), math.atan2(y, x)
+    yield (1, 0, 1), (_positive(heading - alpha), between, _positive(beta - heading))
+    if between <= 4.0:
+        middle = TURN - 2.0 * math.asin(between / 4.0)
+        yield (1, -1, 1), (_positive(heading - alpha + middle / 2), middle, _positive(beta - heading + middle / 2))
+    x, y = distance + math.sin(alpha) + math.sin(beta), -math.cos(alpha) - math.cos(beta)
+    if x * x + y * y >= 4.0:
+        straight = math.sqrt(x * x + y * y - 4.0)
+        heading = math.atan2(y, x) + math.atan2(2.0, straight)
+        yield (1, 0, -1), (_positive(heading - alpha), straight, _positive(heading - beta))
+
+
+def _positive(angle_rad: float) -> float:
+    """In [0, 2π)."""
+    angle_rad %= TURN
+    return 0.0 if angle_rad > TURN - _NO_TURN_RAD else angle_rad
+
+
+def _way(start: Pose, turns: list[int], parts: tuple[float, float, float], radius_m: float) -> Way:
+    arcs: list[Arc] = []
+    for turn, part in zip(turns, parts, strict=True):
+        if part > 0.0:
+            arcs.append(Arc(arcs[-1].end if arcs else start, part * radius_m, turn / radius_m))
+    return tuple(arcs)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A way and how it is flown: speed changes evenly in time, and so does height but for a wait at either end.
+
+    Attributes:
+        way: at least one arc.
+        duration_s: of it.
+        speeds_mps: over the ground at its start and end.
+        heights_m: ellipsoidal, at its start and end.
+        wait_s: level flight before and behind the change of height.
+        line: index of the flight line this is, −1: none.
+        airborne: not on the ground.
+    """
+
+    way: Way
+    duration_s: float
+    speeds_mps: tuple[float, float]
+    heights_m: tuple[float, float]
+    wait_s: float = 0.0
+    line: int = -1
+    airborne: bool = True
+
+    @classmethod
+    def over(cls, way: Way, speeds_mps: tuple[float, float], heights_m: tuple[float, float], line: int = -1) -> Leg:
+        """As long as those speeds need."""
+        return cls(way, 2.0 * length_m(way) / sum(speeds_mps), speeds_mps, heights_m, line=line)
+
+    @property
+    def end(self) -> Pose:
+        """Where it ends."""
+        return self.way[-1].end
+
+    def sample(self, time_s: FloatArray) -> FloatArray:
+        """(n, 4) east, north, height, airborne (0 or 1) at times (n,) since its start."""
+        first, last = self.speeds_mps
+        along_m = first * time_s + 0.5 * (last - first) / self.duration_s * time_s**2
+        starts = np.cumsum([0.0, *(arc.length_m for arc in self.way[:-1])])
+        part = np.maximum(np.searchsorted(starts, along_m, side="right") - 1, 0)
+        sampled = np.full((len(time_s), 4), float(self.airborne))
+        for i, arc in enumerate(self.way):
+            sampled[part == i, :2] = arc.positions(along_m[part == i] - starts[i])
+        share = np.clip((time_s - self.wait_s) / (self.duration_s - 2.0 * self.wait_s), 0.0, 1.0)
+        sampled[:, 2] = self.heights_m[0] + share * (self.heights_m[1] - self.heights_m[0])
+        return sampled
+
+
+class Route:
+    """Legs one after the other from time 0; before the first and behind the last it goes on as they begin and end.
+
+    Args:
+        legs: the first and last of them straight or at rest, at constant speed and height.
+    """
+
+    def __init__(self, legs: list[Leg]) -> None:
+        self.legs = tuple(legs)
+        self.starts_s: FloatArray = np.cumsum([0.0, *(leg.duration_s for leg in legs)])
+
+    def sample(self, time_s: FloatArray) -> FloatArray:
+        """(n, 4) east, north, height, airborne (0 or 1) at times (n,), which ascend."""
+        cuts = np.searchsorted(time_s, self.starts_s[1:-1])
+        parts = zip(self.legs, self.starts_s[:-1], np.split(time_s, cuts), strict=True)
+        return np.concatenate([leg.sample(part - start_s) for leg, start_s, part in parts])

@@ -1,0 +1,181 @@
+"""One scanner at work: pulses leave the moving aircraft, meet the scene, come back, are measured and told.
+
+The chain is that of CONVENTIONS' beam, in the direction of the light: s → b → e → site frame, then the scene. A pulse
+leaves and returns at its pose of emission, as ISO/TS 19159-2 Eq. 10 has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim.atmosphere import Air
+from sim.flight import Poses, Trajectory
+from sim.plan_tables import ScannerTable
+from sim.scanners.assembly import Head, Wire
+from sim.scanners.ranging import Ranging
+from sim.scene import Scene
+from sim.shots import Echoes, FloatArray, Pulses, WireUnit
+from sim.site import Site
+from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+
+BLOCK_S = 0.25
+EARTH_RADIUS_M = 6_371_000.0
+LIGHT_MPS = 299_792_458.0
+
+
+@dataclass(frozen=True, slots=True)
+class Beams:
+    """Axes of beams in the site frame, where they start, and the same in e for the truth."""
+
+    origin_e: FloatArray
+    origin: FloatArray
+    direction: FloatArray
+
+
+class Scanner:
+    """One scanner of the plan.
+
+    Args:
+        table: of the plan.
+        head, ranging, wire: its parts.
+        trajectory, scene, site, air: what it flies through.
+        start_gps_ns: of the plan.
+    """
+
+    def __init__(
+        self,
+        table: ScannerTable,
+        head: Head,
+        ranging: Ranging,
+        wire: Wire,
+        trajectory: Trajectory,
+        scene: Scene,
+        site: Site,
+        air: Air,
+        start_gps_ns: int,
+    ) -> None:
+        self._table, self._head, self._ranging, self._wire = table, head, ranging, wire
+        self._trajectory, self._scene, self._site, self._air = trajectory, scene, site, air
+        self._start_gps_ns = start_gps_ns
+        true = table.true
+        self._lever_arm_b = np.array([true.lever_arm_x_m, true.lever_arm_y_m, true.lever_arm_z_m])
+        self._installation = np.array(table.installation)
+        self._boresight_rad = np.radians([true.omega_deg, true.phi_deg, true.kappa_deg])
+
+    def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
+        """Everything until a time, block by block: units in order of time, truth of the returns in them."""
+        for start_s, end_s, laser_on in self._periods(stop_s):
+            if laser_on:
+                for block_s in _cuts(start_s, end_s):
+                    yield self._block(*block_s)
+            else:
+                yield self._wire.idle(start_s, end_s), np.empty(0, RETURN_TRUTH_DTYPE)
+        yield self._wire.close()
+
+    def _periods(self, stop_s: float) -> Iterator[tuple[float, float, bool]]:
+        """(from, to, laser on), one behind the other."""
+        if not self._table.on_lines_only or self._table.kind in ("vlp16", "os1"):
+            yield 0.0, stop_s, True
+            return
+        at_s = 0.0
+        for line in self._trajectory.lines:
+            start_s, end_s = min(line.start_s, stop_s), min(line.end_s, stop_s)
+            yield at_s, start_s, False
+            yield start_s, end_s, True
+            at_s = end_s
+        yield at_s, stop_s, False
+
+    def _block(self, start_s: float, stop_s: float) -> tuple[list[WireUnit], StructArray]:
+        pulses = self._head.pulses(start_s, stop_s)
+        poses = self._trajectory.poses(pulses.time_s)
+        beams = self.beams(pulses, poses)
+        echoes = self._cast(pulses, beams)
+        from_m, to_m = self._heights(beams, echoes)
+        measured = self._ranging.measure(pulses, echoes, from_m, to_m)
+        return self._wire.units(pulses, measured, self._truth(pulses, beams, echoes))
+
+    def beams(self, pulses: Pulses, poses: Poses) -> Beams:
+        """Axes of pulses as they leave (ISO/TS 19159-2 Eq. 10)."""
+        directions_b = self._to_body(pulses.direction_s, pulses.phi_extra_rad)
+        origins_b = self._to_body(pulses.origin_s, pulses.phi_extra_rad) + self._lever_arm_b
+        directions_e = np.einsum("nij,nj->ni", poses.rot_e_from_b, directions_b)
+        origins_e = poses.position_e + np.einsum("nij,nj->ni", poses.rot_e_from_b, origins_b)
+        return Beams(origins_e, self._site.site_from_e(origins_e), directions_e @ self._site.rot_site_from_e.T)
+
+    def _to_body(self, vectors_s: FloatArray, phi_extra_rad: FloatArray) -> FloatArray:
+        """s → b: installation, then κ, φ (each pulse with its own slope), ω."""
+        omega, phi, kappa = self._boresight_rad
+        turned = vectors_s @ self._installation.T @ Rotation.from_euler("z", kappa).as_matrix().T
+        pitched = np.empty_like(turned)
+        cos, sin = np.cos(phi + phi_extra_rad), np.sin(phi + phi_extra_rad)
+        pitched[:, 0] = cos * turned[:, 0] + sin * turned[:, 2]
+        pitched[:, 1] = turned[:, 1]
+        pitched[:, 2] = cos * turned[:, 2] - sin * turned[:, 0]
+        rolled: FloatArray = pitched @ Rotation.from_euler("x", omega).as_matrix().T
+        return rolled
+
+    def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
+        """Echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
+        straight = self._cast_along(pulses, beams, beams.direction)
+        if not self._air.bends:
+            return straight
+        from_m, to_m = self._heights(beams, straight)
+        ground_m = np.where(np.isfinite(to_m[:, -1]), to_m[:, -1], np.nanmean(to_m) if np.isfinite(to_m).any() else 0.0)
+        beams.direction[:] = self._air.bend(beams.direction, self._down(beams.origin), from_m, ground_m)
+        return self._cast_along(pulses, beams, beams.direction)
+
+    def _cast_along(self, pulses: Pulses, beams: Beams, direction: FloatArray) -> Echoes:
+        table = self._table
+        return self._scene.cast(
+            beams.origin,
+            direction,
+            pulses.time_s,
+            pulses.number,
+            1e-3 * table.divergence_mrad,
+            0.5 * LIGHT_MPS * 1e-9 * table.pulse_ns,
+            table.return_slots,
+        )
+
+    def _down(self, origin: FloatArray) -> FloatArray:
+        """(n, 3) the plumb line, to the curvature of a sphere."""
+        down = np.stack([-origin[:, 0], -origin[:, 1], np.full(len(origin), -EARTH_RADIUS_M)], axis=1)
+        unit: FloatArray = down / np.linalg.norm(down, axis=1, keepdims=True)
+        return unit
+
+    def _heights(self, beams: Beams, echoes: Echoes) -> tuple[FloatArray, FloatArray]:
+        """Heights above the ellipsoid of the scanner (n,) and of echoes (n, R), for the air: good to a decimetre."""
+        rho = echoes.range_m
+        x = beams.origin[:, :1] + rho * beams.direction[:, :1]
+        y = beams.origin[:, 1:2] + rho * beams.direction[:, 1:2]
+        z = beams.origin[:, 2:] + rho * beams.direction[:, 2:]
+        above = beams.origin[:, 2] + (beams.origin[:, 0] ** 2 + beams.origin[:, 1] ** 2) / (2 * EARTH_RADIUS_M)
+        return above, z + (x**2 + y**2) / (2 * EARTH_RADIUS_M)
+
+    def _truth(self, pulses: Pulses, beams: Beams, echoes: Echoes) -> StructArray:
+        """(n, R) rows; those of empty slots mean nothing."""
+        rows = np.zeros(echoes.range_m.shape, RETURN_TRUTH_DTYPE)
+        directions_e = beams.direction @ self._site.rot_site_from_e
+        points_e = beams.origin_e[:, np.newaxis] + echoes.range_m[:, :, np.newaxis] * directions_e[:, np.newaxis]
+        rows["gps_ns"] = (self._start_gps_ns + np.rint(1e9 * pulses.time_s).astype(np.int64))[:, np.newaxis]
+        rows["point_e"] = points_e
+        rows["range_m"] = echoes.range_m
+        rows["pulse"] = pulses.number[:, np.newaxis]
+        rows["incidence_rad"] = echoes.incidence_rad
+        rows["strip"] = self._trajectory.line_at(pulses.time_s)[:, np.newaxis]
+        rows["channel"] = pulses.channel[:, np.newaxis]
+        rows["return_number"] = np.arange(1, echoes.range_m.shape[1] + 1)
+        rows["surface"] = echoes.surface
+        return rows
+
+
+def _cuts(start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:
+    """The time between, cut at whole multiples of a block."""
+    at_s = start_s
+    while at_s < stop_s:
+        next_s = min(stop_s, (np.floor(at_s / BLOCK_S + 1e-9) + 1) * BLOCK_S)
+        yield at_s, float(next_s)
+        at_s = float(next_s)

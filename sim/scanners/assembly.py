@@ -1,0 +1,51 @@
+"""Which head and which wire a kind of scanner has."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from sim.clocks import PulsePerSecond
+from sim.faults import windows
+from sim.flight import Trajectory
+from sim.plan import Plan
+from sim.scanners.line_heads import LineHead
+from sim.scanners.ouster_wire import OusterWire
+from sim.scanners.spinning_heads import Os1Head, Vlp16Head
+from sim.scanners.srep_wire import SrepWire
+from sim.scanners.velodyne_wire import VelodyneWire
+from sim.shots import Measured, Pulses, WireUnit
+from sim.truth import StructArray
+
+
+class Head(Protocol):
+    """Where pulses come from."""
+
+    def pulses(self, start_s: float, stop_s: float) -> Pulses:
+        """Those that leave in this time."""
+
+
+class Wire(Protocol):
+    """What the scanner says of them."""
+
+    def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
+        """Datagrams that are complete, and the truth of their returns."""
+
+    def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
+        """What is said while the laser is off."""
+
+    def close(self) -> tuple[list[WireUnit], StructArray]:
+        """What is left."""
+
+
+def head_and_wire(plan: Plan, name: str, pps: PulsePerSecond | None, trajectory: Trajectory) -> tuple[Head, Wire]:
+    """The parts of a scanner of the plan; raises `PlanError`."""
+    tables = plan.tables
+    table = tables.scanner[name]
+    lost_pps = windows(tables, f"scanner/{name}", "pps_lost")
+    if table.kind == "vlp16":
+        return Vlp16Head(table, name), VelodyneWire(plan, name, pps, trajectory, lost_pps)
+    if table.kind == "os1":
+        return Os1Head(table, name), OusterWire(plan, name, pps, lost_pps)
+    flight = tables.flight
+    wire = SrepWire(table, name, pps, tables.host, flight.seed, noise=flight.noise, lost_pps=lost_pps)
+    return LineHead(table, name), wire

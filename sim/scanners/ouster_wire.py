@@ -1,0 +1,187 @@
+"""What an Ouster OS1 says: its metadata, and lidar packets, single (strongest) or dual return.
+
+Packets by `drivers.scanner.ouster_layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second a
+pulse since power-on (`sim.scanners.spinning_wire.HeadClock`).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.scanner.ouster_head import SYNC_PULSE, read_head
+from drivers.scanner.ouster_layout import LidarLayout
+from sim.clocks import PulsePerSecond
+from sim.errors import PlanError
+from sim.plan import Plan
+from sim.plan_tables import ScannerTable
+from sim.scanners.spinning_wire import Arrivals, HeadClock, PacketCutter, Windows, head_config, two_returns
+from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+
+COLUMNS = 1024  # of a turn
+COLUMNS_OF_PACKET = 16
+BEAMS = 64
+NANOSECOND_HZ = 1_000_000_000
+RANGE_UNIT_M = 0.001
+RANGE_MAX_RAW = (1 << 19) - 1
+SERIAL_BITS = 40
+FRAME_IDS = 1 << 16
+HALF_FIELD_DEG = 16.6  # of an OS1-64, evenly filled
+STAGGER_DEG = (4.23, 1.41, -1.41, -4.23)  # four columns of diodes behind the lens
+STAGGER_COLUMNS = (24, 16, 8, 0)  # by which rows of the image are shifted against each other
+BEAM_ORIGIN_MM = 15.806
+LIDAR_ABOVE_SENSOR_MM = 36.18
+IMU_IN_SENSOR_MM = (6.253, -11.775, 7.645)
+INITIALIZATION_ID = 4_711
+
+
+def os1_metadata(table: ScannerTable) -> bytes:
+    """The metadata of the plan's head as its HTTP interface gives it: JSON, in sections, as of firmware 2.5.
+
+    Args:
+        table: of the plan.
+    """
+    x_mm, y_mm, z_mm = IMU_IN_SENSOR_MM
+    profile = "RNG19_RFL8_SIG16_NIR16_DUAL" if table.dual_return else "RNG19_RFL8_SIG16_NIR16"
+    lidar_mode = f"{COLUMNS}x{table.scan_hz:.0f}"
+    document = {
+        "sensor_info": {
+            "prod_line": f"OS-1-{BEAMS}",
+            "prod_sn": table.serial,
+            "image_rev": "simulated",
+            "initialization_id": INITIALIZATION_ID,
+            "status": "RUNNING",
+        },
+        "beam_intrinsics": {
+            "beam_altitude_angles": np.round(np.linspace(HALF_FIELD_DEG, -HALF_FIELD_DEG, BEAMS), 3).tolist(),
+            "beam_azimuth_angles": list(STAGGER_DEG) * (BEAMS // 4),
+            "lidar_origin_to_beam_origin_mm": BEAM_ORIGIN_MM,
+            "beam_to_lidar_transform": [1, 0, 0, BEAM_ORIGIN_MM, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
+        },
+        "lidar_intrinsics": {
+            "lidar_to_sensor_transform": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, LIDAR_ABOVE_SENSOR_MM, 0, 0, 0, 1]
+        },
+        "imu_intrinsics": {"imu_to_sensor_transform": [1, 0, 0, x_mm, 0, 1, 0, y_mm, 0, 0, 1, z_mm, 0, 0, 0, 1]},
+        "lidar_data_format": {
+            "columns_per_frame": COLUMNS,
+            "columns_per_packet": COLUMNS_OF_PACKET,
+            "pixels_per_column": BEAMS,
+            "pixel_shift_by_row": list(STAGGER_COLUMNS) * (BEAMS // 4),
+            "column_window": [0, COLUMNS - 1],
+            "udp_profile_lidar": profile,
+            "udp_profile_imu": "LEGACY",
+        },
+        "config_params": {"lidar_mode": lidar_mode, "timestamp_mode": SYNC_PULSE, "udp_profile_lidar": profile},
+    }
+    return json.dumps(document, indent=2).encode()
+
+
+class OusterWire:
+    """Makes the packets of one head.
+
+    Args:
+        plan: of the flight.
+        name: of the scanner.
+        pps: wired to SYNC_PULSE_IN; None: nothing is.
+        lost_pps: (from, to) in which the head gets no pulse.
+
+    Raises:
+        PlanError: a serial number that its packets cannot carry.
+    """
+
+    def __init__(self, plan: Plan, name: str, pps: PulsePerSecond | None, lost_pps: Windows = ()) -> None:
+        table = plan.tables.scanner[name]
+        _check_serial(table.serial, f"scanner.{name}.serial")
+        self._source, self._dual = f"scanner/{name}", table.dual_return
+        self._layout = LidarLayout(read_head(os1_metadata(table)))
+        offset_s = 1e-6 * table.true.time_offset_us
+        self._clock = HeadClock(NANOSECOND_HZ, table.oscillator, pps, lost_pps, offset_s, None)
+        self._cutter = PacketCutter(COLUMNS_OF_PACKET * BEAMS)
+        self._arrivals = Arrivals(plan, self._source)
+
+    def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
+        """Packets that are complete, and the truth of their returns in the order in which `OusterParser` gives them.
+
+        Args:
+            pulses: of `Os1Head`, consecutive.
+            measured: of them, (n, R).
+            truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
+        """
+        raw = np.rint(measured.range_m / RANGE_UNIT_M)
+        raw = np.where((raw >= 1) & (raw <= RANGE_MAX_RAW), raw, 0).astype(np.int64)
+        light = np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
+        number, time_s, raw, light, truth = self._cutter.take([pulses.number, pulses.time_s, raw, light, truth])
+        if len(number) == 0:
+            return [], np.empty(0, RETURN_TRUTH_DTYPE)
+        slots = two_returns(np.where(raw > 0, light, -1))[: 2 if self._dual else 1]
+        fields: dict[str, IntArray] = {}
+        for slot, which in zip(slots, ("", "2"), strict=False):
+            fields[f"RANGE{which}"] = _picked(raw, slot)
+            # the parser's intensity is the signal: it and the reflectivity are what the receiver says
+            fields[f"SIGNAL{which}"] = fields[f"REFLECTIVITY{which}"] = _picked(light, slot)
+        return self._packets(number, time_s, fields), _truth(raw, slots, truth)
+
+    def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
+        """A head that does not fire says nothing."""
+        return []
+
+    def close(self) -> tuple[list[WireUnit], StructArray]:
+        """A packet that is not full is not sent."""
+        return [], np.empty(0, RETURN_TRUTH_DTYPE)
+
+    def _packets(self, number: IntArray, time_s: FloatArray, fields: dict[str, IntArray]) -> list[WireUnit]:
+        """Packets of pulses (n,) with these fields (n,)."""
+        shape = (-1, COLUMNS_OF_PACKET, BEAMS)
+        shaped = {name: values.reshape(shape) for name, values in fields.items()}
+        fired_s = time_s.reshape(shape)[:, :, 0]
+        stamps = self._clock.ticks(fired_s.reshape(-1)).reshape(fired_s.shape)
+        column = number.reshape(shape)[:, 0, 0] // BEAMS
+        frames, places = (column // COLUMNS % FRAME_IDS).tolist(), (column % COLUMNS).tolist()
+        arrived_s = self._arrivals.times(fired_s[:, -1])
+        units = []
+        for at in range(len(fired_s)):
+            content = {name: values[at] for name, values in shaped.items()}
+            data = self._layout.encode(frames[at], places[at], stamps[at], content)
+            units.append(WireUnit(arrived_s[at], self._source, data))
+        return units
+
+
+def _picked(values: IntArray, slot: IntArray) -> IntArray:
+    """(n,) of values (n, R) in these slots (n,); 0 where it is −1."""
+    return np.where(slot >= 0, values[np.arange(len(values)), slot], 0)
+
+
+def _truth(raw: IntArray, slots: tuple[NDArray[np.int64], ...], truth: StructArray) -> StructArray:
+    """Truth of the returns in these slots, (n,) each, flattened: pulse by pulse, of two the nearer first."""
+    pulse = np.arange(len(raw))
+    rows = np.stack([truth[pulse, slot] for slot in slots], axis=1)
+    there = np.stack([slot >= 0 for slot in slots], axis=1)
+    rows["return_number"] = 1
+    if len(slots) == 2:
+        two = there[:, 1]
+        turned = two & (raw[pulse, slots[1]] < raw[pulse, slots[0]])
+        rows[turned] = rows[turned][:, ::-1]
+        rows["return_number"][two, 1] = 2
+    flat: StructArray = rows[there]
+    return flat
+
+
+def _check_serial(serial: str, key: str) -> None:
+    """A number of digits must be read back from packets as it stands; other texts are none to a head."""
+    if serial.isdecimal() and (str(int(serial)) != serial or int(serial) >= 1 << SERIAL_BITS):
+        raise PlanError(key, f'got "{serial}", want a number below 2^{SERIAL_BITS} without leading zeros')
+
+
+def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, Any]:
+    """``[scanner.<name>]`` of the configuration that records this head; its metadata beside it is ``<name>.json``.
+
+    Args:
+        table: of the plan.
+        name: of the scanner.
+        transport: where its packets go.
+    """
+    return head_config(table, transport, "ouster") | {"geometry": {"file": f"{name}.json"}}

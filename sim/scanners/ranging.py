@@ -1,0 +1,197 @@
+"""The receiver: what it says of echoes — ranges with every error of CONVENTIONS' model, intensities, pulse widths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.atmosphere import Air
+from sim.clocks import generator
+from sim.errors import PlanError
+from sim.plan_tables import ScannerTable
+from sim.shots import Echoes, Measured, Pulses
+from sim.truth import StructArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+LIGHT_MPS = 299_792_458.0
+THRESHOLD = 0.005  # of full intensity: weaker echoes are not detected
+STEEPEST_RAD = np.radians(85.0)  # flatter incidence is taken for this one, so that no footprint has infinite depth
+LARGEST_SCALE_PPM = 100_000.0
+_SLOTS = 16  # more than any scanner has
+
+
+@dataclass(frozen=True, slots=True)
+class IntensityScale:
+    """Counts of a receiver.
+
+    Attributes:
+        full: of a surface of reflectance 1 at the reference range, met perpendicularly, in clear air.
+        most: where it saturates.
+    """
+
+    full: float
+    most: float
+
+
+LINE_SCANNER = IntensityScale(4000.0, 65_535.0)
+SPINNING_HEAD = IntensityScale(100.0, 255.0)  # as Velodyne: 100 is white paper, above are retroreflectors
+
+
+class Ranging:
+    """A scanner's receiver.
+
+    Args:
+        table: of the plan.
+        air: on the way.
+        seed, name: of its noise.
+        noise: False: ranges without noise.
+        intensity: its counts; None: by the kind.
+
+    Raises:
+        PlanError: a range gate without width, intensities of ``ibrc`` out of order.
+    """
+
+    def __init__(
+        self,
+        table: ScannerTable,
+        air: Air,
+        seed: int,
+        name: str,
+        noise: bool,
+        intensity: IntensityScale | None = None,
+    ) -> None:
+        self._table, self._air, self._noise = table, air, noise
+        self._spinning = table.kind in ("vlp16", "os1")
+        self._counts = intensity or (SPINNING_HEAD if self._spinning else LINE_SCANNER)
+        self._key = generator(seed, "ranging", name).integers(2**64, dtype=np.uint64)
+        self._scale = 1.0 + 1e-6 * table.true.range_scale_ppm
+        self._beam_m = _beam_corrections(table) if self._spinning else np.zeros(1)
+        _check(table, f"scanner.{name}")
+
+    def measure(self, pulses: Pulses, echoes: Echoes, from_height_m: FloatArray, to_height_m: FloatArray) -> Measured:
+        """What the device says.
+
+        Args:
+            pulses: n.
+            echoes: of them, R slots.
+            from_height_m: (n,) of the scanner, to_height_m (n, R) of the echoes, for the air.
+
+        Returns:
+            slots as those of the echoes, which keep their places: a slot whose echo is too weak or outside the range
+            gate has range, intensity and width 0, also before one that has not (`packed` closes such gaps).
+        """
+        pulse, slot = np.nonzero(np.isfinite(echoes.range_m))
+        range_m, incidence = echoes.range_m[pulse, slot], echoes.incidence_rad[pulse, slot]
+        intensity = self._intensity(range_m, echoes.reflectance[pulse, slot])
+        depth_m = 1e-3 * self._table.divergence_mrad * range_m * np.tan(np.minimum(incidence, STEEPEST_RAD))
+        said_m = self._model_range(range_m, intensity, pulses.channel[pulse])
+        said_m = self._air.device_range(said_m, from_height_m[pulse], to_height_m[pulse, slot])
+        if self._noise:
+            said_m = said_m + self._sigma_m(intensity, depth_m) * _gauss(self._key, pulses.number[pulse], slot)
+        width_ns = self._table.pulse_ns + 2e9 / LIGHT_MPS * depth_m
+        there = intensity >= max(1.0, THRESHOLD * self._counts.full)
+        there &= (said_m > 0.0) & (said_m >= self._table.range_min_m) & (said_m <= self._table.range_max_m)
+        placed = np.zeros((3, *echoes.range_m.shape))
+        placed[:, pulse[there], slot[there]] = said_m[there], intensity[there], width_ns[there]
+        return Measured(range_m=placed[0], intensity=placed[1], pulse_width_ns=placed[2])
+
+    def _intensity(self, range_m: FloatArray, reflectance: FloatArray) -> FloatArray:
+        """(k,) whole counts: reflectance by the square of the distance and what the air leaves of it."""
+        near = np.maximum(range_m, 1e-3)  # an echo at the scanner itself is bright, not infinite
+        power = reflectance * (self._table.reference_range_m / near) ** 2 * self._air.transmission(range_m)
+        counts: FloatArray = np.clip(np.rint(self._counts.full * power), 0.0, self._counts.most)
+        return counts
+
+    def _model_range(self, range_m: FloatArray, intensity: FloatArray, channel: NDArray[np.uint16]) -> FloatArray:
+        """(k,) ρ_measured of CONVENTIONS: ρ = (1 + range_scale) ρ_measured + range_offset − ibrc(intensity).
+
+        A beam's own correction is added to the offset, as the calibration's other tables are.
+        """
+        offset_m = self._table.true.range_offset_m + self._beam_m[np.minimum(channel, len(self._beam_m) - 1)]
+        if self._table.ibrc is not None:
+            offset_m = offset_m - np.interp(intensity, self._table.ibrc.intensity, self._table.ibrc.correction_m)
+        measured_m: FloatArray = (range_m - offset_m) / self._scale
+        return measured_m
+
+    def _sigma_m(self, intensity: FloatArray, depth_m: FloatArray) -> FloatArray:
+        """(k,) of the noise: less for bright echoes, more where the footprint lies on a slope."""
+        noise = self._table.range_noise
+        weak = 0.1 * self._counts.full / np.maximum(intensity, 1.0)
+        sigma: FloatArray = np.sqrt(noise.sigma_m**2 * weak + (noise.footprint * depth_m) ** 2)
+        return sigma
+
+
+def packed(measured: Measured, truth: StructArray) -> tuple[Measured, StructArray]:
+    """The same, nearest first, slots without a return at the end; ``truth`` (n, R) goes along, renumbered.
+
+    Args:
+        measured: of n pulses.
+        truth: `sim.truth.RETURN_TRUTH_DTYPE`, same slots.
+    """
+    key = np.where(measured.range_m > 0.0, measured.range_m, np.inf)
+    with np.errstate(invalid="ignore"):
+        mixed = np.flatnonzero((np.diff(key, axis=1) < 0.0).any(axis=1))
+    if not len(mixed):
+        return measured, truth
+    order = np.argsort(key[mixed], axis=1, kind="stable")
+    columns = []
+    for values in (measured.range_m, measured.intensity, measured.pulse_width_ns):
+        values = values.copy()
+        values[mixed] = np.take_along_axis(values[mixed], order, axis=1)
+        columns.append(values)
+    truth = truth.copy()
+    truth[mixed] = np.take_along_axis(truth[mixed], order, axis=1)
+    truth["return_number"][mixed] = np.arange(1, truth.shape[1] + 1)
+    return Measured(*columns), truth
+
+
+def _check(table: ScannerTable, key: str) -> None:
+    if table.range_min_m >= table.range_max_m:
+        text = f"got {table.range_min_m:g}, want less than range_max_m = {table.range_max_m:g}"
+        raise PlanError(f"{key}.range_min_m", text)
+    if abs(table.true.range_scale_ppm) > LARGEST_SCALE_PPM:
+        text = f"got {table.true.range_scale_ppm:g}, want {-LARGEST_SCALE_PPM:g} to {LARGEST_SCALE_PPM:g}"
+        raise PlanError(f"{key}.true.range_scale_ppm", text)
+    if table.ibrc is None:
+        return
+    intensity, correction = table.ibrc.intensity, table.ibrc.correction_m
+    if len(correction) != len(intensity):
+        text = f"has {len(correction)} values, want {len(intensity)}: one for each of ibrc.intensity"
+        raise PlanError(f"{key}.ibrc.correction_m", text)
+    for before, after in pairwise(intensity):
+        if after <= before:
+            raise PlanError(f"{key}.ibrc.intensity", f"{after:g} stands behind {before:g}, want increasing values")
+
+
+def _beam_corrections(table: ScannerTable) -> FloatArray:
+    """(channels + 1,) ``range_m`` of every beam; the last one, of all others, is 0."""
+    corrections = np.zeros(max((beam.channel for beam in table.beam), default=-1) + 2)
+    for beam in table.beam:
+        corrections[beam.channel] += beam.range_m
+    return corrections
+
+
+def _gauss(key: np.uint64, number: IntArray, slot: IntArray) -> FloatArray:
+    """(k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
+
+    Counters through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through Box and Muller.
+    """
+    counter = (number * _SLOTS + slot).astype(np.uint64)
+    first = _mixed(_mixed(counter) ^ key)
+    radius = np.sqrt(-2.0 * np.log(((first >> np.uint64(11)) + np.uint64(1)).astype(np.float64) * 2.0**-53))
+    turn = (_mixed(first) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    normal: FloatArray = radius * np.cos(2 * np.pi * turn)
+    return normal
+
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    mixed = values + np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return mixed ^ (mixed >> np.uint64(31))

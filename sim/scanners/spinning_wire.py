@@ -1,0 +1,170 @@
+"""What the wires of spinning heads have in common: a clock set by PPS, packets cut out of pulses, the host's stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.clocks import Oscillator, PulsePerSecond, generator
+from sim.plan import Plan
+from sim.plan_tables import OscillatorTable, ScannerTable
+from sim.shots import FloatArray, IntArray
+
+Windows = Sequence[tuple[float, float]]
+
+START_UP_S = 30  # from power-on to the plan's start, when a head has long been turning
+PROCESSING_S = 100e-6  # from a packet's last firing to the host
+PPS_ABSENT, PPS_SYNCHRONIZING, PPS_LOCKED = range(3)  # as Velodyne's table 9-4 numbers them
+
+
+class HeadClock:
+    """The counter a head stamps with: set by the pulse each second, else free-running.
+
+    Two pulses in a row lock it. While it is locked it shows the true time less ``time_offset``. Where a pulse does not
+    come it goes on from there by its oscillator; where none has come yet it counts from power-on.
+
+    Args:
+        tick_hz: of the stamps.
+        oscillator: of the head; its ``ticks_at_start`` are such ticks and added to those of `START_UP_S`.
+        pps: wired to it; None: nothing is.
+        lost: (from, to) in which it gets no pulse; one that begins at 0 has none before it either.
+        offset_s: time_offset.
+        second: shown at the plan's start while locked; None: it goes on counting the seconds since power-on.
+    """
+
+    def __init__(
+        self,
+        tick_hz: int,
+        oscillator: OscillatorTable,
+        pps: PulsePerSecond | None,
+        lost: Windows,
+        offset_s: float,
+        second: int | None,
+    ) -> None:
+        self._hz, self._oscillator = tick_hz, Oscillator(tick_hz, oscillator)
+        self._pps, self._lost, self._offset_s = pps, tuple(lost), offset_s
+        self._at_start = START_UP_S * tick_hz
+        counted = START_UP_S + round(oscillator.ticks_at_start / tick_hz)
+        self._second = counted if second is None else second
+        self._status = np.zeros(0, np.int64)  # of second −1, 0, 1, …
+        self._anchor = np.zeros(0, np.int64)  # latest second at which it was locked, −2: none
+
+    def ticks(self, time_s: FloatArray) -> IntArray:
+        """(n,) its reading at true times (n,), whole ticks."""
+        time_s = np.asarray(time_s, np.float64)
+        free = self._oscillator.ticks(time_s) + self._at_start
+        if self._pps is None:
+            return free
+        status, anchor = self._of(self._pps, time_s)
+        locked = status == PPS_LOCKED
+        since_s = np.where(locked, 0.0, anchor + 1.0)  # a lost pulse is the first thing it does not know of
+        held = self._hz * (since_s - self._offset_s) + self._oscillator.phase(time_s) - self._oscillator.phase(since_s)
+        shown = np.where(locked, self._hz * (time_s - self._offset_s), held)
+        whole = np.floor(shown).astype(np.int64) + self._second * self._hz
+        return np.where(locked | (anchor > -2), whole, free)
+
+    def status(self, time_s: FloatArray) -> IntArray:
+        """(n,) of the pulse at true times (n,): `PPS_ABSENT`, `PPS_SYNCHRONIZING` or `PPS_LOCKED`."""
+        time_s = np.asarray(time_s, np.float64)
+        return np.full(time_s.shape, PPS_ABSENT) if self._pps is None else self._of(self._pps, time_s)[0]
+
+    def _of(self, pps: PulsePerSecond, time_s: FloatArray) -> tuple[IntArray, IntArray]:
+        """Status and anchor of the seconds that times (n,) lie in."""
+        second = pps.latest(time_s)
+        if len(second) and int(second.max()) + 2 > len(self._status):
+            self._follow(pps, 2 * int(second.max()) + 64)
+        return self._status[second + 1], self._anchor[second + 1]
+
+    def _follow(self, pps: PulsePerSecond, seconds: int) -> None:
+        """Status and anchor of every second up to this one."""
+        edges = pps.edges(np.arange(seconds))
+        came = np.ones(seconds + 2, np.bool_)  # of second −2, −1, 0, …
+        for start_s, stop_s in self._lost:
+            came[2:] &= (edges < start_s) | (edges >= stop_s)
+            came[:2] &= start_s > 0.0
+        self._status = np.where(came[1:], np.where(came[:-1], PPS_LOCKED, PPS_SYNCHRONIZING), PPS_ABSENT)
+        seconds_from = np.arange(-1, seconds)
+        self._anchor = np.maximum.accumulate(np.where(self._status == PPS_LOCKED, seconds_from, -2))
+
+
+class PacketCutter:
+    """Cuts the columns of consecutive pulses into whole packets; what is left waits.
+
+    Args:
+        pulses: of a packet; packets begin at whole multiples of it.
+    """
+
+    def __init__(self, pulses: int) -> None:
+        self._pulses = pulses
+        self._waiting: list[NDArray[Any]] | None = None
+
+    def take(self, columns: list[NDArray[Any]]) -> list[NDArray[Any]]:
+        """Whole packets of columns (n, …), whose first is the pulses' number; (k · pulses, …) each."""
+        number, waiting = columns[0], self._waiting
+        if waiting is not None and len(number) and number[0] == waiting[0][0] + len(waiting[0]):
+            columns = [np.concatenate(pair) for pair in zip(waiting, columns, strict=True)]
+        elif waiting is not None and not len(number):
+            columns = waiting
+        number = columns[0]
+        begin = int(-number[0] % self._pulses) if len(number) else 0
+        end = begin + (max(len(number) - begin, 0) // self._pulses) * self._pulses
+        # copies: a view would keep the whole block
+        self._waiting = [column[end:].copy() for column in columns] if len(number) > end else None
+        return [column[begin:end] for column in columns]
+
+
+class Arrivals:
+    """When the host stamps the datagrams of one source: their sending, the network's jitter, never out of order.
+
+    Args:
+        plan: of the flight.
+        source: whose datagrams.
+    """
+
+    def __init__(self, plan: Plan, source: str) -> None:
+        self._mean_s = 1e-6 * plan.tables.host.udp_jitter_us if plan.tables.flight.noise else 0.0
+        self._rng = generator(plan.tables.flight.seed, "udp", source)
+        self._latest_s = -np.inf
+
+    def times(self, sent_s: FloatArray) -> list[float]:
+        """(n,) of datagrams in order, whose last firing was at ``sent_s`` (n,)."""
+        jitter_s = self._rng.exponential(size=len(sent_s)) * self._mean_s
+        arrived = np.maximum.accumulate(np.concatenate([[self._latest_s], sent_s + PROCESSING_S + jitter_s]))
+        self._latest_s = float(arrived[-1])
+        times_s: list[float] = arrived[1:].tolist()
+        return times_s
+
+
+def two_returns(rank: NDArray[Any], first: NDArray[Any] | None = None) -> tuple[IntArray, IntArray]:
+    """Slots (n,) of the greatest rank of each pulse, and of the greatest of the others; −1 where there is none.
+
+    Args:
+        rank: (n, R), −1 where a slot has no return; of equal ones the first slot's goes before.
+        first: (n,) the first slot where it is known already.
+    """
+    rows = np.arange(len(rank))
+    if first is None:
+        first = np.where(rank.max(axis=1) >= 0, rank.argmax(axis=1), -1)
+    others = rank.copy()
+    others[rows, first] = -1
+    second = np.where(others.max(axis=1) >= 0, others.argmax(axis=1), -1)
+    return first, np.where(first >= 0, second, -1)
+
+
+def head_config(table: ScannerTable, transport: str, protocol: str) -> dict[str, Any]:
+    """``[scanner.<name>]`` of the recording configuration, as far as all spinning heads have it."""
+    nominal = table.nominal
+    config = {
+        "transport": transport,
+        "protocol": protocol,
+        "model": table.model,
+        "serial": table.serial,
+        "installation": table.installation,
+        "lever_arm_m": [nominal.lever_arm_x_m, nominal.lever_arm_y_m, nominal.lever_arm_z_m],
+        "range_min_m": table.range_min_m,
+        "range_max_m": table.range_max_m,
+    }
+    return config | ({"pps": table.pps} if table.pps is not None else {})

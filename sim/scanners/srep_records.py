@@ -1,0 +1,220 @@
+"""Pulse records of SREP: which echo stands in which record, with whole ranges or with apparent ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.scanner.srep_layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
+from sim.plan_tables import ScannerTable
+from sim.scanners.line_heads import emission_ticks
+from sim.scanners.ranging import LIGHT_MPS, packed
+from sim.shots import Measured, Pulses
+from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_U16, _U32 = 2**16 - 1, 2**32 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """n records as they go on the wire, in order.
+
+    Attributes:
+        ticks: (n,) of the emission, from the plan's start.
+        time_s: (n,) its true time.
+        zone: (n,) byte 15 of the datagram it belongs into.
+        body: (n,) `pulse_dtype`, ``ticks`` still to be counted from the datagram's first.
+        truth: (k,) of the returns in them, by record, then by slot.
+    """
+
+    ticks: IntArray
+    time_s: FloatArray
+    zone: IntArray
+    body: StructArray
+    truth: StructArray
+
+    def __len__(self) -> int:
+        """Number of records."""
+        return len(self.ticks)
+
+    def split(self, at: int) -> tuple[Records, Records]:
+        """The first so many, and the others."""
+        returns = np.count_nonzero(self.body["slot"]["range"][:at])
+        return (
+            Records(self.ticks[:at], self.time_s[:at], self.zone[:at], self.body[:at], self.truth[:returns]),
+            Records(self.ticks[at:], self.time_s[at:], self.zone[at:], self.body[at:], self.truth[returns:]),
+        )
+
+    def followed_by(self, other: Records) -> Records:
+        """These and others."""
+        if not len(self):
+            return other
+        return Records(
+            np.concatenate([self.ticks, other.ticks]),
+            np.concatenate([self.time_s, other.time_s]),
+            np.concatenate([self.zone, other.zone]),
+            np.concatenate([self.body, other.body]),
+            np.concatenate([self.truth, other.truth]),
+        )
+
+
+def no_records(return_slots: int) -> Records:
+    """None."""
+    none = np.zeros(0, np.int64)
+    return Records(none, np.zeros(0), none, np.zeros(0, pulse_dtype(return_slots)), np.zeros(0, RETURN_TRUTH_DTYPE))
+
+
+class RecordMaker(Protocol):
+    """Puts what is measured into records."""
+
+    lost_echoes: int
+
+    def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
+        """Records that are complete with these pulses."""
+
+    def rest(self) -> Records:
+        """Records of pulses after which none follows for long."""
+
+
+class WholeRanges:
+    """Ranges as they are, each in the record of its own pulse; a pulse's zone is that of its first return.
+
+    Zone z holds ranges from z to z + 1 times c / (2 prf) (FORMULAS 3.3, z = k − 1, c of vacuum); a pulse without a
+    return belongs to the zone of the one before.
+    """
+
+    def __init__(self, table: ScannerTable) -> None:
+        self.lost_echoes = 0
+        self._table = table
+        self._zone = 0
+        self._zone_m = LIGHT_MPS / (2.0 * table.prf_hz)
+
+    def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
+        """A record for every pulse."""
+        measured, truth = packed(measured, truth)
+        body = np.zeros(len(pulses), pulse_dtype(measured.range_m.shape[1]))
+        body["encoder"] = pulses.encoder
+        _fill(body["slot"], measured.range_m, measured.intensity, measured.pulse_width_ns)
+        ticks, zones = emission_ticks(self._table, pulses.number), self._zones(measured.range_m[:, 0])
+        rows = truth.reshape(-1).take(np.flatnonzero(body["slot"]["range"]))
+        return Records(ticks, pulses.time_s, zones, body, rows)
+
+    def rest(self) -> Records:
+        """None wait."""
+        return no_records(self._table.return_slots)
+
+    def _zones(self, first_m: FloatArray) -> IntArray:
+        zones = np.concatenate([[self._zone], np.floor(first_m / self._zone_m).astype(np.int64)])
+        known = np.arange(len(zones))
+        known[1:][first_m <= 0.0] = 0
+        zones = zones[np.maximum.accumulate(known)]
+        self._zone = int(zones[-1])
+        return zones[1:]
+
+
+class ApparentRanges:
+    """Ranges from the last emission before the echo, each in that emission's record.
+
+    Ticks are the device's own: it takes its counter's nominal rate and c of vacuum to turn them into metres. A record
+    is complete when the next pulse has left. Of more echoes than it has slots the latest are lost, so are those that
+    come at an emission itself, whose range would be 0; ``lost_echoes`` counts both.
+    """
+
+    def __init__(self, table: ScannerTable) -> None:
+        self.lost_echoes = 0
+        self._table = table
+        self._metres_per_tick = LIGHT_MPS / (2.0 * table.tick_hz)
+        self._emissions = _Emissions(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
+        self._flying = _Flying(np.zeros(0, np.int64), np.zeros((3, 0)), np.zeros(0, RETURN_TRUTH_DTYPE))
+
+    def take(self, pulses: Pulses, measured: Measured, truth: StructArray) -> Records:
+        """Records of all pulses but the last, into which echoes may still come."""
+        ticks = emission_ticks(self._table, pulses.number)
+        index = np.flatnonzero(measured.range_m > 0.0)
+        columns = (measured.range_m, measured.intensity, measured.pulse_width_ns)
+        said = np.stack([values.reshape(-1).take(index) for values in columns])
+        come = _Flying(ticks.take(index // measured.range_m.shape[1]), said, truth.reshape(-1).take(index))
+        self._emissions = self._emissions.followed_by(_Emissions(ticks, pulses.time_s, pulses.encoder))
+        self._flying = self._flying.followed_by(come)
+        return self._complete(len(self._emissions.ticks) - 1)
+
+    def rest(self) -> Records:
+        """The last one."""
+        return self._complete(len(self._emissions.ticks))
+
+    def _complete(self, n: int) -> Records:
+        """The first n records; what belongs to later ones waits."""
+        if n <= 0:
+            return no_records(self._table.return_slots)
+        emissions, flying = self._emissions, self._flying
+        flight = np.floor(flying.said[0] / self._metres_per_tick).astype(np.int64)
+        record = np.searchsorted(emissions.ticks, flying.from_ticks + flight, side="right") - 1
+        apparent_m = flying.said[0] - (emissions.ticks[record] - flying.from_ticks) * self._metres_per_tick
+        self._emissions, self._flying = emissions.after(n), flying.chosen(np.flatnonzero(record >= n))
+        echo, slot = self._slots(record, apparent_m, n)
+        cells = np.zeros((3, n, self._table.return_slots))
+        cells[:, record[echo], slot] = apparent_m[echo], *flying.said[1:, echo]
+        body = np.zeros(n, pulse_dtype(self._table.return_slots))
+        body["encoder"] = emissions.encoder[:n]
+        _fill(body["slot"], *cells)
+        zones = np.full(n, ZONE_UNKNOWN)
+        return Records(emissions.ticks[:n], emissions.time_s[:n], zones, body, flying.truth.take(echo))
+
+    def _slots(self, record: IntArray, apparent_m: FloatArray, n: int) -> tuple[IntArray, IntArray]:
+        """Which echoes find a slot in the first n records, and which slot: in the order in which they come."""
+        come = np.flatnonzero(record < n)
+        seen = come[np.rint(apparent_m[come] / RANGE_UNIT_M) > 0.0]
+        echo = seen[np.lexsort((apparent_m[seen], record[seen]))]
+        slot = np.arange(len(echo)) - np.searchsorted(record[echo], record[echo])
+        fits = slot < self._table.return_slots
+        self.lost_echoes += len(come) - int(np.count_nonzero(fits))
+        return echo[fits], slot[fits]
+
+
+@dataclass(frozen=True, slots=True)
+class _Emissions:
+    ticks: IntArray
+    time_s: FloatArray
+    encoder: IntArray
+
+    def after(self, n: int) -> _Emissions:
+        return _Emissions(self.ticks[n:], self.time_s[n:], self.encoder[n:])
+
+    def followed_by(self, other: _Emissions) -> _Emissions:
+        return _Emissions(
+            np.concatenate([self.ticks, other.ticks]),
+            np.concatenate([self.time_s, other.time_s]),
+            np.concatenate([self.encoder, other.encoder]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Flying:
+    """Echoes on their way: ticks of their emission, (range, intensity, width) as rows of ``said``, truth."""
+
+    from_ticks: IntArray
+    said: FloatArray
+    truth: StructArray
+
+    def chosen(self, which: NDArray[np.intp]) -> _Flying:
+        return _Flying(self.from_ticks[which], self.said[:, which], self.truth[which])
+
+    def followed_by(self, other: _Flying) -> _Flying:
+        return _Flying(
+            np.concatenate([self.from_ticks, other.from_ticks]),
+            np.concatenate([self.said, other.said], axis=1),
+            np.concatenate([self.truth, other.truth]),
+        )
+
+
+def _fill(slot: StructArray, range_m: FloatArray, intensity: FloatArray, pulse_width_ns: FloatArray) -> None:
+    """Numbers into slots, all (n, R): rounded to the wire's units, at its limits where they are beyond."""
+    slot["range"] = np.minimum(np.rint(range_m / RANGE_UNIT_M), _U32)
+    slot["intensity"] = np.minimum(np.rint(intensity), _U16)
+    slot["pulse_width"] = np.minimum(np.rint(pulse_width_ns / PULSE_WIDTH_UNIT_NS), _U16)

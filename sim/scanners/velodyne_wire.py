@@ -1,0 +1,204 @@
+"""What a VLP-16 says: data packets, single (strongest) or dual return, and position packets with PPS status and RMC.
+
+Wire format: VLP-16 User Manual 63-9243 rev. D, 9.3. Its clock shows microseconds past the UTC hour while PPS is locked
+(`sim.scanners.spinning_wire.HeadClock`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from drivers.gnss.nmea_sentences import encode_rmc
+from drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from drivers.scanner.velodyne_heads import BLOCKS, PLACES
+from drivers.scanner.velodyne_position import HOUR_US, encode_position_packet
+from georef.timescales import SECOND_NS, utc_from_gps
+from sim.clocks import PulsePerSecond
+from sim.plan import Plan
+from sim.plan_tables import ScannerTable
+from sim.scanners.spinning_wire import Arrivals, HeadClock, PacketCutter, Windows, head_config, two_returns
+from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+
+MICROSECOND_HZ = 1_000_000
+RANGE_UNIT_M = 0.002
+RANGE_MAX_RAW = 65_535
+POSITIONS_HZ = 20
+RMC_DELAY_S = 0.15  # from an edge to the sentence that names it, as a receiver sends it by a slow port
+
+
+class Track(Protocol):
+    """Where the aircraft is, for the sentences its head is given; `sim.flight.Trajectory` is one."""
+
+    def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Latitude, longitude, height of (n,) times."""
+
+    def velocity_l(self, time_s: FloatArray) -> FloatArray:
+        """(n, 3) north, east, down."""
+
+
+class VelodyneWire:
+    """Makes the packets of one head.
+
+    Args:
+        plan: of the flight.
+        name: of the scanner.
+        pps: wired to the head, with the NMEA of its receiver; None: neither is.
+        track: what the receiver's RMC sentences tell.
+        lost_pps: (from, to) in which the head gets no pulse.
+    """
+
+    def __init__(self, plan: Plan, name: str, pps: PulsePerSecond | None, track: Track, lost_pps: Windows = ()) -> None:
+        table = plan.tables.scanner[name]
+        self._source, self._dual = f"scanner/{name}", table.dual_return
+        _, utc_ns = utc_from_gps(plan.start_gps_ns, plan.leap_seconds)
+        self._clock = HeadClock(
+            MICROSECOND_HZ,
+            table.oscillator,
+            pps,
+            lost_pps,
+            1e-6 * table.true.time_offset_us,
+            utc_ns // SECOND_NS % 3600,
+        )
+        self._groups = BLOCKS // 2 if self._dual else BLOCKS
+        self._cutter = PacketCutter(self._groups * PLACES)
+        self._arrivals = Arrivals(plan, self._source)
+        self._positions = _Positions(plan, self._source, self._clock, track if pps is not None else None)
+
+    def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
+        """Packets that are complete, in order of time, and the truth of their returns as `VelodyneParser` gives them.
+
+        Args:
+            pulses: of `Vlp16Head`, consecutive.
+            measured: of them, (n, R).
+            truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
+        """
+        raw = np.rint(measured.range_m / RANGE_UNIT_M)
+        raw = np.where((raw >= 1) & (raw <= RANGE_MAX_RAW), raw, 0).astype(np.int64)
+        light = np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
+        told = [*self._positions.until(float(pulses.time_s[-1]))] if len(pulses) else []
+        number, time_s, encoder, raw, light, truth = self._cutter.take(
+            [pulses.number, pulses.time_s, pulses.encoder, raw, light, truth]
+        )
+        if len(number) == 0:
+            return told, np.empty(0, RETURN_TRUTH_DTYPE)
+        content, rows = (_pairs if self._dual else _strongest)(raw, light, truth)
+        units = told + self._packets(time_s, encoder, content)
+        return sorted(units, key=lambda unit: unit.time_s), rows
+
+    def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
+        """Position packets go on while the laser is off."""
+        return self._positions.until(stop_s)
+
+    def close(self) -> tuple[list[WireUnit], StructArray]:
+        """A packet that is not full is not sent."""
+        return [], np.empty(0, RETURN_TRUTH_DTYPE)
+
+    def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[WireUnit]:
+        """Data packets of pulses (n,), whose content is (returns, n, range and light)."""
+        mode, returns = (MODE_DUAL, 2) if self._dual else (MODE_STRONGEST, 1)
+        packets = len(time_s) // (self._groups * PLACES)
+        # a group's returns are in neighbouring blocks
+        blocks = content.reshape(returns, packets, self._groups, PLACES, 2).transpose(1, 2, 0, 3, 4)
+        blocks = blocks.reshape(packets, BLOCKS, PLACES, 2)
+        azimuth = np.repeat(encoder.reshape(packets, self._groups, PLACES)[:, :, 0], returns, axis=1)
+        fired_s = time_s.reshape(packets, -1)
+        stamps = (self._clock.ticks(fired_s[:, 0]) % HOUR_US).tolist()
+        arrived_s = self._arrivals.times(fired_s[:, -1])
+        return [
+            WireUnit(
+                arrived_s[at],
+                self._source,
+                encode_data_packet(stamps[at], azimuth[at], blocks[at, :, :, 0], blocks[at, :, :, 1], mode),
+            )
+            for at in range(packets)
+        ]
+
+
+class _Positions:
+    """The position packets of one head."""
+
+    def __init__(self, plan: Plan, source: str, clock: HeadClock, track: Track | None) -> None:
+        self._plan, self._source, self._clock, self._track = plan, f"{source}/aux", clock, track
+        self._arrivals = Arrivals(plan, self._source)
+        self._count = 0
+        self._second, self._sentence = -1, ""
+
+    def until(self, time_s: float) -> list[WireUnit]:
+        """Those assembled since the last call and not after this time."""
+        last = max(self._count, int(np.floor(time_s * POSITIONS_HZ + 0.5)))
+        made_s = (np.arange(self._count, last) + 0.5) / POSITIONS_HZ
+        self._count = last
+        stamps, status = self._clock.ticks(made_s) % HOUR_US, self._clock.status(made_s)
+        rows = zip(self._arrivals.times(made_s), made_s.tolist(), stamps.tolist(), status.tolist(), strict=True)
+        return [
+            WireUnit(arrived_s, self._source, encode_position_packet(stamp, state, self._rmc(at_s)))
+            for arrived_s, at_s, stamp, state in rows
+        ]
+
+    def _rmc(self, time_s: float) -> str:
+        """The latest sentence the head was given; empty before the first."""
+        second = int(np.floor(time_s - RMC_DELAY_S))
+        if self._track is not None and second > self._second:
+            self._second, self._sentence = second, self._rmc_of(self._track, second)
+        return self._sentence
+
+    def _rmc_of(self, track: Track, second: int) -> str:
+        at = np.array([float(second)])
+        lat_rad, lon_rad, _ = track.geodetic(at)
+        north, east, _ = track.velocity_l(at)[0].tolist()
+        gps_ns = self._plan.start_gps_ns + second * SECOND_NS
+        date, utc_ns = utc_from_gps(gps_ns, self._plan.leap_seconds)
+        speed_mps, course_rad = float(np.hypot(north, east)), float(np.arctan2(east, north))
+        sentence = encode_rmc(utc_ns, date, float(lat_rad[0]), float(lon_rad[0]), speed_mps, course_rad, talker="GP")
+        return sentence.decode("ascii").strip()
+
+
+def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
+    """Content (1, n, 2) of single returns: range and reflectivity of the strongest; and their truth."""
+    slot, _ = two_returns(np.where(raw > 0, light, -1))
+    there = slot >= 0
+    return _content(raw, light, [slot]), _numbered(truth[there, slot[there]], 1)
+
+
+def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
+    """Content (2, n, 2) of dual returns; and their truth, of two the nearer first.
+
+    First the last return, then the strongest, or the second-strongest where the strongest is the last; an only one
+    stands in both places, and two of equal range are one (9.3.2).
+    """
+    last, _ = two_returns(np.where(raw > 0, raw, -1))
+    _, other = two_returns(np.where(raw > 0, light, -1), last)
+    other = np.where(other >= 0, other, last)
+    pulse = np.arange(len(raw))
+    two = raw[pulse, other] < raw[pulse, last]
+    rows = np.stack([truth[pulse, other], truth[pulse, last]], axis=1)
+    rows["return_number"][:, 0], rows["return_number"][:, 1] = 1, np.where(two, 2, 1)
+    return _content(raw, light, [last, other]), rows[np.stack([two, last >= 0], axis=1)]
+
+
+def _content(raw: IntArray, light: IntArray, slots: Sequence[IntArray]) -> IntArray:
+    """(returns, n, 2) range and reflectivity in these slots (n,); zeros where it is −1."""
+    pulse = np.arange(len(raw))
+    content = np.stack([np.stack([raw[pulse, slot], light[pulse, slot]], axis=1) for slot in slots])
+    content[np.stack(slots) < 0] = 0
+    return content
+
+
+def _numbered(rows: StructArray, number: int) -> StructArray:
+    rows["return_number"] = number
+    return rows
+
+
+def config_table(table: ScannerTable, name: str, transport: str, auxiliary: str) -> dict[str, Any]:
+    """``[scanner.<name>]`` of the configuration that records this head.
+
+    Args:
+        table: of the plan.
+        name: of the scanner.
+        transport, auxiliary: where its data and position packets go.
+    """
+    return head_config(table, transport, "velodyne-vlp16") | {"auxiliary": auxiliary}

@@ -1,0 +1,314 @@
+"""The scene of a flight: the ground of the plan, what stands on it, and rays cast at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+
+from sim.casting import CARS, LAKES, ROADS, SOLIDS, TREES, WIRES, SceneArrays
+from sim.cells import CELL_M, Listed, build_cells
+from sim.clocks import generator
+from sim.echoes import cast_pulses
+from sim.errors import PlanError
+from sim.objects import (
+    CAR_SIZE_M,
+    Solids,
+    Things,
+    build_cars,
+    build_lakes,
+    build_roads,
+    build_solids,
+    build_trees,
+    build_wires,
+    near_circles,
+    near_pieces,
+)
+from sim.plan import Plan
+from sim.plan_tables import RoadTable, ScannerTable, TerrainTable
+from sim.shots import Echoes
+from sim.site import Site
+from sim.terrain import Ground, build_ground, fill_lake
+from sim.village import Houses, build_village
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FOOTPRINT_M = (1.0, 20.0)  # least and greatest radius of a beam for which objects are listed in the cells beside them
+CONTROL_CLEAR_M = 4.0
+_CAR_REACH_M = 3.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What rays are cast at, and what a map shows of it; places are east and north, metres, site frame.
+
+    Attributes:
+        site: the frame.
+        ground: without what stands on it.
+        corners: (k, 2) what had to be covered.
+        buildings: (n, 4, 2) corners of footprints.
+        roads: of the plan and of villages.
+        waters: (n, 3) centers and radii.
+        trees: (n, 3) centers and radii of crowns.
+        wires: (n, 4) from, to.
+        cars: (n, 4) from, to.
+        arrays: for the compiled functions.
+    """
+
+    site: Site
+    ground: Ground
+    corners: FloatArray
+    buildings: FloatArray
+    roads: list[RoadTable]
+    waters: FloatArray
+    trees: FloatArray
+    wires: FloatArray
+    cars: FloatArray
+    arrays: SceneArrays
+
+    def ground_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """(n,) ellipsoidal heights of the ground at site x and y (n,); beyond the area those of its nearest place."""
+        return self.ground.ground_m(east_m, north_m)
+
+    def site_z(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """(n,) site z of the ground at site x and y (n,)."""
+        return self.ground.site_z(east_m, north_m)
+
+    def cast(
+        self,
+        origin: FloatArray,
+        direction: FloatArray,
+        time_s: FloatArray,
+        number: IntArray,
+        divergence_rad: float,
+        pulse_m: float,
+        slots: int,
+    ) -> Echoes:
+        """Echoes of pulses; those of a pulse do not depend on what else is in the batch.
+
+        Args:
+            origin: (n, 3) site frame, metres.
+            direction: (n, 3) unit vectors, site frame.
+            time_s: (n,) when they leave: cars move.
+            number: (n,) of the pulses: what is random about a pulse hangs on the plan's seed and its number.
+            divergence_rad: full angle of the beam; 0: a line.
+            pulse_m: echoes nearer to each other than this are one.
+            slots: echoes kept of a pulse: the first ones and the last.
+        """
+        shape = (len(origin), slots)
+        range_m, reflectance, incidence_rad = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape)
+        surface = np.zeros(shape, np.uint8)
+        cast_pulses(
+            self.arrays,
+            np.ascontiguousarray(origin, np.float64),
+            np.ascontiguousarray(direction, np.float64),
+            np.ascontiguousarray(time_s, np.float64),
+            np.ascontiguousarray(number, np.int64),
+            0.5 * float(divergence_rad),
+            float(pulse_m),
+            range_m,
+            reflectance,
+            incidence_rad,
+            surface,
+        )
+        return Echoes(range_m, reflectance, incidence_rad, surface)
+
+    def control_points(self, count: int, seed: int) -> FloatArray:
+        """(count, 3) places on the ground, site frame: in the open, on the flatter half of it, far from each other.
+
+        Raises:
+            PlanError: ``control.points``: there are not so many.
+        """
+        draws = generator(seed, "control", "places")
+        low, high = np.min(self.corners, axis=0), np.max(self.corners, axis=0)
+        places = draws.uniform(low, high, (2000 + 50 * count, 2))
+        if len(self.corners) > 3:
+            places = places[Delaunay(self.corners).find_simplex(places) >= 0]
+        places = places[~self._occupied(places, CONTROL_CLEAR_M)]
+        if len(places) < 2 * count:
+            raise PlanError("control.points", f"no room for {count} in the open; want at most {len(places) // 2}")
+        slope = self.ground.slope(places[:, 0], places[:, 1])
+        places = places[np.argsort(slope, kind="stable")[: max(2 * count, len(places) // 2)]]
+        chosen = _far_apart(places, count)
+        return self.ground.points(chosen[:, 0], chosen[:, 1])
+
+    def _occupied(self, places: FloatArray, clear_m: float) -> NDArray[np.bool_]:
+        """(n,) whether something is nearer to places (n, 2) than this; roads are not something."""
+        clear = np.full(len(places), clear_m)
+        center = np.mean(self.buildings, axis=1)
+        radius = np.max(np.linalg.norm(self.buildings - center[:, np.newaxis], axis=2), axis=1, initial=0.0)
+        taken = near_circles(places, clear, center, radius)
+        for circles in (self.trees, self.waters):
+            taken |= near_circles(places, clear, circles[:, :2], circles[:, 2])
+        for lines in (self.wires, self.cars):
+            taken |= near_pieces(places, clear, lines, np.full(len(lines), _CAR_REACH_M))
+        return taken
+
+
+def _far_apart(places: FloatArray, count: int) -> FloatArray:
+    """Some of the places, each as far as can be from those before."""
+    chosen = np.zeros((count, 2))
+    distance = np.full(len(places), np.inf)
+    at = 0
+    for k in range(count):
+        chosen[k] = places[at]
+        distance = np.minimum(distance, np.linalg.norm(places - places[at], axis=1))
+        at = int(np.argmax(distance))
+    return chosen
+
+
+def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
+    """The scene over corners (k, 2) east, north, and `sim.terrain.MARGIN_M` around; what lies beyond is left out.
+
+    Raises:
+        PlanError: ``terrain.cell_m``: too large an area for it; ``terrain.raster``: it cannot be used;
+            ``terrain.village[i].houses``: no room for them.
+    """
+    table = plan.tables.terrain
+    corners = np.asarray(corners, np.float64)
+    ground = build_ground(plan, site, corners)
+    lakes = [
+        fill_lake(ground, water.center_m, water.radius_m, water.returns)
+        for water in table.water
+        if _covered(ground, [water.center_m])
+    ]
+    water = build_lakes(lakes)
+    houses, roads = _settle(table, ground, water)
+    road = build_roads(roads)
+    solids = build_solids(houses, ground, table.seed)
+    wires = [wire for wire in table.wire if _covered(ground, [wire.from_m, wire.to_m])]
+    cars = build_cars([car for car in table.car if _covered(ground, [car.from_m, car.to_m])], table.seed)
+    things = Things(
+        solids.ball,
+        solids.first_plane,
+        solids.plane,
+        _standing(build_trees(table.forest, ground, table.seed), ground, houses, road, water),
+        build_wires(wires, ground),
+        cars,
+        water,
+        road,
+    )
+    return Scene(
+        site,
+        ground,
+        corners,
+        solids.polygon,
+        roads,
+        water[:, [0, 1, 6]],
+        things.tree[:, [0, 1, 3]],
+        np.array([[*wire.from_m, *wire.to_m] for wire in wires]).reshape(-1, 4),
+        cars[:, :4],
+        _arrays(plan, ground, things, solids),
+    )
+
+
+def _covered(ground: Ground, places: list[list[float]]) -> bool:
+    points = np.array(places)
+    return bool(np.all(ground.covers(points[:, 0], points[:, 1])))
+
+
+def _settle(table: TerrainTable, ground: Ground, water: FloatArray) -> tuple[Houses, list[RoadTable]]:
+    """Buildings and roads: the plan's own, then villages where there is room beside them."""
+    houses = Houses.of_tables(table.building)
+    houses = houses.only(_on_grid(ground, houses))
+    roads = list(table.road)
+    for index, village in enumerate(table.village):
+        more, streets = build_village(village, table.seed, index)
+        road = build_roads(table.road)
+        taken = near_circles(more.center_m, more.radius_m, houses.center_m, houses.radius_m)
+        taken |= near_circles(more.center_m, more.radius_m, water[:, :2], water[:, 6])
+        taken |= near_pieces(more.center_m, more.radius_m, road[:, :4], road[:, 4])
+        houses = houses.and_also(more.only(_on_grid(ground, more) & ~taken))
+        roads += streets
+    return houses, roads
+
+
+def _on_grid(ground: Ground, houses: Houses) -> NDArray[np.bool_]:
+    radius = houses.radius_m[:, np.newaxis]
+    low, high = houses.center_m - radius, houses.center_m + radius
+    return ground.covers(low[:, 0], low[:, 1]) & ground.covers(high[:, 0], high[:, 1])
+
+
+def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArray, water: FloatArray) -> FloatArray:
+    """Trees on the grid that touch no house, no water and no road."""
+    place, radius = trees[:, :2], trees[:, 3]
+    taken = near_circles(place, radius, houses.center_m, houses.radius_m)
+    taken |= near_circles(place, radius, water[:, :2], water[:, 6])
+    taken |= near_pieces(place, radius, road[:, :4], road[:, 4])
+    return trees[~taken & ground.covers(place[:, 0], place[:, 1])]
+
+
+def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids) -> SceneArrays:
+    """Tables and lists for the compiled functions."""
+    foot_m = _footprint_m(list(plan.tables.scanner.values()))
+    tree, wire = things.tree, things.wire
+    of_tree = np.concatenate([tree[:, :2] - tree[:, 3:4], tree[:, :2] + tree[:, 3:4]], axis=1)
+    of_wire = np.concatenate([np.minimum(wire[:, :2], wire[:, 3:5]), np.maximum(wire[:, :2], wire[:, 3:5])], axis=1)
+    listed = [
+        _listed(SOLIDS, 4, np.arange(len(solids.box)), solids.box, solids.top_z, foot_m),
+        _listed(TREES, 4, np.arange(len(tree)), of_tree, tree[:, 2] + tree[:, 4], 0.0),
+        _listed(WIRES, 4, np.arange(len(wire)), of_wire, np.maximum(wire[:, 2], wire[:, 5]) + foot_m, foot_m),
+        _cars_listed(things.car, ground, foot_m),
+    ]
+    of_road = _pieces(things.road[:, :4])
+    lake = things.lake
+    of_lake = np.concatenate([lake[:, :2] - lake[:, 6:7], lake[:, :2] + lake[:, 6:7]], axis=1)
+    covers = [
+        _listed(ROADS, 2, of_road[0], of_road[1], np.zeros(len(of_road[0])), things.road[of_road[0], 4]),
+        _listed(LAKES, 2, np.arange(len(lake)), of_lake, np.zeros(len(lake)), 1.0),
+    ]
+    cells = build_cells(ground, listed, covers)
+    floor_z, roof_z = float(np.min(ground.z)) - 1.0, float(np.max(cells.top)) + 1.0
+    return SceneArrays(
+        np.ascontiguousarray(ground.z),
+        ground.west_m,
+        ground.south_m,
+        ground.cell_m,
+        floor_z,
+        roof_z,
+        plan.tables.terrain.reflectance,
+        plan.tables.flight.seed,
+        cells,
+        Things._make(np.ascontiguousarray(table) for table in things),
+    )
+
+
+def _footprint_m(scanners: list[ScannerTable]) -> float:
+    """Radius of the widest beam at the end of its range, as far as it counts."""
+    widest = max((0.5e-3 * one.divergence_mrad * one.range_max_m for one in scanners), default=0.0)
+    return float(np.clip(widest, *FOOTPRINT_M))
+
+
+def _listed(
+    kind: int, kinds: int, row: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
+) -> Listed:
+    """Objects of a kind, in boxes made wider on all sides."""
+    wider = np.broadcast_to(wider_m, len(box))[:, np.newaxis]
+    return Listed(kinds * row + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
+
+
+def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Straight lines (n, 4) cut into pieces about as long as a cell: the line of each, and its box (m, 4)."""
+    length = np.linalg.norm(lines[:, 2:] - lines[:, :2], axis=1)
+    count = np.maximum(np.ceil(length / CELL_M), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(lines)), count)
+    number = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+    first, last = (
+        lines[row, :2] + (share / count[row])[:, np.newaxis] * (lines[row, 2:] - lines[row, :2])
+        for share in (number, number + 1)
+    )
+    return row, np.concatenate([np.minimum(first, last), np.maximum(first, last)], axis=1)
+
+
+def _cars_listed(cars: FloatArray, ground: Ground, foot_m: float) -> Listed:
+    """Cars everywhere along their ways, below the highest ground of each piece."""
+    row, box = _pieces(cars[:, :4])
+    across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))
+    x = box[:, np.newaxis, :1] + across[:, np.newaxis] * (box[:, 2:3] - box[:, :1])[:, np.newaxis]
+    y = box[:, np.newaxis, 1:2] + across[:, np.newaxis] * (box[:, 3:] - box[:, 1:2])[:, np.newaxis]
+    z = ground.site_z(*np.broadcast_arrays(x, np.swapaxes(y, 1, 2)))
+    top_z = np.max(z, axis=(1, 2), initial=-np.inf) + CAR_SIZE_M[2] + 1.0
+    return _listed(CARS, 4, row, box, top_z, foot_m + _CAR_REACH_M)

@@ -1,0 +1,123 @@
+"""A small direct implementation of ISO/TS 19159-2 Eq. 10 with CONVENTIONS' model, by pyproj and SciPy only.
+
+It takes what a scanner's packets say, the true calibration as a file says it and the true trajectory at the IMU's
+rate, and gives ground points: the check that the virtual aircraft means what CONVENTIONS says. It shares no line with
+`sim`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation, RotationSpline
+
+FloatArray = NDArray[np.float64]
+TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+PIECE_S = 8.0  # of trajectory at a time: RotationSpline solves for all its knots at once
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration file, read here by itself."""
+
+    parameters: dict[str, float]
+    installation: FloatArray
+    facets: dict[int, float] = field(default_factory=dict)
+    ibrc: tuple[list[float], list[float]] | None = None
+
+    @classmethod
+    def read(cls, text: str) -> Calibration:
+        """From the file's text."""
+        document: dict[str, Any] = tomllib.loads(text)
+        facets = {row["index"]: float(np.radians(row["tilt_deg"])) for row in document.get("facet", [])}
+        table = document.get("ibrc")
+        return cls(
+            document["parameters"],
+            np.array(document["calibration"]["installation_matrix"], dtype=np.float64),
+            facets,
+            (table["intensity"], table["correction_m"]) if table else None,
+        )
+
+    def value(self, key: str) -> float:
+        """A parameter in SI units by its key."""
+        factor = {"deg": np.pi / 180, "ppm": 1e-6, "us": 1e-6, "us2": 1e-12, "m": 1.0}[key.rsplit("_", 1)[1]]
+        return float(self.parameters[key] * factor)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Body poses at the IMU's rate: GPS seconds since some whole second, geodetic, attitude."""
+
+    time_s: FloatArray
+    lat_rad: FloatArray
+    lon_rad: FloatArray
+    height_m: FloatArray
+    attitude_rad: FloatArray  # (n, 3) roll, pitch, heading
+
+    def poses(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position (n, 3) and rot_e_from_b (n, 3, 3) at times in order."""
+        position = np.empty((len(time_s), 3))
+        rotation = np.empty((len(time_s), 3, 3))
+        for start_s in np.arange(np.floor(time_s[0]), time_s[-1] + PIECE_S, PIECE_S):
+            at = (time_s >= start_s) & (time_s < start_s + PIECE_S)
+            knots = (self.time_s > start_s - 0.5) & (self.time_s < start_s + PIECE_S + 0.5)
+            if at.any():
+                position[at], rotation[at] = self._piece(knots, time_s[at])
+        return position, rotation
+
+    def _piece(self, knots: NDArray[np.bool_], time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        t, lat, lon = self.time_s[knots], self.lat_rad[knots], self.lon_rad[knots]
+        xyz = np.stack(TO_ECEF.transform(np.degrees(lon), np.degrees(lat), self.height_m[knots]), axis=1)
+        ned = Rotation.from_euler("ZY", np.stack([lon, -lat - np.pi / 2], axis=1))
+        roll, pitch, heading = self.attitude_rad[knots].T
+        body = ned * Rotation.from_euler("ZYX", np.stack([heading, pitch, roll], axis=1))
+        return CubicSpline(t, xyz)(time_s), RotationSpline(t, body)(time_s).as_matrix()
+
+
+def beam_angle(calibration: Calibration, time_s: FloatArray, encoder_rad: FloatArray) -> FloatArray:
+    """θ of CONVENTIONS; its derivatives from the readings themselves, one a pulse, at a steady rate."""
+    theta = (1 + calibration.value("scan_angle_scale_ppm")) * (encoder_rad - calibration.value("scan_angle_offset_deg"))
+    step_s = float(np.median(np.diff(time_s)))
+    first = savgol_filter(encoder_rad, 61, 4, deriv=1, delta=step_s)
+    second = savgol_filter(encoder_rad, 61, 4, deriv=2, delta=step_s)
+    turned: FloatArray = (
+        theta + calibration.value("encoder_latency_us") * first + calibration.value("torsion_us2") * second
+    )
+    return turned
+
+
+def line_direction(calibration: Calibration, theta: FloatArray) -> FloatArray:
+    """(n, 3) beam in s with the scan plane's tilt (ISO Eq. 14)."""
+    eta = calibration.value("scan_plane_tilt_deg")
+    return np.stack(
+        [np.full_like(theta, -np.sin(eta)), np.sin(theta) * np.cos(eta), np.cos(theta) * np.cos(eta)], axis=1
+    )
+
+
+def corrected_range(calibration: Calibration, range_m: FloatArray, intensity: FloatArray) -> FloatArray:
+    """ρ of CONVENTIONS."""
+    rho = (1 + calibration.value("range_scale_ppm")) * range_m + calibration.value("range_offset_m")
+    if calibration.ibrc is not None:
+        rho = rho - np.interp(intensity, *calibration.ibrc)
+    return rho
+
+
+def ground_points(
+    calibration: Calibration, track: Track, time_s: FloatArray, points_s: FloatArray, theta: FloatArray
+) -> FloatArray:
+    """(n, 3) ECEF of points in s at their pulses' times (ISO Eq. 10); each θ tilts φ by the pitch slope."""
+    lever_arm_b = np.array([calibration.value(f"lever_arm_{axis}_m") for axis in "xyz"])
+    phi = calibration.value("phi_deg") + calibration.value("pitch_slope_ppm") * theta
+    omega, kappa = (np.full_like(theta, calibration.value(f"{name}_deg")) for name in ("omega", "kappa"))
+    boresight = Rotation.from_euler("XYZ", np.stack([omega, phi, kappa], axis=1))
+    in_body = lever_arm_b + boresight.apply(points_s @ calibration.installation.T)
+    position, rotation = track.poses(time_s)
+    points: FloatArray = position + np.einsum("nij,nj->ni", rotation, in_body)
+    return points
