@@ -288,10 +288,11 @@ class Air:
         sin = np.linalg.norm(direction - cos[:, np.newaxis] * down, axis=1)
         nadir = np.arctan2(sin, cos)
         bent = self.bending(nadir, sensor_height_m, ground_height_m)
-        safe = np.where(sin > 1e-9, sin, 1.0)  # straight down nothing bends
+        turns = (sin > 1e-9) & (bent != 0.0)  # straight down nothing bends
+        safe = np.where(turns, sin, 1.0)
         along, towards = np.sin(nadir - bent) / safe, np.sin(bent) / safe
         turned = along[:, np.newaxis] * direction + towards[:, np.newaxis] * down
-        return np.where((sin > 1e-9)[:, np.newaxis], turned, direction)
+        return np.where(turns[:, np.newaxis], turned, direction)
 
     def transmission(self, range_m: FloatArray) -> FloatArray:
         """Share of the light that is left after the way to a target and back; shape of ``range_m``, 0 … 1.

@@ -17,24 +17,18 @@ CELL_M = 20.0
 
 
 class Cells(NamedTuple):
-    """Cells from the ground's south-west corner on; rows go north.
+    """Cells of `CELL_M` from the ground's south-west corner on; rows go north.
 
     Attributes:
-        west, south, size: of the cells, metres.
-        top: (rows, columns) site z that nothing in a cell exceeds; ``ground_top``: the ground alone.
-        first, item: cell c lists ``item[first[c] : first[c + 1]]``; an item is what `listed` was given.
-        first_cover, cover: likewise, of what covers the ground without standing on it.
+        top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
+        first: (2, cells + 1) cell c lists ``item[first[0, c] : first[0, c + 1]]`` of what stands on the ground, by
+            row 1 what covers it.
+        item: codes as `Listed` had them.
     """
 
-    west: float
-    south: float
-    size: float
     top: FloatArray
-    ground_top: FloatArray
     first: IntArray
     item: IntArray
-    first_cover: IntArray
-    cover: IntArray
 
 
 @dataclass(frozen=True)
@@ -60,10 +54,14 @@ def build_cells(ground: Ground, things: list[Listed], covers: list[Listed]) -> C
     cell, item, top_z = _spread(ground, _joined(things), rows, columns)
     top = ground_top.ravel().copy()
     np.maximum.at(top, cell, top_z)
-    lists = _lists(cell, item, rows * columns)
+    first, item = _lists(cell, item, rows * columns)
     cell, cover, _ = _spread(ground, _joined(covers), rows, columns)
-    cover_lists = _lists(cell, cover, rows * columns)
-    return Cells(ground.west_m, ground.south_m, CELL_M, top.reshape(rows, columns), ground_top, *lists, *cover_lists)
+    first_cover, cover = _lists(cell, cover, rows * columns)
+    return Cells(
+        np.stack([top.reshape(rows, columns), ground_top]),
+        np.stack([first, first_cover + len(item)]),
+        np.concatenate([item, cover]),
+    )
 
 
 def _joined(listed: list[Listed]) -> Listed:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+import zlib
+from collections.abc import Callable
+from pathlib import Path
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.casting import RIM_SHARE, SPENT, SceneArrays, march
-from sim.rays import NEVER, Ray
+from sim import casting, rays
+from sim.casting import BOX, RIM_SHARE, SPENT, Frame, Pulse, SceneArrays, march
+from sim.rays import NEVER, Ray, kernel
 from sim.shots import NO_SURFACE
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 SOFT_HITS = 24
 # Columns of soft hits: distance, share of the energy that comes so far, reflectance, cosine of incidence, surface.
 # Columns of echoes: distance, apparent reflectance, cosine of incidence, surface, 1 if on the axis.
 
 
-@numba.njit(cache=True)
+@kernel
 def in_order(rows: FloatArray, count: int) -> None:
     """Sort the first rows by distance; they are few."""
     for i in range(1, count):
@@ -30,7 +35,7 @@ def in_order(rows: FloatArray, count: int) -> None:
                 rows[j - 1, k], rows[j, k] = rows[j, k], rows[j - 1, k]
 
 
-@numba.njit(cache=True)
+@kernel
 def energy_at(soft: FloatArray, count: int, at: float) -> float:
     """What soft hits, in order, leave of a pulse's energy for a distance."""
     energy = 1.0
@@ -41,7 +46,7 @@ def energy_at(soft: FloatArray, count: int, at: float) -> float:
     return energy if energy >= SPENT else 0.0
 
 
-@numba.njit(cache=True)
+@kernel
 def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, surface: float, on_axis: float) -> int:
     """One more echo, if there is any of it."""
     if at < NEVER and strength > 0.0 and count < len(echo):
@@ -56,10 +61,10 @@ def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, su
     return count
 
 
-@numba.njit(cache=True)
+@kernel
 def rim(ray: Ray, spread: float, side: int) -> Ray:
     """One of four rays that leave with a beam's axis, ``spread`` radians from it."""
-    ox, oy, oz, dx, dy, dz = ray
+    ox, oy, oz, dx, dy, dz, _, _ = ray
     if abs(dx) < 0.8:
         ax, ay, az = 0.0, dz, -dy  # d × x
     else:
@@ -70,10 +75,18 @@ def rim(ray: Ray, spread: float, side: int) -> Ray:
         ax, ay, az = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
     aside = math.tan(spread) if side % 2 == 0 else -math.tan(spread)
     scale = 1.0 / math.sqrt(1.0 + aside * aside)
-    return ox, oy, oz, scale * (dx + aside * ax), scale * (dy + aside * ay), scale * (dz + aside * az)
+    dx, dy, dz = scale * (dx + aside * ax), scale * (dy + aside * ay), scale * (dz + aside * az)
+    return ox, oy, oz, dx, dy, dz, 1.0 / dx, 1.0 / dy
 
 
-@numba.njit(cache=True)
+@kernel
+def move(echo: FloatArray, source: int, target: int) -> None:
+    """A row over another."""
+    for k in range(5):
+        echo[target, k] = echo[source, k]
+
+
+@kernel
 def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
     """Echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger one."""
     kept = 0
@@ -81,27 +94,31 @@ def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
         if echo[k, 0] - echo[kept, 0] < pulse_m:
             strength = echo[kept, 1] + echo[k, 1]
             if echo[k, 4] > echo[kept, 4] or (echo[k, 4] == echo[kept, 4] and echo[k, 1] > echo[kept, 1]):
-                echo[kept] = echo[k]
+                move(echo, k, kept)
             echo[kept, 1] = strength
         else:
             kept += 1
-            echo[kept] = echo[k]
+            move(echo, k, kept)
     return kept + 1 if count else 0
 
 
-@numba.njit(cache=True)
+@kernel
 def echoes_of(
-    scene: SceneArrays,
+    frame: Frame,
+    z: FloatArray,
+    top: FloatArray,
+    first: IntArray,
+    item: IntArray,
+    rows: FloatArray,
     ray: Ray,
-    time_s: float,
-    number: int,
     spread: float,
+    pulse: Pulse,
     soft: FloatArray,
     echo: FloatArray,
     box: FloatArray,
 ) -> int:
     """All echoes of a pulse, in order of distance; returns how many."""
-    at, surface, reflectance, cos, edge, softs = march(scene, ray, time_s, number, spread, soft, 0, box)
+    at, surface, reflectance, cos, edge, softs = march(frame, z, top, first, item, rows, ray, spread, pulse, soft, box)
     in_order(soft, softs)
     count = 0
     for k in range(softs):
@@ -113,36 +130,52 @@ def echoes_of(
     count = add(echo, count, at, energy_at(soft, softs, at) * share * reflectance * cos, cos, float(surface), 1.0)
     if rims:
         for side in range(4):
-            t, s, r, c, _, _ = march(scene, rim(ray, spread, side), time_s, number, 0.0, soft, -1, box)
+            other = rim(ray, spread, side)
+            t, s, r, c, _, _ = march(frame, z, top, first, item, rows, other, 0.0, pulse, soft[:0], box)
             if s != NO_SURFACE:
                 count = add(echo, count, t, energy_at(soft, softs, t) * RIM_SHARE * r * c, c, float(s), 0.0)
         in_order(echo, count)
     return count
 
 
-@numba.njit(cache=True, nogil=True)
-def cast_pulses(
-    scene: SceneArrays,
-    origin: FloatArray,
-    direction: FloatArray,
-    time_s: FloatArray,
-    number: NDArray[np.int64],
-    spread: float,
-    pulse_m: float,
-    range_m: FloatArray,
-    reflectance: FloatArray,
-    incidence_rad: FloatArray,
-    surface: NDArray[np.uint8],
-) -> None:
-    """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
-    soft, echo, box = np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 6, 5)), np.empty((5, 6))
-    slots = range_m.shape[1]
-    for i in range(len(origin)):
-        ray = origin[i, 0], origin[i, 1], origin[i, 2], direction[i, 0], direction[i, 1], direction[i, 2]
-        count = merged(echo, echoes_of(scene, ray, time_s[i], number[i], spread, soft, echo, box), pulse_m)
-        for slot in range(min(count, slots)):
-            k = count - 1 if slot == slots - 1 else slot
-            range_m[i, slot] = echo[k, 0]
-            reflectance[i, slot] = echo[k, 1]
-            incidence_rad[i, slot] = math.acos(min(echo[k, 2], 1.0))
-            surface[i, slot] = np.uint8(echo[k, 3])
+def _compiled(digest: int) -> Callable[..., None]:
+    """`cast_pulses`, which numba keeps on disk for later processes, by this file's age and what the closure holds.
+
+    ``digest`` stands for the files that it does not look at.
+    """
+
+    def cast_pulses(
+        scene: SceneArrays,
+        origin: FloatArray,
+        direction: FloatArray,
+        time_s: FloatArray,
+        number: IntArray,
+        spread: float,
+        pulse_m: float,
+        range_m: FloatArray,
+        reflectance: FloatArray,
+        incidence_rad: FloatArray,
+        surface: NDArray[np.uint8],
+    ) -> None:
+        """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
+        soft, echo, box = np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 6, 5)), np.empty(BOX)
+        slots = range_m.shape[1] if digest else 0
+        frame, z, top, first, item, rows, seed = scene
+        for i in range(len(origin)):
+            dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+            ray = origin[i, 0], origin[i, 1], origin[i, 2], dx, dy, dz, 1.0 / dx, 1.0 / dy
+            pulse = time_s[i], number[i], seed
+            found = echoes_of(frame, z, top, first, item, rows, ray, spread, pulse, soft, echo, box)
+            count = merged(echo, found, pulse_m)
+            for slot in range(min(count, slots)):
+                k = count - 1 if slot == slots - 1 else slot
+                range_m[i, slot] = echo[k, 0]
+                reflectance[i, slot] = echo[k, 1]
+                incidence_rad[i, slot] = math.acos(min(echo[k, 2], 1.0))
+                surface[i, slot] = np.uint8(echo[k, 3])
+
+    kept: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(cast_pulses)
+    return kept
+
+
+cast_pulses = _compiled(zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in (casting, rays))))

@@ -155,7 +155,7 @@ def refuse_lines(tables: Tables, ground_m: Ground) -> None:
 
 
 def _refuse_low(key: str, line: LineTable, length_m: float, ground_m: Ground) -> None:
-    share = np.linspace(0.0, 1.0, 2 + int(length_m / _GROUND_STEP_M))
+    share = np.linspace(0.0, 1.0, 1 + math.ceil(length_m / _GROUND_STEP_M))
     east_m = line.from_m[0] + share * (line.to_m[0] - line.from_m[0])
     north_m = line.from_m[1] + share * (line.to_m[1] - line.from_m[1])
     terrain_m = ground_m(east_m, north_m)

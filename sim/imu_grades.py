@@ -7,8 +7,9 @@ greatest Allan deviation of the drifting part of a bias, which is what data shee
   random walk: 8 µg/√Hz of the accelerometers in its class (iMAR iNAV-RQH).
 - tactical: iMAR IMU-FSAS (0.75 °/h, 0.1 °/√h, 1 mg, 0.03 m/s/√h, 300 ppm), Honeywell HG1700 and HG1900 beside it
   (1 °/h, 0.09 to 0.125 °/√h, 1 mg).
-- mems: Analog Devices ADIS16488 (in run 6 °/h and 0.1 mg, 0.3 °/√h, 0.029 m/s/√h, axes to 0.05°), its bias at turn-on
-  that of a unit calibrated over temperature and not the sheet's repeatability over years; so are its scale factors.
+- mems: gyroscopes of an Analog Devices ADIS16488 (in run 6 °/h, 0.3 °/√h, axes to 0.05°), accelerometers of a Sensonor
+  STIM300 (in run 0.05 mg, 0.07 m/s/√h); biases at turn-on and scale factors are those of a unit calibrated over
+  temperature, not the sheets' repeatability over years.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ GRADES = {
         gyro_bias_deg_per_h=0.0035,
         accel_bias_mg=0.025,
         gyro_bias_instability_deg_per_h=0.001,
-        accel_bias_instability_mg=0.003,
+        accel_bias_instability_mg=0.001,
         bias_correlation_h=1.0,
         gyro_scale_ppm=5.0,
         accel_scale_ppm=100.0,
@@ -49,11 +50,11 @@ GRADES = {
     ),
     "mems": ImuNoiseTable(
         angle_random_walk_deg_per_sqrt_h=0.3,
-        velocity_random_walk_m_per_s_per_sqrt_h=0.03,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.07,
         gyro_bias_deg_per_h=36.0,
         accel_bias_mg=3.0,
         gyro_bias_instability_deg_per_h=6.0,
-        accel_bias_instability_mg=0.1,
+        accel_bias_instability_mg=0.05,
         bias_correlation_h=1.0,
         gyro_scale_ppm=1000.0,
         accel_scale_ppm=1000.0,

@@ -218,7 +218,7 @@ class InertialUnit:
             raise PlanError(f"imu.{name}.rotation_b_imu", text)
         self._rot_imu_from_b = np.linalg.inv(rot_b_from_imu)
         self.last = self.count(trajectory.end_s)
-        self._kept = -1, np.zeros((0, 6))
+        self._kept: dict[int, FloatArray] = {}  # values of the last two seconds: who cuts time meets both
 
     def ends_s(self, number: FloatArray | IntArray) -> FloatArray:
         """(n,) true times at which samples (n,) end."""
@@ -261,12 +261,13 @@ class InertialUnit:
 
     def _second(self, second: int) -> FloatArray:
         """(n, 6) values of the samples second · rate_hz and on, as far as there are any; there is no sample 0."""
-        if self._kept[0] != second:
+        if second not in self._kept:
             rate_hz = self.table.rate_hz
             begin, end = max(second * rate_hz, 1), min((second + 1) * rate_hz, self.last + 1)
             errors = self.errors.of_second(second)[begin - second * rate_hz : end - second * rate_hz]
-            self._kept = second, self._means(begin, end) + errors
-        return self._kept[1]
+            newest = {number: self._kept[number] for number in list(self._kept)[-1:]}
+            self._kept = newest | {second: self._means(begin, end) + errors}
+        return self._kept[second]
 
     def _means(self, begin: int, end: int) -> FloatArray:
         """(n, 6) of the samples from ``begin`` to before ``end``, with scale factors and leaning axes."""

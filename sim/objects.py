@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from sim.clocks import generator
 from sim.plan_tables import CarTable, ForestTable, RoadTable, WireTable
+from sim.rays import PLANE
 from sim.shots import ROOF, WALL
 from sim.terrain import Ground, Lake, ups
 from sim.village import ROOFS, Houses
@@ -27,19 +28,17 @@ class Things(NamedTuple):
     """Tables in the site frame, metres.
 
     Attributes:
-        ball: (n, 4) center and radius of the sphere around each solid.
-        first_plane: (n + 1,) rows of ``plane`` that bound each solid.
         plane: (p, 6) outward normal, its product with points of the plane, surface, reflectance.
-        tree: (n, 7) crown's center, radius, half height, interceptions a metre, reflectance.
+        solid: (n, 6) center and radius of the sphere around it; in `flat`, where its planes begin and end.
+        tree: (n, 7) crown's center, one by its radius and by its half height, interceptions a metre, reflectance.
         wire: (n, 7) ends of a straight piece, radius.
         car: (n, 6) from, to, speed in m/s, reflectance.
         lake: (n, 8) center, normal, radius, share of pulses that return.
         road: (n, 8) ends of a straight piece, half width, metres of road before it, 1 if painted, number of the road.
     """
 
-    ball: FloatArray
-    first_plane: NDArray[np.int64]
     plane: FloatArray
+    solid: FloatArray
     tree: FloatArray
     wire: FloatArray
     car: FloatArray
@@ -47,20 +46,28 @@ class Things(NamedTuple):
     road: FloatArray
 
 
+def flat(things: Things) -> tuple[FloatArray, dict[str, NDArray[np.int64]]]:
+    """All tables one behind the other, planes first, and where each row of each begins."""
+    starts, at = {}, 0
+    for name, table in things._asdict().items():
+        starts[name] = at + table.shape[1] * np.arange(len(table), dtype=np.int64)
+        at += table.size
+    return np.concatenate([np.ravel(table) for table in things]), starts
+
+
 @dataclass(frozen=True)
 class Solids:
     """Buildings as bodies between planes; they have no floor, the ground is in the way.
 
     Attributes:
-        ball, first_plane, plane: see `Things`.
+        plane, solid: see `Things`.
         polygon: (n, 4, 2) east, north of the corners of the footprints.
         box: (n, 4) west, south, east, north of them.
         top_z: (n,) site z of the highest point.
     """
 
-    ball: FloatArray
-    first_plane: NDArray[np.int64]
     plane: FloatArray
+    solid: FloatArray
     polygon: FloatArray
     box: FloatArray
     top_z: FloatArray
@@ -78,13 +85,13 @@ def build_solids(houses: Houses, ground: Ground, seed: int) -> Solids:
     center = base + up * (0.5 * (top_m + bottom_m))[:, np.newaxis]
     radius = np.sqrt(np.sum(half**2, axis=1) + (0.5 * (top_m - bottom_m)) ** 2)
     planes, used = _planes(houses, base, axes, seed)
+    last = np.cumsum(used.sum(axis=1))
     signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     corners = base[:, np.newaxis] + np.einsum("ck,nk,nkx->ncx", signs, half, axes[:, :2])
     polygon = corners[:, :, :2]
     return Solids(
-        np.concatenate([center, radius[:, np.newaxis]], axis=1),
-        np.concatenate([[0], np.cumsum(used.sum(axis=1))]),
         planes[used],
+        np.column_stack([center, radius, PLANE * (last - used.sum(axis=1)), PLANE * last]),
         polygon,
         np.concatenate([polygon.min(axis=1), polygon.max(axis=1)], axis=1),
         np.max(corners[:, :, 2], axis=1) + top_m,
@@ -154,7 +161,9 @@ def build_trees(forests: list[ForestTable], ground: Ground, seed: int) -> FloatA
         half = 0.5 * height * draws.uniform(0.55, 0.75, count)
         foot = ground.points(place[:, 0], place[:, 1])
         foot[:, 2] += height - half
-        leaves = np.stack([radius, half, draws.uniform(0.25, 0.5, count), draws.uniform(0.35, 0.6, count)], axis=1)
+        leaves = np.stack(
+            [1.0 / radius, 1.0 / half, draws.uniform(0.25, 0.5, count), draws.uniform(0.35, 0.6, count)], axis=1
+        )
         rows.append(np.concatenate([foot, leaves], axis=1))
     return np.concatenate(rows)
 

@@ -14,12 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from sim.coverage import FloatArray, Grid, Survey, grid_of, summary_of
+from sim.envelope import Ground
 from sim.errors import PlanError
 from sim.picture_map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of
 from sim.plan import Plan
+from sim.terrain import build_ground
 
 FORMATS = (".pdf", ".png", ".svg")
 DPI = 150
+GROUND_CELLS = 500  # of the ground along the map's longer side
 WIDE = 1.7  # maps wider than this times their height stand above the rest instead of beside it
 STRETCH = 8.0  # and beyond this the shorter side is drawn larger than it is
 OVERLAP_COLOURS = ("#f2ead3", "#a8d5ba", "#5fb0a5", "#2f7fa3", "#3d4f96", "#4b2a78")
@@ -59,8 +62,10 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
     figure = Figure(figsize=page, facecolor="white")
     axes = {name: _panel(figure, page, box) for name, box in panels.items()}
     _title(figure, page, survey, rows)
-    draw_map(axes["map"], survey, track, *_framed(low, high, panels["map"]))
-    _profile(axes["profile"], survey, track)
+    frame = _framed(low, high, panels["map"])
+    ground_m = _wide_ground(survey, *frame[:2])
+    draw_map(axes["map"], survey, track, ground_m, frame)
+    _profile(axes["profile"], survey, track, ground_m)
     _density(axes["density"], survey, grid)
     _overlap(axes["overlap"], survey, grid)
     _table(axes["table"], rows)
@@ -117,6 +122,15 @@ def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, Fl
     return middle - half, middle + half, stretch
 
 
+def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
+    """Heights all over the map; of a raster only where the flight asks for them, and beyond as at the edge."""
+    if survey.plan.tables.terrain.raster:
+        return survey.scene.ground_m
+    cell_m = float(np.clip((high - low).max() / GROUND_CELLS, 0.25, 100.0))
+    coarse = survey.plan.changed({"terrain": {"cell_m": cell_m}})
+    return build_ground(coarse, survey.site, np.stack([low, high])).ground_m
+
+
 def _title(figure: Figure, page: tuple[float, float], survey: Survey, rows: Sequence[dict[str, Any]]) -> None:
     tables, total = survey.plan.tables, rows[-1]
     scanners = "; ".join(f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items())
@@ -139,11 +153,11 @@ def _scanner_words(table: Any) -> str:
     return f"{table.kind}, {table.prf_hz / 1000:g} kHz, ±{table.half_angle_deg:g}°"
 
 
-def _profile(axes: Axes, survey: Survey, track: FloatArray) -> None:
+def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> None:
     """Heights over time: the ground below, the aircraft, and how much is between them on each line."""
     unit_s, unit = (60.0, "min") if track[-1, 0] > 300.0 else (1.0, "s")
     time, height_m = track[:, 0] / unit_s, track[:, 3]
-    ground_m = survey.scene.ground_m(track[:, 1], track[:, 2])
+    ground_m = ground(track[:, 1], track[:, 2])
     low, high = float(ground_m.min()), float(height_m.max())
     bottom, top = low - 0.12 * (high - low), high + 0.16 * (high - low)
     for number, strip in enumerate(survey.strips):

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.patches import Patch, Polygon
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
 from pyproj import Transformer
 
 from sim.coverage import FloatArray, Strip, Survey
+from sim.envelope import Ground
+from sim.village import STREET_M
 
 INK, MUTED = "#22262b", "#5a6068"
 ROOFS, WATER, TREES, ROAD, MAST, CAR = "#a65f4a", "#8fbfdc", "#7fa65e", "#8d8d89", "#3b3b3b", "#c23b22"
@@ -35,6 +38,7 @@ LINE_COLOURS = (
 LAND = LinearSegmentedColormap.from_list("land", ["#c9d9b5", "#e3e7c8", "#f1e8cf", "#e4d3b3", "#d3ba97"])
 HALO = (withStroke(linewidth=2.6, foreground="white", alpha=0.85),)
 SHADE_CELLS = 420
+KILOMETRES_FROM_M = 30_000.0
 
 
 def colour_of(number: int) -> str:
@@ -58,17 +62,24 @@ def nice_step(size: float, *, up: bool = False) -> float:
     return min(step for step in steps if step >= size) if up else max(step for step in steps if step <= size)
 
 
-def draw_map(axes: Axes, survey: Survey, track: FloatArray, low: FloatArray, high: FloatArray, stretch: float) -> None:
+def draw_map(
+    axes: Axes,
+    survey: Survey,
+    track: FloatArray,
+    ground_m: Ground,
+    frame: tuple[FloatArray, FloatArray, float],
+) -> None:
     """The map between two corners.
 
     Args:
         axes: to draw in.
         survey: the plan, flown.
         track: (n, 4) time, east, north and height of the aircraft.
-        low, high: (2,) east and north of the corners.
-        stretch: north is drawn larger than east by this.
+        ground_m: heights all over the map.
+        frame: (2,) east and north of either corner; north is drawn larger than east by the last.
     """
-    _relief(axes, survey, low, high)
+    low, high, stretch = frame
+    _relief(axes, ground_m, low, high)
     draw_ground(axes, survey)
     for number, strip in enumerate(survey.strips):
         _swath(axes, survey.edges(strip), colour_of(number), 0.16 if len(survey.strips) < 5 else 0.09)
@@ -80,8 +91,10 @@ def draw_map(axes: Axes, survey: Survey, track: FloatArray, low: FloatArray, hig
     control = survey.scene.control_points(survey.plan.tables.control.points, survey.plan.tables.flight.seed)
     axes.plot(control[:, 0], control[:, 1], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7, zorder=7)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_xlabel("east of the origin (m)", fontsize=8, color=MUTED)
-    axes.set_ylabel("north of the origin (m)", fontsize=8, color=MUTED)
+    for axis, where, size_m in ((axes.xaxis, "east", high[0] - low[0]), (axes.yaxis, "north", high[1] - low[1])):
+        unit, metres = ("km", 1000.0) if size_m > KILOMETRES_FROM_M else ("m", 1.0)
+        axis.set_major_formatter(FuncFormatter(lambda value, _, metres=metres: f"{value / metres:g}"))
+        axis.set_label_text(f"{where} of the origin ({unit})", fontsize=8, color=MUTED)
     axes.grid(color="white", lw=0.6, alpha=0.55, zorder=1)
     _scale_bar(axes, low, high)
     _north_arrow(axes)
@@ -89,67 +102,73 @@ def draw_map(axes: Axes, survey: Survey, track: FloatArray, low: FloatArray, hig
     _origin(axes, survey, stretch)
 
 
-def _relief(axes: Axes, survey: Survey, low: FloatArray, high: FloatArray) -> None:
+def _relief(axes: Axes, ground_m: Ground, low: FloatArray, high: FloatArray) -> None:
     """Heights as soft colours with shadows, and contour lines."""
     size = high - low
     shape = np.maximum((SHADE_CELLS * size / size.max()).astype(int), 40)
     east_m, north_m = (np.linspace(low[axis], high[axis], shape[axis]) for axis in (0, 1))
     east, north = np.meshgrid(east_m, north_m)
-    ground_m = survey.scene.ground_m(east.ravel(), north.ravel()).reshape(east.shape)
+    height_m = ground_m(east.ravel(), north.ravel()).reshape(east.shape)
     extent = (low[0], high[0], low[1], high[1])
-    relief_m = float(np.ptp(ground_m))
+    relief_m = float(np.ptp(height_m))
     if relief_m < 1.0:
         axes.set_facecolor("#e6e8cf")
         return
     step_m = size / shape
-    slope = np.hypot(*np.gradient(ground_m, step_m[1], step_m[0]))
+    slope = np.hypot(*np.gradient(height_m, step_m[1], step_m[0]))
     exaggeration = float(np.clip(0.3 / slope.mean(), 0.5, 15.0))
-    light = LightSource(315.0, 45.0).hillshade(ground_m, exaggeration, dx=float(step_m[0]), dy=-float(step_m[1]))
-    tint = LAND((ground_m - ground_m.min()) / relief_m)[:, :, :3]
+    light = LightSource(315.0, 45.0).hillshade(height_m, exaggeration, dx=float(step_m[0]), dy=-float(step_m[1]))
+    tint = LAND((height_m - height_m.min()) / relief_m)[:, :, :3]
     image = np.clip(tint * (0.78 + 0.32 * light[:, :, np.newaxis]), 0.0, 1.0)
     axes.imshow(image, extent=extent, origin="lower", aspect="auto", interpolation="bilinear", zorder=0)
     step = nice_step(relief_m / 8.0, up=True)
-    levels = step * np.arange(math.ceil(ground_m.min() / step), math.floor(ground_m.max() / step) + 1)
+    levels = step * np.arange(math.ceil(height_m.min() / step), math.floor(height_m.max() / step) + 1)
     if len(levels):
-        lines = axes.contour(east_m, north_m, ground_m, levels=levels, colors="#8a7752", linewidths=0.45, alpha=0.7)
+        lines = axes.contour(east_m, north_m, height_m, levels=levels, colors="#8a7752", linewidths=0.45, alpha=0.7)
         axes.clabel(lines, fmt="%g", fontsize=6, inline_spacing=2)
 
 
 def draw_ground(axes: Axes, survey: Survey, *, outlines: bool = False) -> None:
     """What stands on the ground; ``outlines``: over colours that are not to be hidden."""
-    terrain = survey.plan.tables.terrain
-    fill: dict[str, Any] = {"facecolor": "none", "lw": 0.4, "alpha": 0.7} if outlines else {"lw": 0.5}
-    for lake in terrain.water:
-        colours: dict[str, Any] = {"edgecolor": "#4d88ad"} | ({} if outlines else {"facecolor": WATER})
-        axes.add_patch(Circle((lake.center_m[0], lake.center_m[1]), lake.radius_m, zorder=2, **fill | colours))
-    for forest in terrain.forest:
+    scene = survey.scene
+    for forest in [] if outlines else survey.plan.tables.terrain.forest:
         corners = np.array(forest.center_m) + np.array(forest.size_m) / 2 * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
-        colours = {"edgecolor": "#4f7a35"} | ({} if outlines else {"facecolor": TREES, "alpha": 0.65})
-        axes.add_patch(Polygon(corners, zorder=2, **fill | colours))
-    for road in terrain.road:
-        points = np.array(road.points_m)
-        axes.plot(*points.T, color=ROAD, lw=0.5 if outlines else 2.2, solid_joinstyle="round", zorder=2.2)
-        if not outlines:
-            axes.plot(*points.T, color="#f4f2ec", lw=1.0, solid_joinstyle="round", zorder=2.3)
-    roofs: dict[str, Any] = {"facecolors": "none"} if outlines else {"facecolors": ROOFS}
+        axes.add_patch(Polygon(corners, facecolor=TREES, alpha=0.3, lw=0, zorder=1.9))
+    for circles, edge, face in ((scene.waters, "#4d88ad", WATER), (scene.trees, "#4f7a35", TREES)):
+        width = 2.0 * circles[:, 2]
+        look = {"edgecolors": edge, "linewidths": 0.4, "facecolors": "none"} if outlines else {"facecolors": face}
+        if not outlines or circles is scene.waters:
+            axes.add_collection(_circles(axes, circles, width, zorder=2.0, **look), autolim=False)
+    for road in sorted(scene.roads, key=lambda road: road.width_m):
+        points = np.array(road.points_m).T
+        wide = 0.4 if outlines else 1.1 if road.width_m <= STREET_M else 2.2
+        axes.plot(*points, color=ROAD, lw=wide, solid_joinstyle="round", zorder=2.2)
+        if wide > 2.0:
+            axes.plot(*points, color="#f4f2ec", lw=1.0, solid_joinstyle="round", zorder=2.3)
+    edge, face = ("#555555", "none") if outlines else ("#6b3a2c", ROOFS)
     axes.add_collection(
-        PolyCollection(
-            survey.scene.buildings,
-            edgecolors="#555555" if outlines else "#6b3a2c",
-            linewidths=0.25,
-            zorder=2.5,
-            **roofs,
-        ),
+        PolyCollection(list(scene.buildings), edgecolors=edge, facecolors=face, linewidths=0.25, zorder=2.5),
         autolim=False,
     )
-    wires = [[wire.from_m, wire.to_m] for wire in terrain.wire]
-    axes.add_collection(LineCollection(wires, colors=MAST, linewidths=0.5 if outlines else 0.9, zorder=2.6))
+    wires = scene.wires.reshape(-1, 2, 2)
+    axes.add_collection(LineCollection(list(wires), colors=MAST, linewidths=0.5 if outlines else 0.9, zorder=2.6))
     if outlines:
         return
-    for wire in wires:
-        axes.plot(*np.array(wire).T, ls="", marker="P", ms=3.2, color=MAST, mew=0.0, zorder=2.7)
-    for car in terrain.car:
-        axes.plot(*np.array([car.from_m, car.to_m]).T, color=CAR, lw=0.9, ls=(0, (1, 1.2)), zorder=2.8)
+    axes.plot(*wires.reshape(-1, 2).T, ls="", marker="P", ms=3.4, color=MAST, mew=0.0, zorder=2.7)
+    for way in scene.cars.reshape(-1, 2, 2):
+        axes.plot(*way.T, color=CAR, lw=0.9, ls=(0, (1, 1.2)), zorder=2.8)
+
+
+def _circles(axes: Axes, circles: FloatArray, width: FloatArray, **look: Any) -> EllipseCollection:
+    return EllipseCollection(
+        width,
+        width,
+        np.zeros(len(width)),
+        units="xy",
+        offsets=circles[:, :2],
+        offset_transform=axes.transData,
+        **look,
+    )
 
 
 def _swath(axes: Axes, outline: FloatArray, colour: str, alpha: float) -> None:
@@ -161,7 +180,7 @@ def _line(axes: Axes, strip: Strip, colour: str) -> None:
     """A line with an arrow and its name behind its beginning; a little to its right, where a pilot keeps."""
     aside = np.array([strip.ahead[1], -strip.ahead[0]]) * 1.4 / 72.0
     moved = axes.transData + ScaledTranslation(aside[0], aside[1], page_of(axes).dpi_scale_trans)
-    start, end = strip.from_m, strip.from_m + strip.length_m * strip.ahead
+    start, end = strip.from_m, strip.end_m
     axes.plot([start[0], end[0]], [start[1], end[1]], color=colour, lw=2.0, transform=moved, zorder=6)
     turned = math.degrees(math.atan2(strip.ahead[1], strip.ahead[0]))
     for part in (0.3, 0.75):
@@ -188,8 +207,8 @@ def _line(axes: Axes, strip: Strip, colour: str) -> None:
 
 
 def _scale_bar(axes: Axes, low: FloatArray, high: FloatArray) -> None:
-    """In metres or kilometres, a fifth of the map at most."""
-    length_m = nice_step(0.2 * float(high[0] - low[0]))
+    """In metres or kilometres, a seventh of the map at most."""
+    length_m = nice_step(0.15 * float(high[0] - low[0]))
     part = length_m / float(high[0] - low[0])
     place = axes.transAxes
     x, y = 0.03, 0.035
@@ -221,7 +240,7 @@ def _north_arrow(axes: Axes) -> None:
 
 def _legend(axes: Axes, survey: Survey) -> None:
     """Below the map: what of it there is."""
-    terrain, control = survey.plan.tables.terrain, survey.plan.tables.control
+    scene, control = survey.scene, survey.plan.tables.control
     entries: list[tuple[Any, str, Any]] = [
         (True, "flight line", Line2D([], [], color=LINE_COLOURS[0], lw=2)),
         (True, "swath", Patch(facecolor=LINE_COLOURS[0], alpha=0.3)),
@@ -229,12 +248,12 @@ def _legend(axes: Axes, survey: Survey) -> None:
         (True, "begin", Line2D([], [], ls="", marker="o", ms=5, color="white", mec=INK, mew=1.2)),
         (True, "end", Line2D([], [], ls="", marker="s", ms=5, color=INK)),
         (control.points, "control point", Line2D([], [], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7)),
-        (len(survey.scene.buildings), "building", Patch(facecolor=ROOFS)),
-        (terrain.road, "road", Line2D([], [], color=ROAD, lw=2.2)),
-        (terrain.water, "water", Patch(facecolor=WATER)),
-        (terrain.forest, "trees", Patch(facecolor=TREES, alpha=0.65)),
-        (terrain.wire, "wire", Line2D([], [], color=MAST, lw=0.9, marker="P", ms=3.2)),
-        (terrain.car, "cars", Line2D([], [], color=CAR, lw=0.9, ls=(0, (1, 1.2)))),
+        (len(scene.buildings), "building", Patch(facecolor=ROOFS)),
+        (scene.roads, "road", Line2D([], [], color=ROAD, lw=2.2)),
+        (len(scene.waters), "water", Patch(facecolor=WATER)),
+        (len(scene.trees), "trees", Patch(facecolor=TREES, alpha=0.65)),
+        (len(scene.wires), "wire", Line2D([], [], color=MAST, lw=0.9, marker="P", ms=3.2)),
+        (len(scene.cars), "cars", Line2D([], [], color=CAR, lw=0.9, ls=(0, (1, 1.2)))),
     ]
     shown = [(handle, text) for there, text, handle in entries if there]
     axes.legend(
@@ -264,7 +283,7 @@ def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
     )
     text += f"   {crs} {east_m:.1f}, {north_m:.1f}"
     if stretch > 1.0:
-        text += f"   north drawn {stretch:.3g} × larger than east"
+        text += f"   north drawn {stretch:.2g} × larger than east"
     heading(axes, text, 3.0, x=1.0, fontsize=7.5, color=MUTED, ha="right")
 
 

@@ -7,9 +7,9 @@ site frame of `sim.site`). Heights are ellipsoidal.
 from __future__ import annotations
 
 import datetime as dt
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -24,12 +24,20 @@ def _zero() -> list[float]:
     return [0.0, 0.0, 0.0]
 
 
+def _none_of_empty(value: Any) -> Any:
+    """TOML has no null."""
+    return None if value == "" else value
+
+
 def _identity() -> list[list[float]]:
     return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
 def _all_roofs() -> list[Roof]:
     return ["gabled", "hipped", "flat"]
+
+
+Wired = Annotated[Name | None, BeforeValidator(_none_of_empty)]
 
 
 class Section(BaseModel):
@@ -75,7 +83,7 @@ class GroundStart(Section):
 class LineTable(Section):
     """``[[line]]``: a flight line, level and straight."""
 
-    name: Name
+    name: Name = Field(description="of the line, in the truth and the picture")
     from_m: Point = Field(description="east, north")
     to_m: Point = Field(description="east, north")
     height_m: float = Field(description="ellipsoidal")
@@ -88,65 +96,67 @@ class LineTable(Section):
 class VillageTable(Section):
     """``[[terrain.village]]``: houses along roads that cross."""
 
-    center_m: Point
+    center_m: Point = Field(description="east, north")
     size_m: Point = Field(description="east, north extent")
     heading_deg: float = Field(0.0, description="of its streets")
-    houses: int = Field(60, ge=1, le=100_000)
-    roofs: list[Roof] = Field(default_factory=_all_roofs, min_length=1)
+    houses: int = Field(
+        60, ge=1, le=100_000, description="on lots along its streets; what has no room beside other things is left out"
+    )
+    roofs: list[Roof] = Field(default_factory=_all_roofs, min_length=1, description="drawn from these")
 
 
 class BuildingTable(Section):
     """``[[terrain.building]]``: one building on a level floor at the terrain's height."""
 
-    center_m: Point
+    center_m: Point = Field(description="east, north")
     size_m: Point = Field(description="along, across its ridge")
     heading_deg: float = Field(0.0, description="of its ridge")
     eaves_m: Positive = Field(6.0, description="above the terrain")
-    roof: Roof = "gabled"
-    roof_pitch_deg: float = Field(35.0, gt=0.0, le=70.0)
+    roof: Roof = Field("gabled", description="flat, of two planes, or of four")
+    roof_pitch_deg: float = Field(35.0, gt=0.0, le=70.0, description="of its planes")
 
 
 class RoadTable(Section):
     """``[[terrain.road]]``: asphalt with painted lines along its edges and middle."""
 
-    points_m: list[Point] = Field(min_length=2)
-    width_m: Positive = 6.0
-    markings: bool = True
+    points_m: list[Point] = Field(min_length=2, description="east, north of its bends")
+    width_m: Positive = Field(6.0, description="of the asphalt")
+    markings: bool = Field(True, description="painted lines, brighter than asphalt")
 
 
 class WaterTable(Section):
     """``[[terrain.water]]``: a level lake; most pulses give no return."""
 
-    center_m: Point
-    radius_m: Positive
+    center_m: Point = Field(description="east, north")
+    radius_m: Positive = Field(description="of its shore")
     returns: float = Field(0.1, ge=0.0, le=1.0, description="share of pulses that come back near nadir")
 
 
 class ForestTable(Section):
     """``[[terrain.forest]]``: trees at random."""
 
-    center_m: Point
-    size_m: Point
-    trees_per_ha: Positive = 150.0
-    height_m: Positive = 18.0
+    center_m: Point = Field(description="east, north")
+    size_m: Point = Field(description="east, north extent")
+    trees_per_ha: Positive = Field(150.0, description="on average")
+    height_m: Positive = Field(18.0, description="of its trees, about")
 
 
 class WireTable(Section):
     """``[[terrain.wire]]``: a conductor between two masts."""
 
-    from_m: Point
-    to_m: Point
+    from_m: Point = Field(description="east, north")
+    to_m: Point = Field(description="east, north")
     height_m: Positive = Field(20.0, description="of its ends above the terrain")
-    sag_m: NotNegative = 4.0
-    diameter_m: Positive = 0.03
+    sag_m: NotNegative = Field(4.0, description="of its middle below its ends")
+    diameter_m: Positive = Field(0.03, description="of the conductor")
 
 
 class CarTable(Section):
     """``[[terrain.car]]``: drives from one point to the other and back again."""
 
-    from_m: Point
-    to_m: Point
-    speed_mps: NotNegative = 14.0
+    from_m: Point = Field(description="east, north")
+    to_m: Point = Field(description="east, north")
+    speed_mps: NotNegative = Field(14.0, description="on the way; 0: parked")
 
 
 class TerrainTable(Section):
@@ -173,7 +183,7 @@ class TerrainTable(Section):
 class ControlTable(Section):
     """``[control]``: ground control points on flat places in the open."""
 
-    points: int = Field(20, ge=0, le=10_000)
+    points: int = Field(20, ge=0, le=10_000, description="how many")
     sigma_m: float = Field(0.01, ge=0.0, le=10.0, description="of the survey, one sigma each of three axes")
 
 
@@ -200,8 +210,8 @@ class PpsTable(Section):
 class OscillatorTable(Section):
     """A device's own oscillator; ``oscillator = {…}`` of IMU and scanners."""
 
-    offset_ppm: float = Field(0.0, ge=-1000.0, le=1000.0)
-    drift_ppm_per_h: float = Field(0.0, ge=-100.0, le=100.0)
+    offset_ppm: float = Field(0.0, ge=-1000.0, le=1000.0, description="its frequency is too high by this")
+    drift_ppm_per_h: float = Field(0.0, ge=-100.0, le=100.0, description="and by this more every hour")
     wander_ppm: float = Field(0.0, ge=0.0, le=10.0, description="size of a slow wave of ten minutes")
     ticks_at_start: int = Field(0, ge=0, lt=2**63, description="so that a counter wraps when it should")
 
@@ -210,12 +220,14 @@ class AtmosphereTable(Section):
     """``[atmosphere]``: what the light does on its way; keys as in the configuration."""
 
     ranges: Literal["corrected", "vacuum"] = Field("corrected", description="vacuum: the scanner counts with c")
-    model: Literal["standard", "measured"] = "standard"
-    temperature_c: float = Field(15.0, ge=-80.0, le=60.0)
-    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0)
-    humidity_percent: float = Field(50.0, ge=0.0, le=100.0)
-    height_m: float = Field(0.0, ge=-500.0, le=12_000.0)
-    refraction: Literal["none", "ardc", "spherical"] = "none"
+    model: Literal["standard", "measured"] = Field(
+        "standard", description="of the air: the standard atmosphere, or what was measured"
+    )
+    temperature_c: float = Field(15.0, ge=-80.0, le=60.0, description="measured")
+    pressure_hpa: float = Field(1013.25, ge=100.0, le=1100.0, description="measured")
+    humidity_percent: float = Field(50.0, ge=0.0, le=100.0, description="measured")
+    height_m: float = Field(0.0, ge=-500.0, le=12_000.0, description="where it was measured")
+    refraction: Literal["none", "ardc", "spherical"] = Field("none", description="how beams bend")
     visibility_km: float = Field(23.0, gt=0.0, description="dims what is far away")
 
 
@@ -225,26 +237,26 @@ class AtmosphereTable(Section):
 class OutageTable(Section):
     """``[[gnss.<name>.outage]]``: no satellites."""
 
-    at_s: NotNegative
-    for_s: Positive
+    at_s: NotNegative = Field(description="seconds after the start")
+    for_s: Positive = Field(description="how long")
 
 
 class JumpTable(Section):
     """``[[gnss.<name>.jump]]``: a wrong fix, as after a cycle slip."""
 
-    at_s: NotNegative
-    for_s: Positive
+    at_s: NotNegative = Field(description="seconds after the start")
+    for_s: Positive = Field(description="how long")
     offset_l_m: Vector = Field(description="north, east, down")
 
 
 class GnssTable(Section):
     """``[gnss.<name>]``: a receiver."""
 
-    protocol: Literal["novatel", "ubx", "nmea"] = "novatel"
-    pps: Name | None = "main"
-    baud: int = Field(460_800, ge=4800, le=4_000_000)
-    grade: Literal["rtk", "ppk", "spp"] = "rtk"
-    rate_hz: Literal[1, 2, 5, 10, 20] = 5
+    protocol: Literal["novatel", "ubx", "nmea"] = Field("novatel", description="that it speaks")
+    pps: Wired = Field("main", description='[pps.<name>] that it drives; "": none')
+    baud: int = Field(460_800, ge=4800, le=4_000_000, description="of its serial line")
+    grade: Literal["rtk", "ppk", "spp"] = Field("rtk", description="of its positions")
+    rate_hz: Literal[1, 2, 5, 10, 20] = Field(5, description="of positions and velocities")
     lever_arm_m: Vector = Field(default_factory=lambda: [0.10, -0.05, -1.20], description="x_a^b")
     secondary_lever_arm_m: Vector | None = Field(None, description="second antenna: heading and pitch are sent too")
     ins: bool = Field(False, description="novatel: solutions of its own INS at 100 Hz, INSPVAX once a second")
@@ -257,30 +269,34 @@ class GnssTable(Section):
 class ImuNoiseTable(Section):
     """``[imu.<name>.noise]``: keys of the configuration, and what only a simulator knows; they override the grade."""
 
-    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0)
-    velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(None, ge=0.0)
-    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0)
-    accel_bias_mg: float | None = Field(None, ge=0.0)
-    gyro_bias_instability_deg_per_h: float | None = Field(None, ge=0.0)
-    accel_bias_instability_mg: float | None = Field(None, ge=0.0)
-    bias_correlation_h: float | None = Field(None, gt=0.0)
-    gyro_scale_ppm: float | None = Field(None, ge=0.0)
-    accel_scale_ppm: float | None = Field(None, ge=0.0)
-    misalignment_mrad: float | None = Field(None, ge=0.0)
+    angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, description="white noise of the gyroscopes")
+    velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
+        None, ge=0.0, description="white noise of the accelerometers"
+    )
+    gyro_bias_deg_per_h: float | None = Field(None, ge=0.0, description="at turn-on, one sigma")
+    accel_bias_mg: float | None = Field(None, ge=0.0, description="at turn-on, one sigma")
+    gyro_bias_instability_deg_per_h: float | None = Field(None, ge=0.0, description="floor of the Allan deviation")
+    accel_bias_instability_mg: float | None = Field(None, ge=0.0, description="floor of the Allan deviation")
+    bias_correlation_h: float | None = Field(None, gt=0.0, description="longest time constant of the drift")
+    gyro_scale_ppm: float | None = Field(None, ge=0.0, description="one sigma")
+    accel_scale_ppm: float | None = Field(None, ge=0.0, description="one sigma")
+    misalignment_mrad: float | None = Field(None, ge=0.0, description="of each axis, one sigma")
 
 
 class ImuTable(Section):
     """``[imu.<name>]``: an IMU on CAN, described by a DBC of its own."""
 
-    grade: Literal["navigation", "tactical", "mems", "perfect"] = "tactical"
-    rate_hz: int = Field(200, ge=10, le=2000)
-    pps: Name | None = "main"
-    rotation_b_imu: Matrix = Field(default_factory=_identity)
-    tick_hz: int = Field(1_000_000, ge=1000, le=100_000_000)
-    tick_bits: Literal[16, 24, 32] = 32
+    grade: Literal["navigation", "tactical", "mems", "perfect"] = Field(
+        "tactical", description="of its sensors; noise overrides it"
+    )
+    rate_hz: int = Field(200, ge=10, le=2000, description="of samples")
+    pps: Wired = Field("main", description='[pps.<name>] that latches its counter; "": none')
+    rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
+    tick_hz: int = Field(1_000_000, ge=1000, le=100_000_000, description="of its counter")
+    tick_bits: Literal[16, 24, 32] = Field(32, description="after which the counter wraps")
     latency_us: float = Field(0.0, ge=-100_000.0, le=100_000.0, description="its stamps are late: imu_latency")
-    oscillator: OscillatorTable = Field(default_factory=OscillatorTable)
-    noise: ImuNoiseTable = Field(default_factory=ImuNoiseTable)
+    oscillator: OscillatorTable = Field(default_factory=OscillatorTable, description="of its counter")
+    noise: ImuNoiseTable = Field(default_factory=ImuNoiseTable, description="single figures instead of the grade's")
 
 
 # ---------------------------------------------------------------------------------------------- scanners
@@ -289,45 +305,45 @@ class ImuTable(Section):
 class ParameterTable(Section):
     """``[scanner.<name>.true]`` and ``[…nominal]``: keys, signs and units of a calibration file."""
 
-    omega_deg: float = 0.0
-    phi_deg: float = 0.0
-    kappa_deg: float = 0.0
-    range_offset_m: float = 0.0
-    range_scale_ppm: float = 0.0
-    scan_angle_offset_deg: float = 0.0
-    scan_angle_scale_ppm: float = 0.0
-    scan_plane_tilt_deg: float = 0.0
-    lever_arm_x_m: float = 0.12
-    lever_arm_y_m: float = -0.03
-    lever_arm_z_m: float = 0.28
-    time_offset_us: float = 0.0
-    imu_latency_us: float = 0.0
-    encoder_latency_us: float = 0.0
-    torsion_us2: float = 0.0
-    pitch_slope_ppm: float = 0.0
+    omega_deg: float = Field(0.0, description="boresight ω")
+    phi_deg: float = Field(0.0, description="boresight φ")
+    kappa_deg: float = Field(0.0, description="boresight κ")
+    range_offset_m: float = Field(0.0, description="added to ranges")
+    range_scale_ppm: float = Field(0.0, description="of ranges")
+    scan_angle_offset_deg: float = Field(0.0, description="the encoder's reading at the centre of the scan")
+    scan_angle_scale_ppm: float = Field(0.0, description="of scan angles")
+    scan_plane_tilt_deg: float = Field(0.0, description="Δη")
+    lever_arm_x_m: float = Field(0.12, description="x_s^b")
+    lever_arm_y_m: float = Field(-0.03, description="x_s^b")
+    lever_arm_z_m: float = Field(0.28, description="x_s^b")
+    time_offset_us: float = Field(0.0, description="the scanner's stamps are early by this")
+    imu_latency_us: float = Field(0.0, description="attitude is taken so much later")
+    encoder_latency_us: float = Field(0.0, description="times the scan's rate, added to the angle")
+    torsion_us2: float = Field(0.0, description="times the scan's acceleration, added to the angle")
+    pitch_slope_ppm: float = Field(0.0, description="of φ with the scan angle")
 
 
 class IbrcTable(Section):
     """``[scanner.<name>.ibrc]``: what intensity does to the range; keys of a calibration file."""
 
-    intensity: list[float] = Field(min_length=2)
-    correction_m: list[float] = Field(min_length=2)
+    intensity: list[float] = Field(min_length=2, description="rising")
+    correction_m: list[float] = Field(min_length=2, description="subtracted from the range at each intensity")
 
 
 class FacetTable(Section):
     """``[[scanner.<name>.facet]]``: a facet's own tilt (pyramid error)."""
 
-    index: int = Field(ge=0)
-    tilt_deg: float
+    index: int = Field(ge=0, description="from 0")
+    tilt_deg: float = Field(description="of its normal, towards forward")
 
 
 class BeamErrorTable(Section):
     """``[[scanner.<name>.beam]]``: corrections of one beam of a multi-beam head."""
 
-    channel: int = Field(ge=0)
-    azimuth_deg: float = 0.0
-    elevation_deg: float = 0.0
-    range_m: float = 0.0
+    channel: int = Field(ge=0, description="from 0")
+    azimuth_deg: float = Field(0.0, description="added")
+    elevation_deg: float = Field(0.0, description="added")
+    range_m: float = Field(0.0, description="added to its ranges")
 
 
 class RangeNoiseTable(Section):
@@ -343,9 +359,9 @@ ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley",
 class ScannerTable(Section):
     """``[scanner.<name>]``: a scanner; what a kind does not use is ignored for it, and named in docs/simulation.md."""
 
-    kind: ScannerKind = "oscillating"
+    kind: ScannerKind = Field("oscillating", description="how it deflects its beam")
     motion: Literal["sine", "triangle"] = Field("sine", description="oscillating: of the mirror")
-    pps: Name | None = "main"
+    pps: Wired = Field("main", description='[pps.<name>] that latches or sets its counter; "": none')
     prf_hz: float = Field(100_000.0, ge=100.0, le=2_000_000.0, description="pulses a second; vlp16, os1: their own")
     scan_hz: float = Field(
         40.0, gt=0.0, le=1000.0, description="oscillations, or turns of the shaft or head, a second; os1: 10 or 20"
@@ -359,29 +375,31 @@ class ScannerTable(Section):
     refractive_index: float = Field(1.51, gt=1.0, le=4.0, description="risley")
     prism_ratio: float = Field(-0.7265625, description="risley: turns of the second prism a turn of the first")
     encoder_counts: int = Field(4_194_304, ge=1000, le=2**30, description="a turn of the shaft")
-    tick_hz: int = Field(10_000_000, ge=100_000, le=1_000_000_000)
-    oscillator: OscillatorTable = Field(default_factory=OscillatorTable)
-    return_slots: int = Field(3, ge=1, le=7)
-    pulses_per_datagram: int = Field(100, ge=1, le=4000)
+    tick_hz: int = Field(10_000_000, ge=100_000, le=1_000_000_000, description="of its counter; vlp16, os1: their own")
+    oscillator: OscillatorTable = Field(
+        default_factory=OscillatorTable, description="of its counter, and of its pulses"
+    )
+    return_slots: int = Field(3, ge=1, le=7, description="returns kept of a pulse; vlp16, os1: their own")
+    pulses_per_datagram: int = Field(100, ge=1, le=4000, description="SREP")
     zone: Literal["resolved", "apparent"] = Field(
         "resolved", description="pulses in air: ranges are whole, or count from the last emission before the echo"
     )
     dual_return: bool = Field(False, description="vlp16, os1")
-    wavelength_nm: float = Field(1064.0, ge=300.0, le=2000.0)
+    wavelength_nm: float = Field(1064.0, ge=300.0, le=2000.0, description="in vacuum")
     divergence_mrad: float = Field(0.5, ge=0.0, le=10.0, description="full angle")
     pulse_ns: float = Field(3.0, gt=0.0, le=50.0, description="length: nearer echoes are one")
-    range_min_m: float = Field(20.0, ge=0.0)
-    range_max_m: float = Field(3000.0, gt=0.0)
+    range_min_m: float = Field(20.0, ge=0.0, description="nearer is not measured")
+    range_max_m: float = Field(3000.0, gt=0.0, description="farther is not measured")
     reference_range_m: float = Field(1000.0, gt=0.0, description="where full reflectance gives full intensity")
-    model: str = "SIM"
-    serial: str = "1"
+    model: str = Field("SIM", description="in its calibration")
+    serial: str = Field("1", description="in its calibration")
     installation: Matrix = Field(default_factory=_identity, description="T, b from s")
     true: ParameterTable = Field(default_factory=ParameterTable, description="what the scanner really is")
     nominal: ParameterTable = Field(default_factory=ParameterTable, description="what its papers say")
-    ibrc: IbrcTable | None = None
-    facet: list[FacetTable] = Field(default_factory=list)
-    beam: list[BeamErrorTable] = Field(default_factory=list)
-    range_noise: RangeNoiseTable = Field(default_factory=RangeNoiseTable)
+    ibrc: IbrcTable | None = Field(None, description="intensity-dependent range")
+    facet: list[FacetTable] = Field(default_factory=list, description="polygon")
+    beam: list[BeamErrorTable] = Field(default_factory=list, description="vlp16, os1")
+    range_noise: RangeNoiseTable = Field(default_factory=RangeNoiseTable, description="of ranges")
     on_lines_only: bool = Field(True, description="the laser is off in turns; false: it is always on")
 
 
@@ -398,7 +416,7 @@ class FaultTable(Section):
     source: str = Field(
         pattern=r"^(host|(gnss|imu|scanner|pps)/[A-Za-z0-9_-]+(/aux)?)$", description="kind/name, or host"
     )
-    kind: FaultKind
+    kind: FaultKind = Field(description="what goes wrong")
     at_s: NotNegative = Field(description="seconds after the start")
     for_s: NotNegative = Field(0.0, description="how long; 0: at that moment only")
     delay_s: float = Field(0.5, gt=0.0, le=60.0, description="late: by how much")

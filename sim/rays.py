@@ -1,39 +1,53 @@
 """Where a ray meets one thing: compiled functions of plain numbers.
 
-A ray is ``(x, y, z, dx, dy, dz)``: origin and unit direction in the site frame. Distances along it are metres from the
-origin; infinity: never.
+A ray is ``(x, y, z, dx, dy, dz, 1 / dx, 1 / dy)``: origin and unit direction in the site frame. Distances along it are
+metres from the origin; infinity: never.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-Ray = tuple[float, float, float, float, float, float]
+Ray = tuple[float, float, float, float, float, float, float, float]
 
+PLANE = 6  # numbers of a plane's row
 NEVER = math.inf
 UNDERGROUND = -1.0
-_MIX_1, _MIX_2, _GOLDEN = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB), np.uint64(0x9E3779B97F4A7C15)
+Compiled = TypeVar("Compiled", bound=Callable[..., Any])
+
+
+def kernel(function: Compiled) -> Compiled:
+    """Compile for other compiled functions alone: no way in from Python; x / 0 is infinite, which spares a branch."""
+    compiled: Compiled = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
+        function
+    )
+    return compiled
+
+
+_MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_ODD_1, _ODD_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03)
+_ODD_3, _ODD_4 = np.uint64(0x8CB92BA72F3D8DD7), np.uint64(0xAEF17502108EF2D9)
 _S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31)
 
 
-@numba.njit(cache=True)
+@kernel
 def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
     """A number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al. 2014)."""
-    state = np.uint64(seed)
-    for name in (number, purpose, draw):
-        state = (state ^ np.uint64(name)) + _GOLDEN
-        state = (state ^ (state >> _S30)) * _MIX_1
-        state = (state ^ (state >> _S27)) * _MIX_2
-        state = state ^ (state >> _S31)
-    return np.float64(state >> _S11) * 2.0**-53
+    state = np.uint64(seed) * _ODD_1 + np.uint64(number) * _ODD_2 + np.uint64(purpose) * _ODD_3
+    state += np.uint64(draw) * _ODD_4
+    state = (state ^ (state >> _S30)) * _MIX_1
+    state = (state ^ (state >> _S27)) * _MIX_2
+    return float((state ^ (state >> _S31)) >> _S11) * 2.0**-53
 
 
-@numba.njit(cache=True)
+@kernel
 def patch_root(height: float, slope: float, bend: float) -> float:
     """Smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a patch."""
     inside = slope * slope - 4.0 * bend * height
@@ -46,23 +60,21 @@ def patch_root(height: float, slope: float, bend: float) -> float:
     return NEVER
 
 
-@numba.njit(cache=True)
-def boundary(at: float, step: float, low: float, size: float, index: int) -> float:
+@kernel
+def boundary(at: float, step: float, per_step: float, low: float, size: float, index: int) -> float:
     """Distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
     if step > 0.0:
-        return (low + (index + 1) * size - at) / step
-    if step < 0.0:
-        return (low + index * size - at) / step
-    return NEVER
+        return (low + (index + 1) * size - at) * per_step
+    return (low + index * size - at) * per_step if step < 0.0 else NEVER
 
 
-@numba.njit(cache=True)
+@kernel
 def slice_at(value: float, low: float, size: float, count: int) -> int:
     """Index of the slice that holds a value, the nearest one beyond the ends."""
     return min(max(math.floor((value - low) / size), 0), count - 1)
 
 
-@numba.njit(cache=True)
+@kernel
 def ground_entry(
     z: FloatArray, west: float, south: float, cell: float, ray: Ray, start: float, stop: float, fresh: bool
 ) -> float:
@@ -71,20 +83,20 @@ def ground_entry(
     Within a cell the height of the ray above the patch is a quadratic of the distance; it is set up at the ray's entry
     into the cell, so that nothing large cancels. `UNDERGROUND` where a ``fresh`` ray begins below.
     """
-    ox, oy, oz, dx, dy, dz = ray
-    columns, rows = z.shape[1] - 1, z.shape[0] - 1
+    ox, oy, oz, dx, dy, dz, per_dx, per_dy = ray
+    columns, rows, per_cell = z.shape[1] - 1, z.shape[0] - 1, 1.0 / cell
     column = slice_at(ox + start * dx, west, cell, columns)
     row = slice_at(oy + start * dy, south, cell, rows)
     at = start
-    while True:
-        leave_x, leave_y = boundary(ox, dx, west, cell, column), boundary(oy, dy, south, cell, row)
+    while 0 <= column < columns and 0 <= row < rows:
+        leave_x, leave_y = boundary(ox, dx, per_dx, west, cell, column), boundary(oy, dy, per_dy, south, cell, row)
         leave = max(at, min(stop, leave_x, leave_y))
         z00, z10, z01, z11 = z[row, column], z[row, column + 1], z[row + 1, column], z[row + 1, column + 1]
         here = oz + at * dz
         if min(here, oz + leave * dz) <= max(z00, z10, z01, z11) + 1e-6:
             a, b, twist = z10 - z00, z01 - z00, z11 - z10 - z01 + z00
-            u, v = (ox + at * dx - west) / cell - column, (oy + at * dy - south) / cell - row
-            du, dv = dx / cell, dy / cell
+            u, v = (ox + at * dx - west) * per_cell - column, (oy + at * dy - south) * per_cell - row
+            du, dv = dx * per_cell, dy * per_cell
             height = here - (z00 + a * u + b * v + twist * u * v)
             if height <= 0.0:
                 return UNDERGROUND if fresh and height < -1e-9 else at
@@ -99,11 +111,10 @@ def ground_entry(
             column += 1 if dx > 0.0 else -1
         else:
             row += 1 if dy > 0.0 else -1
-        if column < 0 or row < 0 or column >= columns or row >= rows:
-            return NEVER
+    return NEVER
 
 
-@numba.njit(cache=True)
+@kernel
 def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> tuple[float, float]:
     """Slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
@@ -114,7 +125,7 @@ def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: floa
     return (z10 - z00 + twist * v) / cell, (z01 - z00 + twist * u) / cell
 
 
-@numba.njit(cache=True)
+@kernel
 def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> float:
     """Site z of the bilinear ground at a place."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
@@ -125,10 +136,10 @@ def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y:
     return float((1.0 - v) * southern + v * northern)
 
 
-@numba.njit(cache=True)
+@kernel
 def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
     """Distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
-    ox, oy, oz, dx, dy, dz = ray
+    ox, oy, oz, dx, dy, dz, _, _ = ray
     wx, wy, wz = x - ox, y - oy, z - oz
     along = wx * dx + wy * dy + wz * dz
     if wx * wx + wy * wy + wz * wz - along * along > radius * radius or along < -radius:
@@ -136,20 +147,21 @@ def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
     return along
 
 
-@numba.njit(cache=True)
-def solid_entry(plane: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float]:
-    """Where a ray enters the body behind planes ``first … last − 1``: distance, plane, distance of an edge in reach.
+@kernel
+def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float, float]:
+    """Where a ray enters the body behind the planes in ``rows[first:last]`` (`Things.plane`).
 
-    The last is finite where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
+    Returns distance, where the plane's row begins, cosine of incidence, and the distance of an edge in reach: finite
+    where the beam's rim, ``grow`` from its axis, may meet something else than the axis does.
     """
-    ox, oy, oz, dx, dy, dz = ray
-    enter, leave, wide_enter, wide_leave, through = -NEVER, NEVER, -NEVER, NEVER, -1
-    for k in range(first, last):
-        speed = plane[k, 0] * dx + plane[k, 1] * dy + plane[k, 2] * dz
-        gap = plane[k, 3] - (plane[k, 0] * ox + plane[k, 1] * oy + plane[k, 2] * oz)
+    ox, oy, oz, dx, dy, dz, _, _ = ray
+    enter, leave, wide_enter, wide_leave, through, cos = -NEVER, NEVER, -NEVER, NEVER, first, 1.0
+    for k in range(first, last, PLANE):
+        speed = rows[k] * dx + rows[k + 1] * dy + rows[k + 2] * dz
+        gap = rows[k + 3] - (rows[k] * ox + rows[k + 1] * oy + rows[k + 2] * oz)
         if speed == 0.0:
             if gap < -grow:
-                return NEVER, -1, NEVER
+                return NEVER, first, 1.0, NEVER
             if gap < 0.0:
                 enter = NEVER
             continue
@@ -157,28 +169,27 @@ def solid_entry(plane: FloatArray, first: int, last: int, ray: Ray, grow: float)
         if speed < 0.0:
             wide_enter = max(wide_enter, at + grow / speed)
             if at > enter:
-                enter, through = at, k
+                enter, through, cos = at, k, -speed
         else:
             leave, wide_leave = min(leave, at), min(wide_leave, at + grow / speed)
     if wide_enter > wide_leave or wide_leave < 0.0:
-        return NEVER, -1, NEVER
+        return NEVER, first, 1.0, NEVER
     if enter >= leave or enter <= 0.0:
-        return NEVER, -1, max(wide_enter, 0.0)
-    cos = -(plane[through, 0] * dx + plane[through, 1] * dy + plane[through, 2] * dz)
+        return NEVER, first, 1.0, max(wide_enter, 0.0)
     x, y, z, reach = ox + enter * dx, oy + enter * dy, oz + enter * dz, grow / max(cos, 0.02)
-    for k in range(first, last):
-        if k != through and plane[k, 3] - (plane[k, 0] * x + plane[k, 1] * y + plane[k, 2] * z) < reach:
-            return enter, through, enter
-    return enter, through, NEVER
+    for k in range(first, last, PLANE):
+        if k != through and rows[k + 3] - (rows[k] * x + rows[k + 1] * y + rows[k + 2] * z) < reach:
+            return enter, through, cos, enter
+    return enter, through, cos, NEVER
 
 
-@numba.njit(cache=True)
-def crown_span(tree: FloatArray, ray: Ray) -> tuple[float, float]:
-    """Where a ray enters and leaves an upright ellipsoid (row of `Things.tree`)."""
-    ox, oy, oz, dx, dy, dz = ray
-    radius, half = tree[3], tree[4]
-    px, py, pz = (ox - tree[0]) / radius, (oy - tree[1]) / radius, (oz - tree[2]) / half
-    ux, uy, uz = dx / radius, dy / radius, dz / half
+@kernel
+def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
+    """Where a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
+    ox, oy, oz, dx, dy, dz, _, _ = ray
+    across, upright = rows[tree + 3], rows[tree + 4]
+    px, py, pz = (ox - rows[tree]) * across, (oy - rows[tree + 1]) * across, (oz - rows[tree + 2]) * upright
+    ux, uy, uz = dx * across, dy * across, dz * upright
     a = ux * ux + uy * uy + uz * uz
     b = px * ux + py * uy + pz * uz
     inside = b * b - a * (px * px + py * py + pz * pz - 1.0)
@@ -188,12 +199,12 @@ def crown_span(tree: FloatArray, ray: Ray) -> tuple[float, float]:
     return (-b - root) / a, (root - b) / a
 
 
-@numba.njit(cache=True)
-def wire_passage(wire: FloatArray, ray: Ray) -> tuple[float, float, float]:
-    """Where a ray passes a piece of wire: distance, miss distance, cosine of incidence; beside its ends it does not."""
-    ox, oy, oz, dx, dy, dz = ray
-    ux, uy, uz = wire[3] - wire[0], wire[4] - wire[1], wire[5] - wire[2]
-    wx, wy, wz = ox - wire[0], oy - wire[1], oz - wire[2]
+@kernel
+def wire_passage(rows: FloatArray, wire: int, ray: Ray) -> tuple[float, float, float]:
+    """Where a ray passes a piece of wire (`Things.wire`): distance, miss distance, cosine; never beside its ends."""
+    ox, oy, oz, dx, dy, dz, _, _ = ray
+    ux, uy, uz = rows[wire + 3] - rows[wire], rows[wire + 4] - rows[wire + 1], rows[wire + 5] - rows[wire + 2]
+    wx, wy, wz = ox - rows[wire], oy - rows[wire + 1], oz - rows[wire + 2]
     square = ux * ux + uy * uy + uz * uz
     along, ahead, behind = dx * ux + dy * uy + dz * uz, dx * wx + dy * wy + dz * wz, ux * wx + uy * wy + uz * wz
     across = square - along * along

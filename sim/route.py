@@ -61,9 +61,11 @@ class Arc:
     @property
     def end(self) -> Pose:
         """Where it ends."""
-        east_m, north_m = self.positions(np.array([self.length_m]))[0]
-        turned = self.start.course_rad + self.curvature_per_m * self.length_m
-        return Pose(float(east_m), float(north_m), turned)
+        half_turn = 0.5 * self.curvature_per_m * self.length_m
+        chord_m = self.length_m * (math.sin(half_turn) / half_turn if half_turn else 1.0)
+        course = self.start.course_rad + half_turn
+        east_m = self.start.east_m + chord_m * math.sin(course)
+        return Pose(east_m, self.start.north_m + chord_m * math.cos(course), course + half_turn)
 
 
 Way = tuple[Arc, ...]
@@ -91,8 +93,8 @@ class Turning:
 
 def shortest_way(start: Pose, end: Pose, turning: Turning) -> Way:
     """The shortest way from pose to pose; of no arc where both are the same."""
-    ways = list(_ways(start, end, turning))
-    return min(ways, key=length_m)
+    words = _words(start, end, turning)
+    return _way(start, min(words, key=lambda word: word.radius_m * sum(word.parts)))
 
 
 def way_of_length(start: Pose, end: Pose, turning: Turning, least_m: float) -> Way:
@@ -121,31 +123,38 @@ def _circles(start: Pose, way: Way, turning: Turning, count: int) -> Way:
     return (Arc(start, count * TURN * turning.radius_m, math.copysign(1.0 / turning.radius_m, curvature)),)
 
 
-def _ways(start: Pose, end: Pose, turning: Turning) -> Iterator[Way]:
-    """Every word there is, with the radius it must be flown with."""
-    for side in (1, -1):
-        for radius_m in (turning.radius_m, turning.reversal_radius_m):
-            distance_m = math.hypot(end.east_m - start.east_m, end.north_m - start.north_m)
-            bearing = math.atan2(end.east_m - start.east_m, end.north_m - start.north_m)
-            words = _words(
-                side * (start.course_rad - bearing), side * (end.course_rad - bearing), distance_m / radius_m
-            )
-            for turns, parts in words:
-                wide_m = _radius_of(turns, parts[1] * radius_m, turning)
-                if radius_m >= wide_m:
-                    yield _way(start, [side * turn for turn in turns], parts, radius_m)
+@dataclass(frozen=True, slots=True)
+class _Word:
+    """Three turns (1 right, 0 none, −1 left) and how long they are, in radii."""
+
+    turns: tuple[int, int, int]
+    parts: tuple[float, float, float]
+    radius_m: float
+
+    def fits(self, turning: Turning) -> bool:
+        """Whether the radius is as wide as the word needs."""
+        near = self.parts[1] * self.radius_m < turning.reversal_gap_m
+        reverses = self.turns[1] != 0 or (self.turns[0] != self.turns[2] and near)
+        return self.radius_m >= (turning.reversal_radius_m if reverses else turning.radius_m)
 
 
-def _radius_of(turns: tuple[int, int, int], middle_m: float, turning: Turning) -> float:
-    """Of a word whose middle part is so long."""
-    reverses = turns[1] != 0 or (turns[0] != turns[2] and middle_m < turning.reversal_gap_m)
-    return turning.reversal_radius_m if reverses else turning.radius_m
+def _words(start: Pose, end: Pose, turning: Turning) -> Iterator[_Word]:
+    """All there are, each with the radii it may be flown with."""
+    east_m, north_m = end.east_m - start.east_m, end.north_m - start.north_m
+    bearing, distance_m = math.atan2(east_m, north_m), math.hypot(east_m, north_m)
+    for radius_m in (turning.radius_m, turning.reversal_radius_m):
+        for side in (1, -1):
+            alpha, beta = side * (start.course_rad - bearing), side * (end.course_rad - bearing)
+            for (first, middle, last), parts in _right_words(alpha, beta, distance_m / radius_m):
+                word = _Word((side * first, side * middle, side * last), parts, radius_m)
+                if word.fits(turning):
+                    yield word
 
 
-def _words(
+def _right_words(
     alpha: float, beta: float, distance: float
 ) -> Iterator[tuple[tuple[int, int, int], tuple[float, float, float]]]:
-    """LSL, LSR and LRL of Shkel and Lumelsky, lengths in radii; their mirror images are the other three."""
+    """LSL, LRL and LSR of Shkel and Lumelsky, their left being right; the mirror images are the other three."""
     x, y = distance + math.sin(alpha) - math.sin(beta), math.cos(beta) - math.cos(alpha)
     between, heading = math.hypot(x, y), math.atan2(y, x)
     yield (1, 0, 1), (_positive(heading - alpha), between, _positive(beta - heading))
@@ -165,11 +174,11 @@ def _positive(angle_rad: float) -> float:
     return 0.0 if angle_rad > TURN - _NO_TURN_RAD else angle_rad
 
 
-def _way(start: Pose, turns: list[int], parts: tuple[float, float, float], radius_m: float) -> Way:
+def _way(start: Pose, word: _Word) -> Way:
     arcs: list[Arc] = []
-    for turn, part in zip(turns, parts, strict=True):
+    for turn, part in zip(word.turns, word.parts, strict=True):
         if part > 0.0:
-            arcs.append(Arc(arcs[-1].end if arcs else start, part * radius_m, turn / radius_m))
+            arcs.append(Arc(arcs[-1].end if arcs else start, part * word.radius_m, turn / word.radius_m))
     return tuple(arcs)
 
 

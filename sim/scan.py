@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -63,8 +64,10 @@ class Scanner:
         self._start_gps_ns = start_gps_ns
         true = table.true
         self._lever_arm_b = np.array([true.lever_arm_x_m, true.lever_arm_y_m, true.lever_arm_z_m])
-        self._installation = np.array(table.installation)
-        self._boresight_rad = np.radians([true.omega_deg, true.phi_deg, true.kappa_deg])
+        kappa = Rotation.from_euler("z", true.kappa_deg, degrees=True).as_matrix()
+        self._rot_kappa_installation = kappa @ np.array(table.installation, dtype=np.float64)
+        self._phi_rad = float(np.radians(true.phi_deg))
+        self._rot_omega = Rotation.from_euler("x", true.omega_deg, degrees=True).as_matrix()
 
     def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
         """Everything until a time, block by block: units in order of time, truth of the returns in them."""
@@ -100,23 +103,15 @@ class Scanner:
 
     def beams(self, pulses: Pulses, poses: Poses) -> Beams:
         """Axes of pulses as they leave (ISO/TS 19159-2 Eq. 10)."""
-        directions_b = self._to_body(pulses.direction_s, pulses.phi_extra_rad)
-        origins_b = self._to_body(pulses.origin_s, pulses.phi_extra_rad) + self._lever_arm_b
-        directions_e = np.einsum("nij,nj->ni", poses.rot_e_from_b, directions_b)
-        origins_e = poses.position_e + np.einsum("nij,nj->ni", poses.rot_e_from_b, origins_b)
-        return Beams(origins_e, self._site.site_from_e(origins_e), directions_e @ self._site.rot_site_from_e.T)
-
-    def _to_body(self, vectors_s: FloatArray, phi_extra_rad: FloatArray) -> FloatArray:
-        """s → b: installation, then κ, φ (each pulse with its own slope), ω."""
-        omega, phi, kappa = self._boresight_rad
-        turned = vectors_s @ self._installation.T @ Rotation.from_euler("z", kappa).as_matrix().T
-        pitched = np.empty_like(turned)
-        cos, sin = np.cos(phi + phi_extra_rad), np.sin(phi + phi_extra_rad)
-        pitched[:, 0] = cos * turned[:, 0] + sin * turned[:, 2]
-        pitched[:, 1] = turned[:, 1]
-        pitched[:, 2] = cos * turned[:, 2] - sin * turned[:, 0]
-        rolled: FloatArray = pitched @ Rotation.from_euler("x", omega).as_matrix().T
-        return rolled
+        origin_e, origin, direction = np.empty((3, len(pulses), 3))
+        _axes(
+            (pulses.origin_s, pulses.direction_s, pulses.phi_extra_rad),
+            (self._rot_kappa_installation, self._phi_rad, self._rot_omega, self._lever_arm_b),
+            (poses.position_e, poses.rot_e_from_b),
+            (self._site.origin_e, self._site.rot_site_from_e),
+            (origin_e, origin, direction),
+        )
+        return Beams(origin_e, origin, direction)
 
     def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
         """Echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
@@ -170,6 +165,38 @@ class Scanner:
         rows["return_number"] = np.arange(1, echoes.range_m.shape[1] + 1)
         rows["surface"] = echoes.surface
         return rows
+
+
+@numba.njit(cache=True)
+def _turned(rotation, vector):  # type: ignore[no-untyped-def]
+    """A vector (3,) by a matrix (3, 3), as three numbers."""
+    return (
+        rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
+        rotation[1, 0] * vector[0] + rotation[1, 1] * vector[1] + rotation[1, 2] * vector[2],
+        rotation[2, 0] * vector[0] + rotation[2, 1] * vector[1] + rotation[2, 2] * vector[2],
+    )
+
+
+@numba.njit(cache=True)
+def _axes(pulses, mounting, poses, site, out):  # type: ignore[no-untyped-def]
+    """s → b (installation and κ, then φ with each pulse's slope, then ω) → e → site frame, pulse by pulse."""
+    origin_s, direction_s, phi_extra = pulses
+    rot_kappa_installation, phi, rot_omega, lever_arm_b = mounting
+    position_e, rot_e_from_b = poses
+    site_e, rot_site_from_e = site
+    origin_e, origin, direction = out
+    for n in range(len(direction_s)):
+        cos, sin = np.cos(phi + phi_extra[n]), np.sin(phi + phi_extra[n])
+        x, y, z = _turned(rot_kappa_installation, direction_s[n])
+        body = _turned(rot_omega, (cos * x + sin * z, y, cos * z - sin * x))
+        direction[n, 0], direction[n, 1], direction[n, 2] = _turned(rot_site_from_e, _turned(rot_e_from_b[n], body))
+        x, y, z = _turned(rot_kappa_installation, origin_s[n])
+        x, y, z = _turned(rot_omega, (cos * x + sin * z, y, cos * z - sin * x))
+        arm = _turned(rot_e_from_b[n], (x + lever_arm_b[0], y + lever_arm_b[1], z + lever_arm_b[2]))
+        for k in range(3):
+            origin_e[n, k] = position_e[n, k] + arm[k]
+        there = (origin_e[n, 0] - site_e[0], origin_e[n, 1] - site_e[1], origin_e[n, 2] - site_e[2])
+        origin[n, 0], origin[n, 1], origin[n, 2] = _turned(rot_site_from_e, there)
 
 
 def _cuts(start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from sim.casting import CARS, LAKES, ROADS, SOLIDS, TREES, WIRES, SceneArrays
+from sim.casting import CARS, COVERS, LAKES, ROADS, SOLIDS, THINGS, TREES, WIRES, Frame, SceneArrays
 from sim.cells import CELL_M, Listed, build_cells
 from sim.clocks import generator
 from sim.echoes import cast_pulses
@@ -23,6 +23,7 @@ from sim.objects import (
     build_solids,
     build_trees,
     build_wires,
+    flat,
     near_circles,
     near_pieces,
 )
@@ -182,9 +183,8 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
     wires = [wire for wire in table.wire if _covered(ground, [wire.from_m, wire.to_m])]
     cars = build_cars([car for car in table.car if _covered(ground, [car.from_m, car.to_m])], table.seed)
     things = Things(
-        solids.ball,
-        solids.first_plane,
         solids.plane,
+        solids.solid,
         _standing(build_trees(table.forest, ground, table.seed), ground, houses, road, water),
         build_wires(wires, ground),
         cars,
@@ -198,7 +198,7 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
         solids.polygon,
         roads,
         water[:, [0, 1, 6]],
-        things.tree[:, [0, 1, 3]],
+        np.column_stack([things.tree[:, :2], 1 / things.tree[:, 3]]),
         np.array([[*wire.from_m, *wire.to_m] for wire in wires]).reshape(-1, 4),
         cars[:, :4],
         _arrays(plan, ground, things, solids),
@@ -234,7 +234,7 @@ def _on_grid(ground: Ground, houses: Houses) -> NDArray[np.bool_]:
 
 def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArray, water: FloatArray) -> FloatArray:
     """Trees on the grid that touch no house, no water and no road."""
-    place, radius = trees[:, :2], trees[:, 3]
+    place, radius = trees[:, :2], 1 / trees[:, 3]
     taken = near_circles(place, radius, houses.center_m, houses.radius_m)
     taken |= near_circles(place, radius, water[:, :2], water[:, 6])
     taken |= near_pieces(place, radius, road[:, :4], road[:, 4])
@@ -244,36 +244,34 @@ def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArra
 def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids) -> SceneArrays:
     """Tables and lists for the compiled functions."""
     foot_m = _footprint_m(list(plan.tables.scanner.values()))
-    tree, wire = things.tree, things.wire
-    of_tree = np.concatenate([tree[:, :2] - tree[:, 3:4], tree[:, :2] + tree[:, 3:4]], axis=1)
+    rows, starts = flat(things)
+    tree, wire, lake = things.tree, things.wire, things.lake
     of_wire = np.concatenate([np.minimum(wire[:, :2], wire[:, 3:5]), np.maximum(wire[:, :2], wire[:, 3:5])], axis=1)
-    listed = [
-        _listed(SOLIDS, 4, np.arange(len(solids.box)), solids.box, solids.top_z, foot_m),
-        _listed(TREES, 4, np.arange(len(tree)), of_tree, tree[:, 2] + tree[:, 4], 0.0),
-        _listed(WIRES, 4, np.arange(len(wire)), of_wire, np.maximum(wire[:, 2], wire[:, 5]) + foot_m, foot_m),
-        _cars_listed(things.car, ground, foot_m),
-    ]
-    of_road = _pieces(things.road[:, :4])
-    lake = things.lake
-    of_lake = np.concatenate([lake[:, :2] - lake[:, 6:7], lake[:, :2] + lake[:, 6:7]], axis=1)
-    covers = [
-        _listed(ROADS, 2, of_road[0], of_road[1], np.zeros(len(of_road[0])), things.road[of_road[0], 4]),
-        _listed(LAKES, 2, np.arange(len(lake)), of_lake, np.zeros(len(lake)), 1.0),
-    ]
-    cells = build_cells(ground, listed, covers)
-    floor_z, roof_z = float(np.min(ground.z)) - 1.0, float(np.max(cells.top)) + 1.0
-    return SceneArrays(
-        np.ascontiguousarray(ground.z),
-        ground.west_m,
-        ground.south_m,
-        ground.cell_m,
-        floor_z,
-        roof_z,
-        plan.tables.terrain.reflectance,
-        plan.tables.flight.seed,
-        cells,
-        Things._make(np.ascontiguousarray(table) for table in things),
+    piece, of_road = _pieces(things.road[:, :4])
+    driven, of_car, car_top = _driven(things.car, ground)
+    cells = build_cells(
+        ground,
+        [
+            _listed(THINGS, SOLIDS, starts["solid"], solids.box, solids.top_z, foot_m),
+            _listed(
+                THINGS, TREES, starts["tree"], _around(tree[:, :2], 1 / tree[:, 3]), tree[:, 2] + 1 / tree[:, 4], 0.0
+            ),
+            _listed(THINGS, WIRES, starts["wire"], of_wire, np.maximum(wire[:, 2], wire[:, 5]) + foot_m, foot_m),
+            _listed(THINGS, CARS, starts["car"][driven], of_car, car_top, foot_m + _CAR_REACH_M),
+        ],
+        [
+            _listed(COVERS, ROADS, starts["road"][piece], of_road, np.zeros(len(piece)), things.road[piece, 4]),
+            _listed(COVERS, LAKES, starts["lake"], _around(lake[:, :2], lake[:, 6]), np.zeros(len(lake)), 1.0),
+        ],
     )
+    floor_z, roof_z = float(np.min(ground.z)) - 1.0, float(np.max(cells.top)) + 1.0
+    table = plan.tables.terrain
+    frame = Frame(ground.west_m, ground.south_m, ground.cell_m, CELL_M, floor_z, roof_z, table.reflectance)
+    return SceneArrays(frame, ground.z, *cells, rows, plan.tables.flight.seed)
+
+
+def _around(center: FloatArray, radius: FloatArray) -> FloatArray:
+    return np.concatenate([center - radius[:, np.newaxis], center + radius[:, np.newaxis]], axis=1)
 
 
 def _footprint_m(scanners: list[ScannerTable]) -> float:
@@ -283,11 +281,11 @@ def _footprint_m(scanners: list[ScannerTable]) -> float:
 
 
 def _listed(
-    kind: int, kinds: int, row: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
+    kinds: int, kind: int, start: IntArray, box: FloatArray, top_z: FloatArray, wider_m: FloatArray | float
 ) -> Listed:
     """Objects of a kind, in boxes made wider on all sides."""
     wider = np.broadcast_to(wider_m, len(box))[:, np.newaxis]
-    return Listed(kinds * row + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
+    return Listed(kinds * start + kind, np.concatenate([box[:, :2] - wider, box[:, 2:] + wider], axis=1), top_z)
 
 
 def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -303,12 +301,11 @@ def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
     return row, np.concatenate([np.minimum(first, last), np.maximum(first, last)], axis=1)
 
 
-def _cars_listed(cars: FloatArray, ground: Ground, foot_m: float) -> Listed:
-    """Cars everywhere along their ways, below the highest ground of each piece."""
+def _driven(cars: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Pieces of the cars' ways: the car of each, its box (m, 4), and what the car does not exceed there (m,)."""
     row, box = _pieces(cars[:, :4])
     across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))
     x = box[:, np.newaxis, :1] + across[:, np.newaxis] * (box[:, 2:3] - box[:, :1])[:, np.newaxis]
     y = box[:, np.newaxis, 1:2] + across[:, np.newaxis] * (box[:, 3:] - box[:, 1:2])[:, np.newaxis]
     z = ground.site_z(*np.broadcast_arrays(x, np.swapaxes(y, 1, 2)))
-    top_z = np.max(z, axis=(1, 2), initial=-np.inf) + CAR_SIZE_M[2] + 1.0
-    return _listed(CARS, 4, row, box, top_z, foot_m + _CAR_REACH_M)
+    return row, box, np.max(z, axis=(1, 2), initial=-np.inf) + CAR_SIZE_M[2] + 1.0

@@ -10,7 +10,6 @@ import json
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.scanner.ouster_head import SYNC_PULSE, read_head
 from drivers.scanner.ouster_layout import LidarLayout
@@ -18,7 +17,16 @@ from sim.clocks import PulsePerSecond
 from sim.errors import PlanError
 from sim.plan import Plan
 from sim.plan_tables import ScannerTable
-from sim.scanners.spinning_wire import Arrivals, HeadClock, PacketCutter, Windows, head_config, two_returns
+from sim.scanners.spinning_wire import (
+    Arrivals,
+    HeadClock,
+    PacketCutter,
+    Windows,
+    best_slot,
+    counts,
+    head_config,
+    in_slot,
+)
 from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
 from sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
@@ -111,18 +119,16 @@ class OusterWire:
             measured: of them, (n, R).
             truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
         """
-        raw = np.rint(measured.range_m / RANGE_UNIT_M)
-        raw = np.where((raw >= 1) & (raw <= RANGE_MAX_RAW), raw, 0).astype(np.int64)
-        light = np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
+        raw, light = counts(measured, RANGE_UNIT_M, RANGE_MAX_RAW)
         number, time_s, raw, light, truth = self._cutter.take([pulses.number, pulses.time_s, raw, light, truth])
         if len(number) == 0:
             return [], np.empty(0, RETURN_TRUTH_DTYPE)
-        slots = two_returns(np.where(raw > 0, light, -1))[: 2 if self._dual else 1]
+        slots = _strongest(raw, light, 2 if self._dual else 1)
         fields: dict[str, IntArray] = {}
         for slot, which in zip(slots, ("", "2"), strict=False):
-            fields[f"RANGE{which}"] = _picked(raw, slot)
+            fields[f"RANGE{which}"] = in_slot(raw, slot)
             # the parser's intensity is the signal: it and the reflectivity are what the receiver says
-            fields[f"SIGNAL{which}"] = fields[f"REFLECTIVITY{which}"] = _picked(light, slot)
+            fields[f"SIGNAL{which}"] = fields[f"REFLECTIVITY{which}"] = in_slot(light, slot)
         return self._packets(number, time_s, fields), _truth(raw, slots, truth)
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
@@ -150,12 +156,17 @@ class OusterWire:
         return units
 
 
-def _picked(values: IntArray, slot: IntArray) -> IntArray:
-    """(n,) of values (n, R) in these slots (n,); 0 where it is −1."""
-    return np.where(slot >= 0, values[np.arange(len(values)), slot], 0)
+def _strongest(raw: IntArray, light: IntArray, count: int) -> list[IntArray]:
+    """Slots (n,) of the strongest return, and of the second-strongest where two are wanted."""
+    rank = np.where(raw > 0, light, -1)
+    slots = [best_slot(rank)]
+    if count == 2:
+        rank[np.arange(len(rank)), slots[0]] = -1
+        slots.append(best_slot(rank))
+    return slots
 
 
-def _truth(raw: IntArray, slots: tuple[NDArray[np.int64], ...], truth: StructArray) -> StructArray:
+def _truth(raw: IntArray, slots: list[IntArray], truth: StructArray) -> StructArray:
     """Truth of the returns in these slots, (n,) each, flattened: pulse by pulse, of two the nearer first."""
     pulse = np.arange(len(raw))
     rows = np.stack([truth[pulse, slot] for slot in slots], axis=1)

@@ -32,6 +32,7 @@ CENTIDEGREES = 36_000
 ENCODER_TICKS = 90_112  # a turn of an Ouster's encoder
 VLP16_HZ = (5.0, 20.0)
 OS1_HZ = (10.0, 20.0)
+ROTATION_TOLERANCE = 1e-6
 NOT_OF_HEADS = ("scan_angle_scale_ppm", "scan_plane_tilt_deg", "torsion_us2", "pitch_slope_ppm")
 
 
@@ -171,6 +172,10 @@ def _checked(table: ScannerTable, name: str, beams: int) -> tuple[FloatArray, Fl
         if getattr(table.true, key) != 0.0:
             text = f"got {getattr(table.true, key):g}, want 0: a head that turns full circles has no such error"
             raise PlanError(f"scanner.{name}.true.{key}", text)
+    matrix = np.array(table.installation)
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
+        text = "is no rotation; want perpendicular rows of length 1, right-handed: b from the maker's axes"
+        raise PlanError(f"scanner.{name}.installation", text)
     azimuth_deg, elevation_deg = np.zeros((2, beams))
     for number, beam in enumerate(table.beam):
         if beam.channel >= beams:

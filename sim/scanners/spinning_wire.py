@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim.clocks import Oscillator, PulsePerSecond, generator
 from sim.plan import Plan
 from sim.plan_tables import OscillatorTable, ScannerTable
-from sim.shots import FloatArray, IntArray
+from sim.shots import FloatArray, IntArray, Measured
 
 Windows = Sequence[tuple[float, float]]
 
@@ -117,11 +117,11 @@ class PacketCutter:
 
 
 class Arrivals:
-    """When the host stamps the datagrams of one source: their sending, the network's jitter, never out of order.
+    """When the host stamps the datagrams of one head: their sending, the network's jitter, never out of order.
 
     Args:
         plan: of the flight.
-        source: whose datagrams.
+        source: of the head.
     """
 
     def __init__(self, plan: Plan, source: str) -> None:
@@ -138,20 +138,21 @@ class Arrivals:
         return times_s
 
 
-def two_returns(rank: NDArray[Any], first: NDArray[Any] | None = None) -> tuple[IntArray, IntArray]:
-    """Slots (n,) of the greatest rank of each pulse, and of the greatest of the others; −1 where there is none.
+def counts(measured: Measured, unit_m: float, most: int) -> tuple[IntArray, IntArray]:
+    """Ranges (n, R) in whole units, 0 where there is none or a packet cannot say it; light 0 … 255."""
+    raw = np.rint(measured.range_m / unit_m)
+    raw = np.where((raw >= 1) & (raw <= most), raw, 0)
+    return raw.astype(np.int64), np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
 
-    Args:
-        rank: (n, R), −1 where a slot has no return; of equal ones the first slot's goes before.
-        first: (n,) the first slot where it is known already.
-    """
-    rows = np.arange(len(rank))
-    if first is None:
-        first = np.where(rank.max(axis=1) >= 0, rank.argmax(axis=1), -1)
-    others = rank.copy()
-    others[rows, first] = -1
-    second = np.where(others.max(axis=1) >= 0, others.argmax(axis=1), -1)
-    return first, np.where(first >= 0, second, -1)
+
+def best_slot(rank: IntArray) -> IntArray:
+    """(n,) slot of the greatest rank of each pulse, the first of equal ones; −1 where all of (n, R) are −1."""
+    return np.where(rank.max(axis=1) >= 0, rank.argmax(axis=1), -1)
+
+
+def in_slot(values: IntArray, slot: IntArray) -> IntArray:
+    """(n,) of values (n, R) in these slots (n,); 0 where it is −1."""
+    return np.where(slot >= 0, values[np.arange(len(values)), slot], 0)
 
 
 def head_config(table: ScannerTable, transport: str, protocol: str) -> dict[str, Any]:

@@ -129,6 +129,7 @@ class SrepWire:
         self._jitter_s = 1e-6 * host.udp_jitter_us if noise else 0.0
         self._random = generator(seed, "udp", self._source)
         self._records: RecordMaker = WholeRanges(table) if table.zone == "resolved" else ApparentRanges(table)
+        self._zone = 0 if table.zone == "resolved" else ZONE_UNKNOWN
         self._waiting = no_records(table.return_slots)
         self._owed: StructArray = np.zeros(0, RETURN_TRUTH_DTYPE)
         self._arrived_s = -np.inf
@@ -155,7 +156,7 @@ class SrepWire:
         time_s = time_s[(time_s >= start_s) & (time_s < stop_s)]
         stamp_s = time_s - 1e-6 * self._table.true.time_offset_us  # as of a pulse, so that none seems to go back
         ticks = np.maximum(np.floor(self._oscillator.phase(stamp_s)).astype(np.int64), self._newest_ticks)
-        header = self._headers(ticks, time_s + PROCESSING_S, zone=np.zeros(len(ticks), np.int64), laser=0)
+        header = self._headers(ticks, time_s + PROCESSING_S, np.full(len(ticks), self._zone), laser=0)
         body = np.zeros((len(ticks), 0), pulse_dtype(self._table.return_slots))
         return units + self._arriving(time_s + PROCESSING_S, encode_datagrams(header, body))
 
@@ -177,7 +178,7 @@ class SrepWire:
         sent, self._waiting = waiting.split(int(edges[-1]))
         if not len(sent):
             return [], sent.truth
-        self._newest_ticks = int(sent.ticks[-1])
+        self._newest_ticks, self._zone = int(sent.ticks[-1]), int(sent.zone[-1])
         first_ticks = sent.ticks[edges[:-1]]
         sent.body["ticks"] = sent.ticks - np.repeat(first_ticks, np.diff(edges))
         time_s = sent.time_s[edges[1:] - 1] + PROCESSING_S
@@ -254,10 +255,12 @@ def _datagram_edges(records: Records, pulses: int) -> IntArray:
 
 
 def _encoded(header: StructArray, body: StructArray, edges: IntArray) -> list[bytes]:
-    """Datagrams between edges (m + 1,), those of one length at once."""
+    """Datagrams between edges (m + 1,), those of one length at once: where zones alternate they are many and short."""
     sizes = np.diff(edges)
-    datagrams: list[bytes] = []
-    for start, stop in pairwise([0, *(np.flatnonzero(np.diff(sizes)) + 1).tolist(), len(sizes)]):
-        part = body[edges[start] : edges[stop]].reshape(stop - start, sizes[start])
-        datagrams += encode_datagrams(header[start:stop], part)
+    datagrams = [b""] * len(sizes)
+    for size in np.unique(sizes).tolist():
+        which = np.flatnonzero(sizes == size)
+        part = body[edges[which][:, np.newaxis] + np.arange(size)]
+        for place, data in zip(which.tolist(), encode_datagrams(header[which], part), strict=True):
+            datagrams[place] = data
     return datagrams

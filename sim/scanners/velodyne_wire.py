@@ -7,7 +7,7 @@ Wire format: VLP-16 User Manual 63-9243 rev. D, 9.3. Its clock shows microsecond
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,7 +19,16 @@ from georef.timescales import SECOND_NS, utc_from_gps
 from sim.clocks import PulsePerSecond
 from sim.plan import Plan
 from sim.plan_tables import ScannerTable
-from sim.scanners.spinning_wire import Arrivals, HeadClock, PacketCutter, Windows, head_config, two_returns
+from sim.scanners.spinning_wire import (
+    Arrivals,
+    HeadClock,
+    PacketCutter,
+    Windows,
+    best_slot,
+    counts,
+    head_config,
+    in_slot,
+)
 from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
 from sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
@@ -38,6 +47,14 @@ class Track(Protocol):
 
     def velocity_l(self, time_s: FloatArray) -> FloatArray:
         """(n, 3) north, east, down."""
+
+
+class _Sent(NamedTuple):
+    """A packet whose last firing, or whose making, was at this true time."""
+
+    time_s: float
+    source: str
+    data: bytes
 
 
 class VelodyneWire:
@@ -66,7 +83,7 @@ class VelodyneWire:
         self._groups = BLOCKS // 2 if self._dual else BLOCKS
         self._cutter = PacketCutter(self._groups * PLACES)
         self._arrivals = Arrivals(plan, self._source)
-        self._positions = _Positions(plan, self._source, self._clock, track if pps is not None else None)
+        self._positions = _Positions(plan, f"{self._source}/aux", self._clock, track if pps is not None else None)
 
     def units(self, pulses: Pulses, measured: Measured, truth: StructArray) -> tuple[list[WireUnit], StructArray]:
         """Packets that are complete, in order of time, and the truth of their returns as `VelodyneParser` gives them.
@@ -76,28 +93,30 @@ class VelodyneWire:
             measured: of them, (n, R).
             truth: `RETURN_TRUTH_DTYPE` (n, R), same slots.
         """
-        raw = np.rint(measured.range_m / RANGE_UNIT_M)
-        raw = np.where((raw >= 1) & (raw <= RANGE_MAX_RAW), raw, 0).astype(np.int64)
-        light = np.clip(np.rint(measured.intensity), 0, 255).astype(np.int64)
-        told = [*self._positions.until(float(pulses.time_s[-1]))] if len(pulses) else []
-        number, time_s, encoder, raw, light, truth = self._cutter.take(
-            [pulses.number, pulses.time_s, pulses.encoder, raw, light, truth]
-        )
-        if len(number) == 0:
-            return told, np.empty(0, RETURN_TRUTH_DTYPE)
+        raw, light = counts(measured, RANGE_UNIT_M, RANGE_MAX_RAW)
+        positions = self._positions.until(float(pulses.time_s[-1])) if len(pulses) else []
+        columns = [pulses.number, pulses.time_s, pulses.encoder, raw, light, truth]
+        _, time_s, encoder, raw, light, truth = self._cutter.take(columns)
+        if len(time_s) == 0:
+            return self._arriving(positions), np.empty(0, RETURN_TRUTH_DTYPE)
         content, rows = (_pairs if self._dual else _strongest)(raw, light, truth)
-        units = told + self._packets(time_s, encoder, content)
-        return sorted(units, key=lambda unit: unit.time_s), rows
+        return self._arriving(positions + self._packets(time_s, encoder, content)), rows
 
     def idle(self, start_s: float, stop_s: float) -> list[WireUnit]:
         """Position packets go on while the laser is off."""
-        return self._positions.until(stop_s)
+        return self._arriving(self._positions.until(stop_s))
 
     def close(self) -> tuple[list[WireUnit], StructArray]:
         """A packet that is not full is not sent."""
         return [], np.empty(0, RETURN_TRUTH_DTYPE)
 
-    def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[WireUnit]:
+    def _arriving(self, sent: list[_Sent]) -> list[WireUnit]:
+        """Packets of both ports as the host gets them: in the order of their sending."""
+        sent = sorted(sent, key=lambda packet: packet.time_s)
+        times_s = self._arrivals.times(np.array([packet.time_s for packet in sent]))
+        return [WireUnit(at_s, packet.source, packet.data) for at_s, packet in zip(times_s, sent, strict=True)]
+
+    def _packets(self, time_s: FloatArray, encoder: IntArray, content: IntArray) -> list[_Sent]:
         """Data packets of pulses (n,), whose content is (returns, n, range and light)."""
         mode, returns = (MODE_DUAL, 2) if self._dual else (MODE_STRONGEST, 1)
         packets = len(time_s) // (self._groups * PLACES)
@@ -107,14 +126,10 @@ class VelodyneWire:
         azimuth = np.repeat(encoder.reshape(packets, self._groups, PLACES)[:, :, 0], returns, axis=1)
         fired_s = time_s.reshape(packets, -1)
         stamps = (self._clock.ticks(fired_s[:, 0]) % HOUR_US).tolist()
-        arrived_s = self._arrivals.times(fired_s[:, -1])
+        rows = zip(fired_s[:, -1].tolist(), stamps, azimuth, blocks, strict=True)
         return [
-            WireUnit(
-                arrived_s[at],
-                self._source,
-                encode_data_packet(stamps[at], azimuth[at], blocks[at, :, :, 0], blocks[at, :, :, 1], mode),
-            )
-            for at in range(packets)
+            _Sent(last_s, self._source, encode_data_packet(stamp, angles, block[:, :, 0], block[:, :, 1], mode))
+            for last_s, stamp, angles, block in rows
         ]
 
 
@@ -122,21 +137,20 @@ class _Positions:
     """The position packets of one head."""
 
     def __init__(self, plan: Plan, source: str, clock: HeadClock, track: Track | None) -> None:
-        self._plan, self._source, self._clock, self._track = plan, f"{source}/aux", clock, track
-        self._arrivals = Arrivals(plan, self._source)
+        self._plan, self._source, self._clock, self._track = plan, source, clock, track
         self._count = 0
         self._second, self._sentence = -1, ""
 
-    def until(self, time_s: float) -> list[WireUnit]:
+    def until(self, time_s: float) -> list[_Sent]:
         """Those assembled since the last call and not after this time."""
         last = max(self._count, int(np.floor(time_s * POSITIONS_HZ + 0.5)))
         made_s = (np.arange(self._count, last) + 0.5) / POSITIONS_HZ
         self._count = last
         stamps, status = self._clock.ticks(made_s) % HOUR_US, self._clock.status(made_s)
-        rows = zip(self._arrivals.times(made_s), made_s.tolist(), stamps.tolist(), status.tolist(), strict=True)
+        rows = zip(made_s.tolist(), stamps.tolist(), status.tolist(), strict=True)
         return [
-            WireUnit(arrived_s, self._source, encode_position_packet(stamp, state, self._rmc(at_s)))
-            for arrived_s, at_s, stamp, state in rows
+            _Sent(at_s, self._source, encode_position_packet(stamp, state, self._rmc(at_s)))
+            for at_s, stamp, state in rows
         ]
 
     def _rmc(self, time_s: float) -> str:
@@ -159,38 +173,33 @@ class _Positions:
 
 def _strongest(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
     """Content (1, n, 2) of single returns: range and reflectivity of the strongest; and their truth."""
-    slot, _ = two_returns(np.where(raw > 0, light, -1))
+    slot = best_slot(np.where(raw > 0, light, -1))
     there = slot >= 0
-    return _content(raw, light, [slot]), _numbered(truth[there, slot[there]], 1)
+    rows = truth[there, slot[there]]
+    rows["return_number"] = 1
+    return _content(raw, light, [slot]), rows
 
 
 def _pairs(raw: IntArray, light: IntArray, truth: StructArray) -> tuple[IntArray, StructArray]:
     """Content (2, n, 2) of dual returns; and their truth, of two the nearer first.
 
     First the last return, then the strongest, or the second-strongest where the strongest is the last; an only one
-    stands in both places, and two of equal range are one (9.3.2).
+    stands in both places. Echoes of equal range are one, as bright as the brightest (9.3.2).
     """
-    last, _ = two_returns(np.where(raw > 0, raw, -1))
-    _, other = two_returns(np.where(raw > 0, light, -1), last)
-    other = np.where(other >= 0, other, last)
+    last = best_slot(np.where(raw > 0, (raw << 8) + light, -1))
+    nearer = (raw > 0) & (raw < in_slot(raw, last)[:, np.newaxis])
+    other = best_slot(np.where(nearer, light, -1))
+    two = other >= 0
+    other = np.where(two, other, last)
     pulse = np.arange(len(raw))
-    two = raw[pulse, other] < raw[pulse, last]
     rows = np.stack([truth[pulse, other], truth[pulse, last]], axis=1)
     rows["return_number"][:, 0], rows["return_number"][:, 1] = 1, np.where(two, 2, 1)
     return _content(raw, light, [last, other]), rows[np.stack([two, last >= 0], axis=1)]
 
 
 def _content(raw: IntArray, light: IntArray, slots: Sequence[IntArray]) -> IntArray:
-    """(returns, n, 2) range and reflectivity in these slots (n,); zeros where it is −1."""
-    pulse = np.arange(len(raw))
-    content = np.stack([np.stack([raw[pulse, slot], light[pulse, slot]], axis=1) for slot in slots])
-    content[np.stack(slots) < 0] = 0
-    return content
-
-
-def _numbered(rows: StructArray, number: int) -> StructArray:
-    rows["return_number"] = number
-    return rows
+    """(returns, n, 2) range and reflectivity in these slots (n,)."""
+    return np.stack([np.stack([in_slot(raw, slot), in_slot(light, slot)], axis=1) for slot in slots])
 
 
 def config_table(table: ScannerTable, name: str, transport: str, auxiliary: str) -> dict[str, Any]:

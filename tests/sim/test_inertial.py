@@ -44,10 +44,12 @@ def test_gravity_on_the_ellipsoid_is_the_published_one() -> None:
 
 
 def test_gravity_at_45_degrees_and_its_gradient() -> None:
-    """GRS 80 says 9.806199203 (Moritz 2000); WGS 84's GM is smaller by 1.468e-7 of itself, its shape the same."""
+    """GRS 80 says 9.806199203 (Moritz 2000); WGS 84's GM is smaller, its shape and the centrifugal part the same."""
     sine = np.full(2, np.sqrt(0.5))
     ground, above = normal_gravity(sine, np.array([0.0, 1.0]))
-    assert ground == pytest.approx(9.806199203 * (3986004.418 / 3986005.0), abs=1e-9)
+    centrifugal = OMEGA**2 * 6388838.3 / 2  # N cos² φ
+    expected = (9.806199203 + centrifugal) * (3986004.418 / 3986005.0) - centrifugal
+    assert ground == pytest.approx(expected, abs=1e-9)
     assert above - ground == pytest.approx(-3.086e-6, abs=1e-9)  # the free-air gradient of every textbook
 
 
@@ -61,7 +63,9 @@ def normal_potential(point: FloatArray) -> float:
     sin_beta = z / u
 
     def q(v: float) -> float:
-        return float(0.5 * ((1 + 3 * v * v / e**2) * np.arctan(e / v) - 3 * v / e))
+        """By its series, 2-57: the closed form cancels."""
+        n = np.arange(1, 12)
+        return float((2 * (-1.0) ** (n + 1) * n / ((2 * n + 1) * (2 * n + 3)) * (e / v) ** (2 * n + 1)).sum())
 
     shape = 0.5 * omega**2 * a**2 * q(u) / q(b) * (sin_beta**2 - 1 / 3)
     return float(gm / e * np.arctan(e / u) + shape + 0.5 * omega**2 * x * x)
@@ -70,12 +74,13 @@ def normal_potential(point: FloatArray) -> float:
 @pytest.mark.parametrize("lat_deg", [0.0, 30.0, 47.5, 75.0])
 @pytest.mark.parametrize("height_m", [0.0, 500.0, 3000.0])
 def test_gravity_above_the_ellipsoid_is_the_potentials_slope(lat_deg: float, height_m: float) -> None:
-    """The series stops at h²: what is left out is 4 (h/a)³, 5e-9 m/s² at 3 km; differences are good to 4e-9."""
+    """The series has flattening to first order, 2γ/a · 3f² = 1e-10 m/s² a metre, and stops at h², 5e-9 m/s² at 3 km."""
     lat = np.radians(lat_deg)
     up, step = np.array([np.cos(lat), np.sin(lat)]), 50.0
     place = e_from_geodetic(np.array([lat]), np.zeros(1), np.array([height_m]))[0, [0, 2]]
     slope = (normal_potential(place + step * up) - normal_potential(place - step * up)) / (2 * step)
-    assert normal_gravity(np.array([np.sin(lat)]), np.array([height_m]))[0] == pytest.approx(-slope, abs=1e-8)
+    limit = 2e-9 + 1e-10 * height_m + 4 * 9.8 * (height_m / 6378137.0) ** 3
+    assert normal_gravity(np.array([np.sin(lat)]), np.array([height_m]))[0] == pytest.approx(-slope, abs=limit)
 
 
 def test_gravity_points_down_the_normal_by_proj_and_compiled() -> None:
@@ -197,7 +202,7 @@ def expected_allan(white: float, drift: float, constants_s: FloatArray, tau_s: f
 
 @pytest.mark.parametrize("grade", ["navigation", "tactical", "mems"])
 def test_the_random_walk_at_a_second_is_the_grades(grade: Any) -> None:
-    """600 s of six sensors at rest: three sigmas are 5 %; and the slope from 1 s to 4 s is that of white noise."""
+    """600 s of six sensors at rest: three sigmas are 6 % at a second, where there is little but white noise."""
     rate_hz, seconds = 20, 600
     _, force, rate = unit(standing(seconds + 1.0), grade=grade, rate_hz=rate_hz).samples(1, seconds * rate_hz)
     for values, sensor in zip((force, rate), sensor_grades(ImuTable(grade=grade)), strict=True):
@@ -207,7 +212,8 @@ def test_the_random_walk_at_a_second_is_the_grades(grade: Any) -> None:
             clusters = int(seconds / tau_s)
             expected, sigma = expected_allan(sensor.random_walk, drift, constants_s, tau_s, clusters)
             assert pooled_allan(values, rate_hz, tau_s) == pytest.approx(expected, abs=3 * sigma / np.sqrt(3))
-            assert expected == pytest.approx(sensor.random_walk / np.sqrt(tau_s), rel=0.05)
+            if tau_s == 1.0:
+                assert 1.0 <= expected / sensor.random_walk < 1.05
 
 
 def test_the_drifts_level_is_the_instability_asked_for() -> None:
@@ -229,12 +235,12 @@ def test_the_drifts_level_is_the_instability_asked_for() -> None:
 
 
 def test_default_drift_is_level_over_two_decades() -> None:
-    """Flicker noise: within 12 % of its top from half a minute to half an hour."""
+    """Flicker noise: within a tenth of its top from a minute to half an hour."""
     constants_s = drift_constants(3600.0)
     drift = 1.0 / drift_level(constants_s)
-    curve = [expected_allan(0.0, drift, constants_s, tau_s, 4)[0] for tau_s in np.geomspace(30.0, 1800.0, 30)]
-    assert max(curve) == pytest.approx(1.0, abs=0.12)
-    assert min(curve) > 0.88
+    curve = [expected_allan(0.0, drift, constants_s, tau_s, 4)[0] for tau_s in np.geomspace(60.0, 1800.0, 30)]
+    assert 0.9 < min(curve)
+    assert max(curve) <= 1.0
 
 
 def test_turn_on_errors_have_the_grades_spread() -> None:

@@ -110,14 +110,14 @@ class Flown:
         return Track(time_s, *places, attitude)
 
 
-def fly_and_decode(folder: Path, changes: dict[str, Any]) -> Flown:
+def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 17.5) -> Flown:
     """Fly the plan, feed the scanner's packets to its driver."""
     plan = parse_plan(PLAN, folder).changed(changes)
     path = folder / "truth.npz"
-    flight = VirtualFlight(plan, open_truth(plan, path))
+    flight = VirtualFlight(plan, open_truth(plan, path), stop_s=stop_s)
     files = companion_files(plan, flight.site, flight.scene)
     config = tomllib.loads(config_text(plan, default_wires(plan), "."))["scanner"]["left"]
-    geometry = {"geometry.file": files["left.json"]} if "left.json" in files else {}
+    geometry = {"geometry": files["left.json"]} if "left.json" in files else {}
     parser = find_driver("scanner", config["protocol"]).make_parser(DeviceSettings("scanner/left", config, geometry))
     records = []
     for unit in flight.units():
@@ -169,7 +169,9 @@ def misses(flown: Flown, points_e: FloatArray) -> FloatArray:
     return distances
 
 
-def bound(flown: Flown, *, range_quantum_m: float, angle_quantum_rad: float, time_quantum_s: float) -> FloatArray:
+def bound(
+    flown: Flown, *, range_quantum_m: float, angle_quantum_rad: float | FloatArray, time_quantum_s: float
+) -> FloatArray:
     """1 mm and half of each quantum carried to the ground."""
     carried = angle_quantum_rad * flown.truth["left.range_m"] + range_quantum_m + time_quantum_s * 75.0
     limits: FloatArray = 1e-3 + 0.5 * carried
@@ -190,7 +192,8 @@ def pulse_angles(flown: Flown) -> FloatArray:
     number = np.rint((flown.time_s[first] - flown.time_s[first[0]]) / step_s).astype(int)
     steady = CubicSpline(number, flown.rows["encoder_rad"][first])(np.arange(number[-1] + 1))
     time_s = flown.time_s[0] + step_s * np.arange(number[-1] + 1)
-    return beam_angle(flown.calibration, time_s, steady)[number][back]
+    angles: FloatArray = beam_angle(flown.calibration, time_s, steady)[number][back]
+    return angles
 
 
 SREP_24_BIT = {"range_quantum_m": 1e-4, "angle_quantum_rad": 2 * 2 * np.pi / 2**24, "time_quantum_s": 1e-7}
@@ -263,8 +266,9 @@ ROUND_ERRORS = EVERY_ERROR | {
 def shaft_angle(flown: Flown, scan_hz: float) -> FloatArray:
     """γ of a shaft that turns evenly."""
     offset = flown.calibration.value("scan_angle_offset_deg")
-    latency: FloatArray = flown.calibration.value("encoder_latency_us") * 2 * np.pi * scan_hz
-    return flown.rows["encoder_rad"] - offset + latency
+    latency = flown.calibration.value("encoder_latency_us") * 2 * np.pi * scan_hz
+    angle: FloatArray = flown.rows["encoder_rad"] - offset + latency
+    return angle
 
 
 def test_nutating_mirror(tmp_path: Path) -> None:
@@ -331,15 +335,28 @@ SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forw
 def test_vlp16(tmp_path: Path, dual: bool) -> None:
     scanner = {"kind": "vlp16", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "dual_return": dual}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
-    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}})
+    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=3.0)
     points_s = velodyne_points(corrected_rows(flown, 10.0), VLP16.beams)
-    check_spinning(flown, points_s, range_quantum_m=0.002, angle_quantum_rad=np.radians(0.01), time_quantum_s=1e-6)
+    angle_quantum_rad = np.radians(0.01) * vlp16_quanta(flown.truth["left.pulse"], groups=6 if dual else 12)
+    check_spinning(flown, points_s, range_quantum_m=0.002, angle_quantum_rad=angle_quantum_rad, time_quantum_s=1e-6)
+
+
+def vlp16_quanta(pulse: NDArray[np.int64], groups: int) -> FloatArray:
+    """How many quanta of azimuth a firing's azimuth is good to.
+
+    Between two groups of a packet it is interpolated: one. Behind the last group it goes on from the last two, a_n and
+    a_n + t (a_n − a_n−1) for the share t of the time from group to group: 1 + 2t.
+    """
+    place = pulse % 32
+    share = ((place // 16) * 55.296 + (place % 16) * 2.304) / 110.592  # VLP-16 manual, 9.4
+    last = pulse // 32 % groups == groups - 1
+    return np.where(last, 1.0 + 2.0 * share, 1.0)
 
 
 def test_os1(tmp_path: Path) -> None:
     scanner = {"kind": "os1", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "serial": "1"}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
-    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}})
+    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=3.0)
     points_s = ouster_points(corrected_rows(flown, -10.0), read_head(flown.files["left.json"]))
     check_spinning(flown, points_s, range_quantum_m=0.001, angle_quantum_rad=0.0, time_quantum_s=1e-9)
 
@@ -353,7 +370,7 @@ def corrected_rows(flown: Flown, scan_hz: float) -> NDArray[np.void]:
     return rows
 
 
-def check_spinning(flown: Flown, points_s: FloatArray, **quanta: float) -> None:
+def check_spinning(flown: Flown, points_s: FloatArray, **quanta: Any) -> None:
     """Ground points of a spinning head against the truth."""
     time_s = flown.time_s + flown.calibration.value("time_offset_us")
     points = ground_points(flown.calibration, flown.track(), time_s, points_s, np.zeros(len(time_s)))

@@ -83,11 +83,15 @@ def test_no_way_is_shorter_by_a_place_between() -> None:
     assert words >= {"RSR", "LSL", "RSL", "LSR"}
 
 
+def turned(pose: Pose) -> Pose:
+    return Pose(pose.east_m, pose.north_m, pose.course_rad + math.pi)
+
+
 def test_the_way_back_is_as_long() -> None:
     poses = random_poses(2, 100)
     for start, end in zip(poses[::2], poses[1::2], strict=True):
-        back = [Pose(pose.east_m, pose.north_m, pose.course_rad + math.pi) for pose in (end, start)]
-        assert length_m(shortest_way(start, end, FREE)) == pytest.approx(length_m(shortest_way(*back, FREE)))
+        there_m = length_m(shortest_way(start, end, FREE))
+        assert length_m(shortest_way(turned(end), turned(start), FREE)) == pytest.approx(there_m)
 
 
 def test_where_there_is_nowhere_to_go_there_is_no_way() -> None:
@@ -95,22 +99,24 @@ def test_where_there_is_nowhere_to_go_there_is_no_way() -> None:
 
 
 def test_straight_on_is_no_whole_turn_by_rounding() -> None:
-    for course in np.linspace(0.1, 6.2, 50).tolist():
+    for course in np.linspace(0.1, 6.2, 300).tolist():
         start = Pose(10.0, -20.0, course)
-        assert length_m(shortest_way(start, start.ahead(987.6), FREE)) == pytest.approx(987.6)
+        for distance_m in (30.0, 100.0, 500.0, 987.6):
+            way = shortest_way(start, start.ahead(distance_m), FREE)
+            assert length_m(way) == pytest.approx(distance_m)
 
 
 def test_turns_to_opposite_sides_are_wider_unless_a_straight_parts_them() -> None:
-    turning = Turning(R, 1.5 * R, 2.0 * R)
+    turning = Turning(R, 1.5 * R, 4.0 * R)
     start = Pose(0, 0, NORTH)
-    near = shortest_way(start, Pose(2 * R, 3.1 * R, NORTH), turning)
-    far = shortest_way(start, Pose(2 * R, 5 * R, NORTH), turning)
+    near = shortest_way(start, Pose(2 * R, 4 * R, NORTH), turning)
+    far = shortest_way(start, Pose(2 * R, 6 * R, NORTH), turning)
     assert [1.0 / arc.curvature_per_m for arc in near[::2]] == pytest.approx([1.5 * R, -1.5 * R])
     assert [1.0 / arc.curvature_per_m for arc in far[::2]] == pytest.approx([R, -R])
     for _, end in zip(range(200), random_poses(3, 200), strict=True):
         way = shortest_way(start, end, turning)
         assert_joins(way, start, end)
-        for before, behind in zip(way, way[1:], strict=False):
+        for before, behind in itertools.pairwise(way):
             if before.curvature_per_m * behind.curvature_per_m < 0.0:
                 assert abs(before.curvature_per_m) == abs(behind.curvature_per_m) == pytest.approx(1 / (1.5 * R))
 
@@ -165,5 +171,12 @@ def test_a_route_goes_on_beyond_its_ends() -> None:
     end_s = float(route.starts_s[-1])
     assert end_s == pytest.approx(10.0 + math.pi * R / 45.0 + 10.0)
     sampled = route.sample(np.array([-2.0, 0.0, 10.0, end_s - 10.0, end_s, end_s + 3.0]))
-    want = [[-100, 0, 100], [0, 0, 100], [500, 0, 100], [500, -2 * R, 130], [100, -2 * R, 130], [-20, -2 * R, 130]]
+    want: list[list[float]] = [
+        [-100, 0, 100],
+        [0, 0, 100],
+        [500, 0, 100],
+        [500, -2 * R, 130],
+        [100, -2 * R, 130],
+        [-20, -2 * R, 130],
+    ]
     np.testing.assert_allclose(sampled[:, :3], want, atol=1e-9)

@@ -11,6 +11,7 @@ import pytest
 
 from georef.records import FixType
 from sim.errors import PlanError
+from sim.gnss.noise import Noise
 from sim.plan_tables import GnssTable
 from sim.satellites import Epochs, InsEpochs, Receiver
 from tests.sim.circling import TO_E, Circling, FloatArray, Standing, geodetic, ned_from_e
@@ -104,6 +105,21 @@ def test_position_errors_have_the_sigma_and_correlation_of_their_grade(grade: st
             assert abs(found - model[lag]) < LIMIT * estimate_sigma(model, lag, count), (axis, lag)
     independent = np.corrcoef(np.diff(epochs.position_error_l, axis=0).T) - np.eye(3)
     assert np.abs(independent).max() < LIMIT * np.sqrt(1.5 / count)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_noise_is_stationary_from_its_first_row_on(smooth: bool) -> None:
+    """Across many components of one draw, where a process that starts from zero has no variance yet."""
+    components, tau_s, step_s = 20_000, 7.0, 0.5
+    rows = Noise(3, ("many",), np.full(components, 2.0), tau_s, step_s, smooth=smooth).rows(0, 600)
+    for first, lag in ((0, 0), (0, 1), (0, 8), (1, 1), (511, 1), (505, 14)):  # blocks of 512 rows
+        age = lag * step_s / tau_s
+        want = np.exp(-age)
+        if smooth:  # of the cascade of two equal poles φ = exp(−step/τ): (1 + lag (1 − φ²)/(1 + φ²)) φ^lag
+            square = np.exp(-2 * step_s / tau_s)
+            want *= 1 + lag * (1 - square) / (1 + square)
+        found = (rows[first] * rows[first + lag]).mean() / 4.0
+        assert abs(found - want) < LIMIT * np.sqrt((1 + want**2) / components), (first, lag)
 
 
 def test_velocity_errors_are_white() -> None:
