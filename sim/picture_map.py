@@ -93,7 +93,7 @@ def draw_map(
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     for axis, where, size_m in ((axes.xaxis, "east", high[0] - low[0]), (axes.yaxis, "north", high[1] - low[1])):
         unit, metres = ("km", 1000.0) if size_m > KILOMETRES_FROM_M else ("m", 1.0)
-        axis.set_major_formatter(FuncFormatter(lambda value, _, metres=metres: f"{value / metres:g}"))
+        axis.set_major_formatter(FuncFormatter(lambda value, _, metres=metres: f"{value / metres:g}".replace("-", "−")))
         axis.set_label_text(f"{where} of the origin ({unit})", fontsize=8, color=MUTED)
     axes.grid(color="white", lw=0.6, alpha=0.55, zorder=1)
     _scale_bar(axes, low, high)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from georef.timescales import gps_ns_from_unix, table_leap_seconds
 from sim.errors import PlanError
 from sim.plan_tables import Tables
+from sim.toml_text import toml_text
 
 PRESETS = ("small", "calibration", "corridor", "block", "bench")
 
@@ -42,7 +43,8 @@ class Plan:
 
     def changed(self, changes: dict[str, Any]) -> Plan:
         """With other values: nested tables as in the file; lists are replaced whole."""
-        return replace(self, tables=_validated(_merged(self.tables.model_dump(exclude_unset=True), changes)))
+        document = _merged(self.tables.model_dump(exclude_unset=True), changes)
+        return replace(self, tables=_validated(document), text=toml_text(document))
 
 
 def load_plan(name: str | Path) -> Plan:

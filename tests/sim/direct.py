@@ -8,6 +8,7 @@ rate, and gives ground points: the check that the virtual aircraft means what CO
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +21,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 FloatArray = NDArray[np.float64]
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+TO_GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+Bending = Callable[[FloatArray, FloatArray], FloatArray]  # heights of sensor and ground, m → Δd / tan α
 PIECE_S = 8.0  # of trajectory at a time: RotationSpline solves for all its knots at once
 
 
@@ -110,14 +113,71 @@ def corrected_range(calibration: Calibration, range_m: FloatArray, intensity: Fl
 
 
 def ground_points(
-    calibration: Calibration, track: Track, time_s: FloatArray, points_s: FloatArray, theta: FloatArray
+    calibration: Calibration,
+    track: Track,
+    time_s: FloatArray,
+    points_s: FloatArray,
+    theta: FloatArray,
+    bending: Bending | None = None,
 ) -> FloatArray:
     """(n, 3) ECEF of points in s at their pulses' times (ISO Eq. 10); each θ tilts φ by the pitch slope."""
     lever_arm_b = np.array([calibration.value(f"lever_arm_{axis}_m") for axis in "xyz"])
     phi = calibration.value("phi_deg") + calibration.value("pitch_slope_ppm") * theta
     omega, kappa = (np.full_like(theta, calibration.value(f"{name}_deg")) for name in ("omega", "kappa"))
     boresight = Rotation.from_euler("XYZ", np.stack([omega, phi, kappa], axis=1))
-    in_body = lever_arm_b + boresight.apply(points_s @ calibration.installation.T)
     position, rotation = track.poses(time_s)
-    points: FloatArray = position + np.einsum("nij,nj->ni", rotation, in_body)
+    origin = position + rotation @ lever_arm_b
+    along = np.einsum("nij,nj->ni", rotation, boresight.apply(points_s @ calibration.installation.T))
+    points: FloatArray = origin + (along if bending is None else bent_towards_nadir(origin, along, bending))
     return points
+
+
+def bent_towards_nadir(origin_e: FloatArray, along_e: FloatArray, bending: Bending) -> FloatArray:
+    """Beams (n, 3) with their lengths, turned about the horizontal by Δd (NGA Eq. 4, 5)."""
+    lon, lat, height_m = TO_GEODETIC.transform(*origin_e.T)
+    lat, lon = np.radians(lat), np.radians(lon)
+    down = -np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    length = np.linalg.norm(along_e, axis=1)
+    cos = (along_e * down).sum(axis=1) / length
+    axis = np.cross(along_e, down)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    turn = bending(height_m, height_m - length * cos) * np.tan(np.arccos(cos))
+    turned: FloatArray = Rotation.from_rotvec(turn[:, np.newaxis] * axis).apply(along_e)
+    return turned
+
+
+def ardc(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
+    """K of the ARDC model, radians (NGA Eq. 4, 5; FORMULAS 4.1)."""
+    top, base = sensor_m / 1000, ground_m / 1000
+    first = 2410 * top / (top**2 - 6 * top + 250)
+    second = 2410 * base / (base**2 - 6 * base + 250) * base / top
+    return 1e-6 * (first - second)
+
+
+def flat_layers(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
+    """K = n̄ − n_s in the dry atmosphere of NGA Eq. 9 to 11 at 1064 nm (FORMULAS 4.2, 4.3), radians."""
+
+    def excess(height_m: FloatArray) -> FloatArray:
+        fahrenheit = 59 - 0.00356 * height_m / 0.3048
+        kelvin = (fahrenheit + 459.67) * 5 / 9
+        hpa = 0.4788025898 * 2116 * ((fahrenheit + 459.7) / 518.6) ** 5.256
+        refractivity: FloatArray = 77.926e-6 * hpa / kelvin
+        return refractivity
+
+    mean = (excess(sensor_m) + 4 * excess((sensor_m + ground_m) / 2) + excess(ground_m)) / 6
+    return mean - excess(sensor_m)
+
+
+def group_index(sensor_m: FloatArray, ground_m: FloatArray) -> FloatArray:
+    """Mean over the path in the dry standard atmosphere at 1064 nm, by the closed form of IAG 1999 (FORMULAS 3.2)."""
+
+    def refractivity(height_m: FloatArray) -> FloatArray:
+        kelvin = 288.15 - 0.0065 * height_m
+        hpa = 1013.25 * (kelvin / 288.15) ** 5.25588
+        dry = 287.6155 + 4.88660 / 1.064**2 + 0.06800 / 1.064**4
+        ppm: FloatArray = 273.15 / 1013.25 * dry * hpa / kelvin
+        return ppm
+
+    mean = (refractivity(sensor_m) + 4 * refractivity((sensor_m + ground_m) / 2) + refractivity(ground_m)) / 6
+    index: FloatArray = 1 + 1e-6 * mean
+    return index

@@ -26,7 +26,19 @@ from georef.records import Chunk, DeviceClockSamples, ScannerReturns
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight, open_truth
 from sim.plan import Plan, parse_plan
-from tests.sim.direct import Calibration, Track, beam_angle, corrected_range, ground_points, line_direction
+from tests.sim.direct import (
+    TO_GEODETIC,
+    Bending,
+    Calibration,
+    Track,
+    ardc,
+    beam_angle,
+    corrected_range,
+    flat_layers,
+    ground_points,
+    group_index,
+    line_direction,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -106,8 +118,8 @@ class Flown:
         truth = self.truth
         attitude = np.stack([truth[f"trajectory.{name}_rad"] for name in ("roll", "pitch", "heading")], axis=1)
         time_s = 1e-9 * (truth["trajectory.gps_ns"] - self.plan.start_gps_ns)
-        places = (truth[f"trajectory.{name}"] for name in ("lat_rad", "lon_rad", "height_m"))
-        return Track(time_s, *places, attitude)
+        lat, lon, height = (truth[f"trajectory.{name}"] for name in ("lat_rad", "lon_rad", "height_m"))
+        return Track(time_s, lat, lon, height, attitude)
 
 
 def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 17.5) -> Flown:
@@ -183,6 +195,32 @@ def line_points(flown: Flown, theta: FloatArray, direction: FloatArray) -> Float
     rho = corrected_range(flown.calibration, flown.rows["range_m"], flown.rows["intensity"])
     time_s = flown.time_s + flown.calibration.value("time_offset_us")
     return ground_points(flown.calibration, flown.track(), time_s, rho[:, np.newaxis] * direction, theta)
+
+
+@pytest.mark.parametrize(("refraction", "bending"), [("ardc", ardc), ("spherical", flat_layers)])
+def test_through_air_that_slows_and_bends(tmp_path: Path, refraction: str, bending: Bending) -> None:
+    scanner = {"kind": "monogon", "half_angle_deg": 40.0, "scan_hz": 60.0}
+    air = {"ranges": "vacuum", "refraction": refraction}
+    line = [{"name": "1", "from_m": [-200, -20], "to_m": [200, 20], "height_m": 2450.0}]  # high: 13 mm at 40°
+    flown = fly_and_decode(tmp_path, {"scanner": {"left": scanner}, "atmosphere": air, "line": line})
+    calibration, track, theta = flown.calibration, flown.track(), flown.rows["encoder_rad"]
+    direction = line_direction(calibration, theta)
+    sensor_m, ground_m = np.full(len(theta), 2450.0), heights(flown.truth["left.point_e"])
+    rho = flown.rows["range_m"] / group_index(sensor_m, ground_m)
+    points_s = rho[:, np.newaxis] * direction
+    limits = bound(flown, **SREP_24_BIT)
+    missed = misses(flown, ground_points(calibration, track, flown.time_s, points_s, theta, bending))
+    assert (missed <= limits).all(), missed.max()
+    assert misses(flown, ground_points(calibration, track, flown.time_s, points_s, theta)).max() > 0.01
+    uncorrected = flown.rows["range_m"][:, np.newaxis] * direction
+    assert misses(flown, ground_points(calibration, track, flown.time_s, uncorrected, theta, bending)).min() > 0.4
+
+
+def heights(points_e: FloatArray) -> FloatArray:
+    """Ellipsoidal."""
+    x, y, z = points_e.T
+    _, _, above_m = TO_GEODETIC.transform(x, y, z)
+    return np.asarray(above_m)
 
 
 def pulse_angles(flown: Flown) -> FloatArray:

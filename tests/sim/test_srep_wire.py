@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,108 +10,26 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.config.tables import ScannerConfig
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.srep import SrepParser
 from drivers.scanner.srep_layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
-from georef.records import Chunk, DeviceClockSamples, ScannerReturns
 from sim.clocks import Oscillator, PulsePerSecond
 from sim.errors import PlanError
 from sim.plan_tables import HostTable, PpsTable, ScannerTable
 from sim.scanners.line_heads import LineHead
 from sim.scanners.srep_wire import PROCESSING_S, SrepWire, config_table
-from sim.shots import Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
-
-FloatArray = NDArray[np.float64]
-C_MPS = 299_792_458.0
-OSCILLATOR = {"offset_ppm": 5.0, "drift_ppm_per_h": 10.0}
-TRANSPORT = "udp:127.0.0.1:2368"
-
-
-def scanner(**keys: Any) -> ScannerTable:
-    defaults = {"prf_hz": 100_000.0, "oscillator": OSCILLATOR, "pulses_per_datagram": 100}
-    return ScannerTable.model_validate(defaults | keys)
-
-
-def pulse_per_second(jitter_ns: float = 20.0) -> PulsePerSecond:
-    return PulsePerSecond(PpsTable(jitter_ns=jitter_ns), 5, "main", noise=True)
-
-
-def measured_of(pulses: Pulses, slots: int, near_m: float, far_m: float) -> tuple[Measured, StructArray]:
-    """Up to ``slots`` returns of each pulse, of its number alone; the truth's range is what the device says."""
-    hashed = (pulses.number[:, np.newaxis] * 2_654_435_761 + np.arange(slots) * 40_503) % 65_536
-    spread = np.sort(hashed / 65_536, axis=1)
-    count = pulses.number * 48_271 % 2_147_483_647 % (slots + 1)
-    there = np.arange(slots) < count[:, np.newaxis]
-    range_m = np.where(there, near_m + (far_m - near_m) * spread, 0.0)
-    truth = np.zeros(range_m.shape, RETURN_TRUTH_DTYPE)
-    truth["range_m"], truth["pulse"] = range_m, pulses.number[:, np.newaxis]
-    truth["channel"], truth["return_number"] = pulses.channel[:, np.newaxis], np.arange(1, slots + 1)
-    return Measured(range_m, np.where(there, hashed % 4000, 0.0), np.where(there, 3.0 + spread, 0.0)), truth
-
-
-@dataclass
-class Spoken:
-    """All that a scanner said."""
-
-    table: ScannerTable
-    wire: SrepWire
-    units: list[WireUnit] = field(default_factory=list)
-    truth: StructArray = field(default_factory=lambda: np.zeros(0, RETURN_TRUTH_DTYPE))
-    pulses: list[Pulses] = field(default_factory=list)
-
-    def add(self, said: tuple[list[WireUnit], StructArray]) -> None:
-        self.units += said[0]
-        self.truth = np.concatenate([self.truth, said[1]])
-
-    def headers(self) -> StructArray:
-        return np.concatenate([np.frombuffer(unit.data[:48], HEADER_DTYPE) for unit in self.units])
-
-    def parsed(self) -> tuple[StructArray, StructArray]:
-        """Returns and clock samples by this project's parser, which has nothing to complain of."""
-        config = config_table(self.table, "left", TRANSPORT)
-        parser = SrepParser(DeviceSettings("scanner/left", config))
-        records = [
-            record
-            for unit in self.units
-            for record in parser.feed(Chunk(unit.source, round(1e9 * unit.time_s), unit.data))
-        ]
-        assert not parser.counters.errors
-        assert parser.counters.bad_messages == parser.counters.bad_checksums == parser.counters.bytes_skipped == 0
-        returns = [record.rows for record in records if isinstance(record, ScannerReturns)]
-        clocks = [record.rows for record in records if isinstance(record, DeviceClockSamples)]
-        return np.concatenate(returns), np.concatenate(clocks)
-
-
-def speak(
-    table: ScannerTable,
-    cuts: Sequence[float] = (10.0, 10.013, 10.03),
-    *,
-    ranges_m: tuple[float, float] = (900.0, 1100.0),
-    noise: bool = False,
-    pps: PulsePerSecond | None = None,
-    idle: Sequence[tuple[float, float]] = (),
-    **keys: Any,
-) -> Spoken:
-    """Fires from the first cut to the last; silent in ``idle`` windows, which are cuts too."""
-    wire = SrepWire(table, "left", pps or pulse_per_second(), HostTable(), 1, noise=noise, **keys)
-    spoken, head = Spoken(table, wire), LineHead(table, "left")
-    for start, stop in pairwise(cuts):
-        if any(start >= from_s and stop <= to_s for from_s, to_s in idle):
-            spoken.units += wire.idle(start, stop)
-            continue
-        pulses = head.pulses(start, stop)
-        spoken.pulses.append(pulses)
-        spoken.add(wire.units(pulses, *measured_of(pulses, table.return_slots, *ranges_m)))
-    spoken.add(wire.close())
-    return spoken
-
-
-def joined(pulses: list[Pulses]) -> dict[str, NDArray[Any]]:
-    return {
-        name: np.concatenate([getattr(part, name) for part in pulses])
-        for name in ("number", "time_s", "encoder", "channel")
-    }
+from sim.shots import Measured, Pulses
+from sim.truth import RETURN_TRUTH_DTYPE
+from tests.sim.srep_spoken import (
+    C_MPS,
+    TRANSPORT,
+    FloatArray,
+    Spoken,
+    joined,
+    measured_count,
+    measured_of,
+    pulse_per_second,
+    scanner,
+    speak,
+)
 
 
 def expected_angle(table: ScannerTable, encoder: NDArray[np.int64]) -> FloatArray:
@@ -136,7 +51,7 @@ def test_every_return_is_parsed_in_the_order_of_its_row(kind: str, slots: int) -
     spoken = speak(table)
     rows, _ = spoken.parsed()
     truth, pulses = spoken.truth, joined(spoken.pulses)
-    fired = sum(np.count_nonzero(pulses["number"] * 48_271 % 2_147_483_647 % (slots + 1) > r) for r in range(slots))
+    fired = measured_count(pulses["number"], slots).sum()
     assert len(rows) == len(truth) == fired
     at = np.searchsorted(pulses["number"], truth["pulse"])
     np.testing.assert_allclose(rows["range_m"], truth["range_m"], atol=0.5e-4 + 1e-9)
@@ -221,100 +136,6 @@ def test_empty_slots_in_between_are_closed_on_the_wire() -> None:
     assert rows["return_number"].tolist() == spoken.truth["return_number"].tolist() == [1, 2, 1, 2]
 
 
-# ---------------------------------------------------------------------------------------------- apparent ranges
-
-
-def records_of(units: list[WireUnit]) -> list[tuple[int, int, list[int]]]:
-    """(ticks, encoder, ranges in 0.1 mm) of every record, by the page, over all datagrams."""
-    records = []
-    for unit in units:
-        n, slots, zone = struct.unpack_from("<H", unit.data, 6)[0], unit.data[14], unit.data[15]
-        first = struct.unpack_from("<Q", unit.data, 32)[0]
-        assert zone == 255
-        for pulse in range(n):
-            at = 48 + pulse * (8 + 8 * slots)
-            ticks, encoder = struct.unpack_from("<Ii", unit.data, at)
-            ranges = [struct.unpack_from("<I", unit.data, at + 8 + 8 * slot)[0] for slot in range(slots)]
-            records.append((first + ticks, encoder, ranges))
-    return records
-
-
-def resolved(units: list[WireUnit], tick_hz: int, about_m: tuple[float, float]) -> list[tuple[int, int, float]]:
-    """(ticks and encoder of its emission, whole range) of every return, of a reader who knows where the ground is."""
-    found = []
-    records = records_of(units)
-    for place, (ticks, _, ranges) in enumerate(records):
-        for apparent in ranges:
-            whole = [
-                (*records[place - z][:2], 1e-4 * apparent + (ticks - records[place - z][0]) * C_MPS / (2 * tick_hz))
-                for z in range(min(place, 40) + 1)
-            ]
-            fitting = [one for one in whole if apparent and about_m[0] <= one[2] <= about_m[1]]
-            assert len(fitting) == bool(apparent)
-            found += fitting
-    return found
-
-
-@pytest.mark.parametrize("prf_hz", [50_000.0, 333_333.3, 900_000.0])
-def test_apparent_ranges_lead_back_to_their_pulse(prf_hz: float) -> None:
-    table = scanner(zone="apparent", prf_hz=prf_hz, return_slots=3)
-    about_m = (1000.0, 1000.0 + 0.9 * C_MPS / (2 * prf_hz))  # less than a zone, so that a reader can tell
-    n = 3000
-    spoken = speak(table, (2.0, 2.0 + n / prf_hz), ranges_m=about_m)
-    found = resolved(spoken.units, table.tick_hz, about_m)
-    assert len(found) == len(spoken.truth)
-    pulses = joined(spoken.pulses)
-    at = np.searchsorted(pulses["number"], spoken.truth["pulse"])
-    ticks = [round(k * table.tick_hz / prf_hz) for k in spoken.truth["pulse"].tolist()]
-    assert [one[0] for one in found] == ticks
-    assert [one[1] for one in found] == pulses["encoder"][at].tolist()
-    np.testing.assert_allclose([one[2] for one in found], spoken.truth["range_m"], atol=0.5e-4 + 1e-6)
-    rows, _ = spoken.parsed()  # the parser, which resolves nothing, has them in the same order
-    assert len(rows) == len(spoken.truth)
-    assert (rows["mta_zone"] == 255).all()
-    said = [1e-4 * apparent for _, _, ranges in records_of(spoken.units) for apparent in ranges if apparent]
-    np.testing.assert_allclose(rows["range_m"], said, atol=1e-9)
-    measured = sum(int((pulses["number"] * 48_271 % 2_147_483_647 % 4 > r).sum()) for r in range(3))
-    assert len(spoken.truth) + spoken.wire.lost_echoes == measured
-    assert spoken.wire.lost_echoes < 0.2 * measured
-
-
-def test_of_more_echoes_than_slots_the_latest_are_lost_and_counted() -> None:
-    table = scanner(zone="apparent", prf_hz=1_000_000.0, return_slots=1, oscillator={})
-    pulses = LineHead(table, "left").pulses(0.0, 6e-6 - 1e-9)
-    unambiguous_m = C_MPS / 2e6
-    range_m = np.zeros((6, 1))
-    range_m[0] = 2.7 * unambiguous_m  # all three in the record of pulse 2
-    range_m[1] = 1.2 * unambiguous_m
-    range_m[2] = 0.5 * unambiguous_m
-    range_m[3] = 2.0 * unambiguous_m + 2e-5  # with the emission of pulse 5: no range
-    spoken = Spoken(table, SrepWire(table, "left", None, HostTable(), 1, noise=False))
-    truth = np.zeros((6, 1), RETURN_TRUTH_DTYPE)
-    truth["pulse"] = np.arange(6)[:, np.newaxis]
-    spoken.add(spoken.wire.units(pulses, Measured(range_m, range_m, range_m), truth))
-    spoken.add(spoken.wire.close())
-    assert spoken.truth["pulse"].tolist() == [1]
-    assert spoken.wire.lost_echoes == 3
-    ranges = [ranges[0] for _, _, ranges in records_of(spoken.units)]
-    assert ranges == [0, 0, round(0.2 * unambiguous_m * 1e4), 0, 0, 0]
-
-
-def test_echoes_of_the_last_pulses_stand_in_the_last_record() -> None:
-    table = scanner(zone="apparent", prf_hz=500_000.0, oscillator={})
-    pulses = LineHead(table, "left").pulses(0.0, 4e-6)
-    range_m = np.zeros((2, 3))
-    range_m[:, 0] = 1000.0, 1100.0
-    spoken = Spoken(table, SrepWire(table, "left", None, HostTable(), 1, noise=False))
-    spoken.add(spoken.wire.units(pulses, Measured(range_m, range_m, range_m), np.zeros((2, 3), RETURN_TRUTH_DTYPE)))
-    assert not spoken.units
-    spoken.units += spoken.wire.idle(1.0, 1.25)  # with heartbeats, of the same zone
-    spoken.add(spoken.wire.close())
-    assert len(spoken.units) == 4
-    apparent = round((1000.0 - C_MPS / 1e6) * 1e4)
-    assert [ranges for _, _, ranges in records_of(spoken.units)] == [[0, 0, 0], [apparent, 11_000_000, 0]]
-    assert len(spoken.truth) == 2
-
-
 # ---------------------------------------------------------------------------------------------- blocks, pauses, time
 
 
@@ -375,8 +196,9 @@ def test_a_long_gap_between_pulses_ends_a_datagram_too() -> None:
 
 
 def test_ticks_since_the_first_fit_their_field() -> None:
-    """1 GHz and 100 pulses a second: 2³² ticks go by in 43 pulses."""
-    table = scanner(tick_hz=1_000_000_000, prf_hz=100.0, oscillator={"ticks_at_start": 12})
+    """1 GHz and 100 pulses a second: 2³² ticks go by in 430 pulses."""
+    oscillator = {"ticks_at_start": 12}
+    table = scanner(tick_hz=1_000_000_000, prf_hz=100.0, pulses_per_datagram=1000, oscillator=oscillator)
     spoken = speak(table, (0.0, 6.0))
     rows, _ = spoken.parsed()
     expected = 12 + spoken.truth["pulse"] * 10_000_000
@@ -417,6 +239,17 @@ def test_the_latch_is_as_of_the_sending_of_each_datagram() -> None:
     np.testing.assert_array_equal(headers["pps_ticks"][count > 0], latched[count[count > 0] - 1])
     np.testing.assert_array_equal(headers["flags"] & 1, count > 0)
     assert (headers["pps_ticks"] > headers["first_ticks"]).any()  # an edge between first pulse and sending
+
+
+def test_an_edge_before_power_on_is_not_latched() -> None:
+    early = (PulsePerSecond(PpsTable(jitter_ns=500.0), seed, "main", noise=True) for seed in range(100))
+    pps = next(pps for pps in early if pps.edges(np.zeros(1, np.int64))[0] < -100e-9)
+    off, on = (
+        speak(scanner(oscillator={"ticks_at_start": ticks}), (0.0, 0.01), pps=pps).headers() for ticks in (0, 1000)
+    )
+    assert not off["pps_count"].any()
+    assert (on["pps_count"] == 1).all()
+    assert ((on["pps_ticks"] > 950) & (on["pps_ticks"] < 1000)).all()
 
 
 def test_a_lost_pps_keeps_the_count_and_loses_the_lock() -> None:
