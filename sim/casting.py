@@ -273,6 +273,7 @@ def meet(
     pulse: Pulse,
     soft: FloatArray,
     count: int,
+    room: int,
     box: FloatArray,
 ) -> tuple[float, int, float, float, float, int]:
     """What a cell lists, between two distances.
@@ -298,7 +299,7 @@ def meet(
                 edge = min(edge, near)
                 if start <= at < stop and at < best:
                     best, surface, reflectance, cosine = at, CAR, rows[row + 5], cos
-        elif count < len(soft):
+        elif count < room:
             if kind == TREES:
                 count = into_crown(rows, row, ray, start, stop, pulse, soft, count)
             else:
@@ -318,10 +319,11 @@ def march(
     spread: float,
     pulse: Pulse,
     soft: FloatArray,
+    count: int,
+    room: int,
     box: FloatArray,
 ) -> tuple[float, int, float, float, float, int]:
-    """As `meet`, for a whole ray; soft things are air where there is no row for them."""
-    count = 0
+    """As `meet`, for a whole ray."""
     best, surface, reflectance, cosine, edge, fresh = NEVER, NO_SURFACE, 0.0, 1.0, NEVER, True
     deep, wide = top.shape[1], top.shape[2]
     at, stop = clipped(ray[2], ray[5], frame.floor_z, frame.roof_z, 0.0, NEVER)
@@ -339,7 +341,7 @@ def march(
             first, last = listed[0, cell], listed[0, cell + 1]
             if last > first:
                 best, surface, reflectance, cosine, near, count = meet(
-                    frame, z, rows, item, first, last, ray, at, leave, spread, pulse, soft, count, box
+                    frame, z, rows, item, first, last, ray, at, leave, spread, pulse, soft, count, room, box
                 )
                 edge = min(edge, near)
             if low <= top[1, row, column]:

@@ -242,8 +242,8 @@ class Survey:
         self.plan = plan
         self.site = Site.at(*plan.tables.flight.origin_deg)
         self.scene: Scene = build_scene(plan, self.site, corners(plan))
-        refuse_ranges(plan, self.scene.ground_m)
         self.trajectory: Trajectory = fly(plan, self.site, self.scene.ground_m)
+        refuse_ranges(plan, self.scene.ground_m)
         self.strips = tuple(strip_of(plan, line.index, line.start_s, line.end_s) for line in self.trajectory.lines)
 
     def stations(self, strip: Strip, count: int = 200) -> tuple[FloatArray, FloatArray]:

@@ -6,10 +6,13 @@ import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from llvmlite.ir import Constant
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
 from sim import casting, rays
@@ -23,6 +26,19 @@ IntArray = NDArray[np.int64]
 SOFT_HITS = 24
 # Columns of soft hits: distance, share of the energy that comes so far, reflectance, cosine of incidence, surface.
 # Columns of echoes: distance, apparent reflectance, cosine of incidence, surface, 1 if on the axis.
+
+
+class Work(NamedTuple):
+    """Room to work in: soft hits, echoes, planes of a car."""
+
+    soft: FloatArray
+    echo: FloatArray
+    box: FloatArray
+
+
+def room_to_work() -> Work:
+    """For one call at a time."""
+    return Work(np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 5, 5)), np.empty(BOX))
 
 
 @kernel
@@ -119,30 +135,41 @@ def echoes_of(
     box: FloatArray,
 ) -> int:
     """All echoes of a pulse, in order of distance; returns how many."""
-    at, surface, reflectance, cos, edge, softs = march(frame, z, top, first, item, rows, ray, spread, pulse, soft, box)
-    in_order(soft, softs)
-    count = 0
-    for k in range(softs):
-        if soft[k, 0] < at:
-            strength = energy_at(soft, softs, soft[k, 0]) * soft[k, 1] * soft[k, 2] * soft[k, 3]
-            count = add(echo, count, soft[k, 0], strength, soft[k, 3], soft[k, 4], 1.0)
-    rims = spread > 0.0 and edge <= at < NEVER
-    share = 1.0 - 4.0 * RIM_SHARE if rims else 1.0
-    count = add(echo, count, at, energy_at(soft, softs, at) * share * reflectance * cos, cos, float(surface), 1.0)
-    if rims:
-        for side in range(4):
-            other = rim(ray, spread, side)
-            t, s, r, c, _, _ = march(frame, z, top, first, item, rows, other, 0.0, pulse, soft[:0], box)
-            if s != NO_SURFACE:
-                count = add(echo, count, t, energy_at(soft, softs, t) * RIM_SHARE * r * c, c, float(s), 0.0)
-        in_order(echo, count)
+    count, softs, room, share, wide, beam = 0, 0, len(soft), 1.0, spread, ray
+    for side in range(5):
+        at, surface, reflectance, cos, edge, softs = march(
+            frame, z, top, first, item, rows, beam, wide, pulse, soft, softs, room, box
+        )
+        if side == 0:
+            in_order(soft, softs)
+            for k in range(softs):
+                if soft[k, 0] < at:
+                    strength = energy_at(soft, softs, soft[k, 0]) * soft[k, 1] * soft[k, 2] * soft[k, 3]
+                    count = add(echo, count, soft[k, 0], strength, soft[k, 3], soft[k, 4], 1.0)
+            if spread > 0.0 and edge <= at < NEVER:
+                share = 1.0 - 4.0 * RIM_SHARE
+        strength = energy_at(soft, softs, at) * share * reflectance * cos
+        count = add(echo, count, at, strength, cos, float(surface), 1.0 if side == 0 else 0.0)
+        if share == 1.0:
+            return count
+        share, wide, room = RIM_SHARE, 0.0, 0
+        beam = rim(ray, spread, side)
+    in_order(echo, count)
     return count
 
 
-@kernel
-def bare(values: NDArray[Any]) -> NDArray[Any]:
-    """An array that owns nothing: numba counts references to what owns memory at every call, 20 ns each."""
-    return numba.carray(values.ctypes, values.shape)
+@intrinsic
+def borrowed(context: Any, values: Any) -> Any:
+    """The same array as one that owns nothing: numba counts references at every call, and that took two thirds of
+    the time. Its owner must outlive it: an argument does."""
+
+    def without_owner(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = make_array(signature.args[0])(context, builder, arguments[0])
+        for name in ("meminfo", "parent"):
+            setattr(array, name, Constant(getattr(array, name).type, None))
+        return array._getvalue()
+
+    return values(values), without_owner
 
 
 def _compiled(digest: int) -> Callable[..., None]:
@@ -153,6 +180,7 @@ def _compiled(digest: int) -> Callable[..., None]:
 
     def cast_pulses(
         scene: SceneArrays,
+        work: Work,
         origin: FloatArray,
         direction: FloatArray,
         time_s: FloatArray,
@@ -165,12 +193,11 @@ def _compiled(digest: int) -> Callable[..., None]:
         surface: NDArray[np.uint8],
     ) -> None:
         """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
-        own_soft, own_echo, own_box = np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 6, 5)), np.empty(BOX)
         slots = range_m.shape[1] if digest else 0
         frame, seed = scene.frame, scene.seed
-        z, top, first = bare(scene.z), bare(scene.top), bare(scene.first)
-        item, rows = bare(scene.item), bare(scene.rows)
-        soft, echo, box = bare(own_soft), bare(own_echo), bare(own_box)
+        z, top, first = borrowed(scene.z), borrowed(scene.top), borrowed(scene.first)
+        item, rows = borrowed(scene.item), borrowed(scene.rows)
+        soft, echo, box = borrowed(work.soft), borrowed(work.echo), borrowed(work.box)
         for i in range(len(origin)):
             dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
             ray = origin[i, 0], origin[i, 1], origin[i, 2], dx, dy, dz, 1.0 / dx, 1.0 / dy

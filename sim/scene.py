@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay
 from sim.casting import CARS, COVERS, LAKES, ROADS, SOLIDS, THINGS, TREES, WIRES, Frame, SceneArrays
 from sim.cells import CELL_M, Listed, build_cells
 from sim.clocks import generator
-from sim.echoes import cast_pulses
+from sim.echoes import cast_pulses, room_to_work
 from sim.errors import PlanError
 from sim.objects import (
     CAR_SIZE_M,
@@ -104,6 +104,7 @@ class Scene:
         surface = np.zeros(shape, np.uint8)
         cast_pulses(
             self.arrays,
+            room_to_work(),
             np.ascontiguousarray(origin, np.float64),
             np.ascontiguousarray(direction, np.float64),
             np.ascontiguousarray(time_s, np.float64),

@@ -18,6 +18,7 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
 Text = Annotated[str, Field(min_length=1)]
 Signal = Annotated[str, Field(pattern=SIGNAL_PATTERN)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
 SignalTriple = Annotated[list[Signal], Field(min_length=3, max_length=3)]
 
@@ -166,6 +167,13 @@ class ImuConfig(Section):
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="for the navigation filter")
 
 
+_KEYS_OF_GEOMETRY = {
+    "polygon": ("facets",),
+    "nutating": ("nutation_deg", "shaft_angle_deg"),
+    "risley": ("wedge_deg", "refractive_index", "prism_ratio"),
+}
+
+
 class GeometryConfig(Section):
     """``[scanner.<name>.geometry]``: how the beam is deflected."""
 
@@ -173,16 +181,31 @@ class GeometryConfig(Section):
         None, description="srep: the kind of deflection"
     )
     facets: int | None = Field(None, ge=2, le=256, description="polygon: number of facets")
+    nutation_deg: float | None = Field(
+        None, gt=0.0, le=20.0, description="nutating: of the mirror's normal from its shaft"
+    )
+    shaft_angle_deg: float | None = Field(
+        None, gt=0.0, lt=90.0, description="nutating: between the mirror's shaft and the laser's beam"
+    )
+    wedge_deg: Pair | None = Field(None, description="risley: angles of the two prisms")
+    refractive_index: float | None = Field(None, gt=1.0, le=4.0, description="risley: of both prisms")
+    prism_ratio: float | None = Field(
+        None, description="risley: turns of the second prism a turn of the first, whose whole turns the encoder counts"
+    )
     file: Text | None = Field(
         None, description="the device's own table (beam angles; ouster: its metadata, JSON), relative to this file"
     )
 
     @model_validator(mode="after")
-    def _polygon_has_facets(self) -> Self:
+    def _keys_are_of_the_type(self) -> Self:
         if self.type == "polygon" and self.facets is None:
             raise ValueError('type = "polygon" needs facets = <number of facets>')
-        if self.type != "polygon" and self.facets is not None:
-            raise ValueError('facets belongs to type = "polygon" only')
+        for kind, keys in _KEYS_OF_GEOMETRY.items():
+            given = [key for key in keys if getattr(self, key) is not None]
+            if given and self.type != kind:
+                raise ValueError(f'{given[0]} belongs to type = "{kind}" only')
+            if given and len(given) < len(keys):
+                raise ValueError(f'type = "{kind}" needs all of {", ".join(keys)} or none')
         return self
 
 

@@ -6,11 +6,11 @@ One datagram: header (48 bytes), N pulses of 8 + 8·R bytes, CRC-32. Little-endi
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.scanner.sequence import BoolArray
@@ -99,15 +99,29 @@ def encode_datagram(
     """
     ranges = np.asarray(range_0p1mm, dtype=np.uint32)
     head = np.zeros(1, dtype=HEADER_DTYPE)
-    head["magic"], head["version"] = MAGIC, VERSION
-    head["pulses"], head["return_slots"] = ranges.shape
     for name in SrepHeader.__dataclass_fields__:
         head[name] = getattr(header, name)
-    body = np.zeros(len(ranges), dtype=pulse_dtype(ranges.shape[1]))
+    body = np.zeros(ranges.shape[:1], dtype=pulse_dtype(ranges.shape[1]))
     body["ticks"], body["encoder"] = ticks, encoder
     body["slot"]["range"], body["slot"]["intensity"], body["slot"]["pulse_width"] = ranges, intensity, pulse_width_10ps
-    data = head.tobytes() + body.tobytes()
-    return data + CRC.pack(zlib.crc32(data))
+    return encode_datagrams(head, body[np.newaxis])[0]
+
+
+def encode_datagrams(header: StructArray, body: StructArray) -> list[bytes]:
+    """Datagrams of equal length.
+
+    Args:
+        header: (m,) `HEADER_DTYPE`; magic, version, N and R are filled in here.
+        body: (m, N) `pulse_dtype`, ticks since each datagram's first_ticks.
+    """
+    header["magic"], header["version"] = MAGIC, VERSION
+    header["pulses"], header["return_slots"] = body.shape[1], body.dtype["slot"].shape[0]
+    rows = np.empty((len(body), datagram_bytes(body.shape[1], body.dtype["slot"].shape[0])), dtype=np.uint8)
+    rows[:, :HEADER_BYTES] = header.view(np.uint8).reshape(-1, HEADER_BYTES)
+    content = np.ascontiguousarray(body).view(np.uint8)
+    rows[:, HEADER_BYTES : -CRC.size] = content.reshape(len(body), rows.shape[1] - HEADER_BYTES - CRC.size)
+    datagrams = (row[: -CRC.size].tobytes() for row in rows)
+    return [data + CRC.pack(crc32(data)) for data in datagrams]
 
 
 def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64Array:

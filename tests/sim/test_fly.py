@@ -148,7 +148,6 @@ def test_truth_has_a_row_for_every_return(tmp_path: Path) -> None:
     assert set(files) >= {
         "left.true.toml",
         "left.nominal.toml",
-        "top.true.toml",
         "main.dbc",
         "control.csv",
         "README.md",
