@@ -7,14 +7,12 @@ leaves and returns at its pose of emission, as ISO/TS 19159-2 Eq. 10 has it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
-import numba
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sim.atmosphere import Air
-from sim.flight import Poses, Trajectory
+from sim.flight import Trajectory
+from sim.mounting import Beams, Mounting
 from sim.plan_tables import ScannerTable
 from sim.scanners.assembly import Head, Wire
 from sim.scanners.ranging import Ranging
@@ -26,15 +24,6 @@ from sim.truth import RETURN_TRUTH_DTYPE, StructArray
 BLOCK_S = 0.25
 EARTH_RADIUS_M = 6_371_000.0
 LIGHT_MPS = 299_792_458.0
-
-
-@dataclass(frozen=True, slots=True)
-class Beams:
-    """Axes of beams in the site frame, where they start, and the same in e for the truth."""
-
-    origin_e: FloatArray
-    origin: FloatArray
-    direction: FloatArray
 
 
 class Scanner:
@@ -62,12 +51,7 @@ class Scanner:
         self._table, self._head, self._ranging, self._wire = table, head, ranging, wire
         self._trajectory, self._scene, self._site, self._air = trajectory, scene, site, air
         self._start_gps_ns = start_gps_ns
-        true = table.true
-        self._lever_arm_b = np.array([true.lever_arm_x_m, true.lever_arm_y_m, true.lever_arm_z_m])
-        kappa = Rotation.from_euler("z", true.kappa_deg, degrees=True).as_matrix()
-        self._rot_kappa_installation = kappa @ np.array(table.installation, dtype=np.float64)
-        self._phi_rad = float(np.radians(true.phi_deg))
-        self._rot_omega = Rotation.from_euler("x", true.omega_deg, degrees=True).as_matrix()
+        self._mounting = Mounting(table)
 
     def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
         """Everything until a time, block by block: units in order of time, truth of the returns in them."""
@@ -95,23 +79,11 @@ class Scanner:
     def _block(self, start_s: float, stop_s: float) -> tuple[list[WireUnit], StructArray]:
         pulses = self._head.pulses(start_s, stop_s)
         poses = self._trajectory.poses(pulses.time_s)
-        beams = self.beams(pulses, poses)
+        beams = self._mounting.beams(pulses, poses, self._site)
         echoes = self._cast(pulses, beams)
         from_m, to_m = self._heights(beams, echoes)
         measured = self._ranging.measure(pulses, echoes, from_m, to_m)
         return self._wire.units(pulses, measured, self._truth(pulses, beams, echoes))
-
-    def beams(self, pulses: Pulses, poses: Poses) -> Beams:
-        """Axes of pulses as they leave (ISO/TS 19159-2 Eq. 10)."""
-        origin_e, origin, direction = np.empty((3, len(pulses), 3))
-        _axes(
-            (pulses.origin_s, pulses.direction_s, pulses.phi_extra_rad),
-            (self._rot_kappa_installation, self._phi_rad, self._rot_omega, self._lever_arm_b),
-            (poses.position_e, poses.rot_e_from_b),
-            (self._site.origin_e, self._site.rot_site_from_e),
-            (origin_e, origin, direction),
-        )
-        return Beams(origin_e, origin, direction)
 
     def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
         """Echoes along the beams; a bent beam is cast twice, since what it meets says how much it bends."""
@@ -165,38 +137,6 @@ class Scanner:
         rows["return_number"] = np.arange(1, echoes.range_m.shape[1] + 1)
         rows["surface"] = echoes.surface
         return rows
-
-
-@numba.njit(cache=True)
-def _turned(rotation, vector):  # type: ignore[no-untyped-def]
-    """A vector (3,) by a matrix (3, 3), as three numbers."""
-    return (
-        rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
-        rotation[1, 0] * vector[0] + rotation[1, 1] * vector[1] + rotation[1, 2] * vector[2],
-        rotation[2, 0] * vector[0] + rotation[2, 1] * vector[1] + rotation[2, 2] * vector[2],
-    )
-
-
-@numba.njit(cache=True)
-def _axes(pulses, mounting, poses, site, out):  # type: ignore[no-untyped-def]
-    """s → b (installation and κ, then φ with each pulse's slope, then ω) → e → site frame, pulse by pulse."""
-    origin_s, direction_s, phi_extra = pulses
-    rot_kappa_installation, phi, rot_omega, lever_arm_b = mounting
-    position_e, rot_e_from_b = poses
-    site_e, rot_site_from_e = site
-    origin_e, origin, direction = out
-    for n in range(len(direction_s)):
-        cos, sin = np.cos(phi + phi_extra[n]), np.sin(phi + phi_extra[n])
-        x, y, z = _turned(rot_kappa_installation, direction_s[n])
-        body = _turned(rot_omega, (cos * x + sin * z, y, cos * z - sin * x))
-        direction[n, 0], direction[n, 1], direction[n, 2] = _turned(rot_site_from_e, _turned(rot_e_from_b[n], body))
-        x, y, z = _turned(rot_kappa_installation, origin_s[n])
-        x, y, z = _turned(rot_omega, (cos * x + sin * z, y, cos * z - sin * x))
-        arm = _turned(rot_e_from_b[n], (x + lever_arm_b[0], y + lever_arm_b[1], z + lever_arm_b[2]))
-        for k in range(3):
-            origin_e[n, k] = position_e[n, k] + arm[k]
-        there = (origin_e[n, 0] - site_e[0], origin_e[n, 1] - site_e[1], origin_e[n, 2] - site_e[2])
-        origin[n, 0], origin[n, 1], origin[n, 2] = _turned(rot_site_from_e, there)
 
 
 def _cuts(start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:
