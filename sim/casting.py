@@ -12,24 +12,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.objects import CAR_SIZE_M
+from sim.compiled import kernel, whole
 from sim.rays import (
     NEVER,
-    PLANE,
     Ray,
     boundary,
     crown_span,
     ground_entry,
     ground_normal,
     ground_z,
-    kernel,
     passes,
     slice_at,
     solid_entry,
     uniform,
     wire_passage,
 )
-from sim.shots import CAR, GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, WATER, WIRE
+from sim.shots import GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, WATER, WIRE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -53,12 +51,8 @@ DROWNED_M = 0.1  # ground in a lake's circle no higher above its level than this
 ASPHALT, PAINT = 0.12, 0.6
 STRIPE_M, EDGE_M = 0.15, 0.3  # width of painted lines; from a road's edge to the middle of its edge line
 DASH_M, DASHES_M = 4.0, 12.0  # length of a dash of the middle line, from one to the next
-# Constants that functions are called with are typed: numba compiles a function anew for every bare number.
-_WATER, _PATCHES, _GRAIN = np.int64(1 << 40), np.int64(1 << 41), np.int64(1 << 42)  # draws: no crown has so many
-_ANY_SEED, _BOX_PLANES = np.int64(0), (np.int64(0), np.int64(5 * PLANE))
-_CAR_HALF = (0.5 * CAR_SIZE_M[0], 0.5 * CAR_SIZE_M[1])
-_CAR_RADIUS = 3.0
-BOX = 5 * PLANE + 3  # numbers that `park` writes
+_WATER, _PATCHES, _GRAIN = whole(1 << 40), whole(1 << 41), whole(1 << 42)  # draws: no crown has so many
+_NO_SEED = whole(0)
 
 
 class Frame(NamedTuple):
@@ -117,11 +111,11 @@ def texture(x: float, y: float) -> float:
     column, row = math.floor(x / 25.0), math.floor(y / 25.0)
     u, v = x / 25.0 - column, y / 25.0 - row
     u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)
-    southern = (1.0 - u) * uniform(_ANY_SEED, column, row, _PATCHES) + u * uniform(_ANY_SEED, column + 1, row, _PATCHES)
-    northern = (1.0 - u) * uniform(_ANY_SEED, column, row + 1, _PATCHES) + u * uniform(
-        _ANY_SEED, column + 1, row + 1, _PATCHES
+    southern = (1.0 - u) * uniform(_NO_SEED, column, row, _PATCHES) + u * uniform(_NO_SEED, column + 1, row, _PATCHES)
+    northern = (1.0 - u) * uniform(_NO_SEED, column, row + 1, _PATCHES) + u * uniform(
+        _NO_SEED, column + 1, row + 1, _PATCHES
     )
-    grain = uniform(_ANY_SEED, math.floor(2.0 * x), math.floor(2.0 * y), _GRAIN)
+    grain = uniform(_NO_SEED, math.floor(2.0 * x), math.floor(2.0 * y), _GRAIN)
     return 1.0 + 0.3 * ((1.0 - v) * southern + v * northern - 0.5) + 0.1 * (grain - 0.5)
 
 
@@ -234,28 +228,14 @@ def into_wire(
 
 
 @kernel
-def park(frame: Frame, z: FloatArray, rows: FloatArray, car: int, time_s: float, box: FloatArray) -> None:
-    """Where a car is at a time: its planes and the center of its floor into ``box``."""
-    ux, uy = rows[car + 2] - rows[car], rows[car + 3] - rows[car + 1]
-    length = math.hypot(ux, uy)
-    driven = 0.0
-    if length > 0.0:
-        ux, uy = ux / length, uy / length
-        driven = (rows[car + 4] * time_s) % (2.0 * length)
-        driven = min(driven, 2.0 * length - driven)
-    else:
-        ux, uy = 0.0, 1.0
-    x, y = rows[car] + driven * ux, rows[car + 1] + driven * uy
+def beside_car(frame: Frame, z: FloatArray, rows: FloatArray, car: int, ray: Ray, time_s: float) -> Ray:
+    """A ray as it is seen from a car: its rows stand at the middle of its floor, which moves over the ground."""
+    length = rows[car + 10]
+    driven = (rows[car + 11] * time_s) % (2.0 * length) if length > 0.0 else 0.0
+    driven = min(driven, 2.0 * length - driven)
+    x, y = rows[car + 6] + driven * rows[car + 8], rows[car + 7] + driven * rows[car + 9]
     floor = ground_z(z, frame.west, frame.south, frame.cell, x, y)
-    for k in range(len(box)):
-        box[k] = 0.0
-    box[0], box[1], box[6], box[7] = ux, uy, -ux, -uy
-    box[12], box[13], box[18], box[19] = uy, -ux, -uy, ux
-    for side in range(4):
-        at = PLANE * side
-        box[at + 3] = box[at] * x + box[at + 1] * y + _CAR_HALF[side // 2]
-    box[26], box[27] = 1.0, floor + CAR_SIZE_M[2]
-    box[30], box[31], box[32] = x, y, floor
+    return ray[0] - x, ray[1] - y, ray[2] - floor, ray[3], ray[4], ray[5], ray[6], ray[7]
 
 
 @kernel
@@ -274,7 +254,6 @@ def meet(
     soft: FloatArray,
     count: int,
     room: int,
-    box: FloatArray,
 ) -> tuple[float, int, float, float, float, int]:
     """What a cell lists, between two distances.
 
@@ -284,21 +263,14 @@ def meet(
     best, surface, reflectance, cosine, edge, grow = NEVER, NO_SURFACE, 0.0, 1.0, NEVER, spread * stop
     for k in range(first, last):
         kind, row = item[k] & 3, item[k] >> 2
-        if kind == SOLIDS:
-            if passes(ray, rows[row], rows[row + 1], rows[row + 2], rows[row + 3] + grow) < NEVER:
-                low, high = int(rows[row + 4]), int(rows[row + 5])
-                at, through, cos, near = solid_entry(rows, low, high, ray, grow)
-                edge = min(edge, near)
+        if kind == SOLIDS or kind == CARS:
+            near = beside_car(frame, z, rows, row, ray, pulse[0]) if kind == CARS else ray
+            if passes(near, rows[row], rows[row + 1], rows[row + 2], rows[row + 3] + grow) < NEVER:
+                at, through, cos, rim = solid_entry(rows, int(rows[row + 4]), int(rows[row + 5]), near, grow)
+                edge = min(edge, rim)
                 if start <= at < stop and at < best:
                     best, surface, cosine = at, int(rows[through + 4]), cos
-                    reflectance = rows[through + 5] * texture(ray[0] + at * ray[3], ray[1] + at * ray[4])
-        elif kind == CARS:
-            park(frame, z, rows, row, pulse[0], box)
-            if passes(ray, box[30], box[31], box[32], _CAR_RADIUS + grow) < NEVER:
-                at, through, cos, near = solid_entry(box, _BOX_PLANES[0], _BOX_PLANES[1], ray, grow)
-                edge = min(edge, near)
-                if start <= at < stop and at < best:
-                    best, surface, reflectance, cosine = at, CAR, rows[row + 5], cos
+                    reflectance = rows[through + 5] * texture(near[0] + at * near[3], near[1] + at * near[4])
         elif count < room:
             if kind == TREES:
                 count = into_crown(rows, row, ray, start, stop, pulse, soft, count)
@@ -321,7 +293,6 @@ def march(
     soft: FloatArray,
     count: int,
     room: int,
-    box: FloatArray,
 ) -> tuple[float, int, float, float, float, int]:
     """As `meet`, for a whole ray."""
     best, surface, reflectance, cosine, edge, fresh = NEVER, NO_SURFACE, 0.0, 1.0, NEVER, True
@@ -341,7 +312,7 @@ def march(
             first, last = listed[0, cell], listed[0, cell + 1]
             if last > first:
                 best, surface, reflectance, cosine, near, count = meet(
-                    frame, z, rows, item, first, last, ray, at, leave, spread, pulse, soft, count, room, box
+                    frame, z, rows, item, first, last, ray, at, leave, spread, pulse, soft, count, room
                 )
                 edge = min(edge, near)
             if low <= top[1, row, column]:

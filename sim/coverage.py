@@ -370,9 +370,10 @@ def _always_on(table: ScannerTable) -> bool:
 
 
 def _pulse_bytes(table: ScannerTable) -> float:
-    """Of the log, a pulse: its part of a datagram (SREP/1; VLP-16 data packet; Ouster legacy packet)."""
+    """Of the log, a pulse: its part of a datagram (SREP/1, VLP-16's data packet, Ouster's RNG19_RFL8_SIG16_NIR16)."""
     if table.kind == "vlp16":
         return (1206 + LOG_MESSAGE_BYTES) / (192 if table.dual_return else 384)
     if table.kind == "os1":
-        return (16 * (20 + 12 * OS1_BEAMS) + LOG_MESSAGE_BYTES) / (16 * OS1_BEAMS)
+        column = 12 + (16 if table.dual_return else 12) * OS1_BEAMS
+        return (64 + 16 * column + LOG_MESSAGE_BYTES) / (16 * OS1_BEAMS)
     return 8 + 8 * table.return_slots + (52 + LOG_MESSAGE_BYTES) / table.pulses_per_datagram

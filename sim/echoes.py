@@ -3,42 +3,36 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numba
 import numpy as np
-from llvmlite.ir import Constant
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 
-from sim import casting, rays
-from sim.casting import BOX, RIM_SHARE, SPENT, Frame, Pulse, SceneArrays, march
-from sim.rays import NEVER, Ray, kernel
-from sim.shots import NO_SURFACE
+from sim import casting, compiled, rays, shots
+from sim.casting import RIM_SHARE, SPENT, Frame, Pulse, SceneArrays, march
+from sim.compiled import borrowed, digest, kept, kernel, whole
+from sim.rays import NEVER, Ray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 SOFT_HITS = 24
+_NONE = whole(0)
 # Columns of soft hits: distance, share of the energy that comes so far, reflectance, cosine of incidence, surface.
 # Columns of echoes: distance, apparent reflectance, cosine of incidence, surface, 1 if on the axis.
 
 
 class Work(NamedTuple):
-    """Room to work in: soft hits, echoes, planes of a car."""
+    """Room to work in: soft hits and echoes."""
 
     soft: FloatArray
     echo: FloatArray
-    box: FloatArray
 
 
 def room_to_work() -> Work:
     """For one call at a time."""
-    return Work(np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 5, 5)), np.empty(BOX))
+    return Work(np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 5, 5)))
 
 
 @kernel
@@ -106,7 +100,7 @@ def move(echo: FloatArray, source: int, target: int) -> None:
 @kernel
 def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
     """Echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger one."""
-    kept = 0
+    kept = _NONE
     for k in range(1, count):
         if echo[k, 0] - echo[kept, 0] < pulse_m:
             strength = echo[kept, 1] + echo[k, 1]
@@ -132,13 +126,12 @@ def echoes_of(
     pulse: Pulse,
     soft: FloatArray,
     echo: FloatArray,
-    box: FloatArray,
 ) -> int:
     """All echoes of a pulse, in order of distance; returns how many."""
-    count, softs, room, share, wide, beam = 0, 0, len(soft), 1.0, spread, ray
+    count, softs, room, share, wide, beam = _NONE, _NONE, len(soft), 1.0, spread, ray
     for side in range(5):
         at, surface, reflectance, cos, edge, softs = march(
-            frame, z, top, first, item, rows, beam, wide, pulse, soft, softs, room, box
+            frame, z, top, first, item, rows, beam, wide, pulse, soft, softs, room
         )
         if side == 0:
             in_order(soft, softs)
@@ -152,32 +145,16 @@ def echoes_of(
         count = add(echo, count, at, strength, cos, float(surface), 1.0 if side == 0 else 0.0)
         if share == 1.0:
             return count
-        share, wide, room = RIM_SHARE, 0.0, 0
+        share, wide, room = RIM_SHARE, 0.0, _NONE
         beam = rim(ray, spread, side)
     in_order(echo, count)
     return count
 
 
-@intrinsic
-def borrowed(context: Any, values: Any) -> Any:
-    """The same array as one that owns nothing: numba counts references at every call, and that took two thirds of
-    the time. Its owner must outlive it: an argument does."""
+def _cast_pulses(sources: int) -> Callable[..., None]:
+    """`cast_pulses` as compiled from ``sources``."""
 
-    def without_owner(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = make_array(signature.args[0])(context, builder, arguments[0])
-        for name in ("meminfo", "parent"):
-            setattr(array, name, Constant(getattr(array, name).type, None))
-        return array._getvalue()
-
-    return values(values), without_owner
-
-
-def _compiled(digest: int) -> Callable[..., None]:
-    """`cast_pulses`, which numba keeps on disk for later processes, by this file's age and what the closure holds.
-
-    ``digest`` stands for the files that it does not look at.
-    """
-
+    @kept
     def cast_pulses(
         scene: SceneArrays,
         work: Work,
@@ -193,16 +170,16 @@ def _compiled(digest: int) -> Callable[..., None]:
         surface: NDArray[np.uint8],
     ) -> None:
         """Echoes of n pulses into tables (n, slots), filled with what an empty slot says before."""
-        slots = range_m.shape[1] if digest else 0
+        slots = range_m.shape[1] if sources else 0
         frame, seed = scene.frame, scene.seed
         z, top, first = borrowed(scene.z), borrowed(scene.top), borrowed(scene.first)
         item, rows = borrowed(scene.item), borrowed(scene.rows)
-        soft, echo, box = borrowed(work.soft), borrowed(work.echo), borrowed(work.box)
+        soft, echo = borrowed(work.soft), borrowed(work.echo)
         for i in range(len(origin)):
             dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
             ray = origin[i, 0], origin[i, 1], origin[i, 2], dx, dy, dz, 1.0 / dx, 1.0 / dy
             pulse = time_s[i], number[i], seed
-            found = echoes_of(frame, z, top, first, item, rows, ray, spread, pulse, soft, echo, box)
+            found = echoes_of(frame, z, top, first, item, rows, ray, spread, pulse, soft, echo)
             count = merged(echo, found, pulse_m)
             for slot in range(min(count, slots)):
                 k = count - 1 if slot == slots - 1 else slot
@@ -211,8 +188,7 @@ def _compiled(digest: int) -> Callable[..., None]:
                 incidence_rad[i, slot] = math.acos(min(echo[k, 2], 1.0))
                 surface[i, slot] = np.uint8(echo[k, 3])
 
-    kept: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(cast_pulses)
-    return kept
+    return cast_pulses
 
 
-cast_pulses = _compiled(zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in (casting, rays))))
+cast_pulses = _cast_pulses(digest(casting, compiled, rays, shots))

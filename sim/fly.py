@@ -12,7 +12,7 @@ import numpy as np
 from sim.atmosphere import Air
 from sim.clocks import PulsePerSecond, generator
 from sim.companions import control_points_e
-from sim.coverage import corners
+from sim.coverage import corners, refuse_ranges
 from sim.errors import PlanError
 from sim.faults import Window, check_faults, windows, with_faults
 from sim.flight import Trajectory, fly
@@ -65,6 +65,7 @@ class VirtualFlight:
         self.site = Site.at(*flight.origin_deg)
         self.scene = build_scene(plan, self.site, corners(plan))
         self.trajectory: Trajectory = fly(plan, self.site, self.scene.ground_m)
+        refuse_ranges(plan, self.scene.ground_m)
         self.duration_s = min(self.trajectory.end_s, stop_s)
         self.host_clock = HostClock(plan)
         self.returns = 0

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sim.clocks import generator
-from sim.plan_tables import CarTable, ForestTable, RoadTable, WireTable
+from sim.plan_terrain import CarTable, ForestTable, RoadTable, WireTable
 from sim.rays import PLANE
-from sim.shots import ROOF, WALL
+from sim.shots import CAR, ROOF, WALL
 from sim.terrain import Ground, Lake, ups
 from sim.village import ROOFS, Houses
 
@@ -32,7 +32,7 @@ class Things(NamedTuple):
         solid: (n, 6) center and radius of the sphere around it; in `flat`, where its planes begin and end.
         tree: (n, 7) crown's center, one by its radius and by its half height, interceptions a metre, reflectance.
         wire: (n, 7) ends of a straight piece, radius.
-        car: (n, 6) from, to, speed in m/s, reflectance.
+        car: (n, 12) as ``solid``, about the middle of its floor; from, direction, length of its way, speed in m/s.
         lake: (n, 8) center, normal, radius, share of pulses that return.
         road: (n, 8) ends of a straight piece, half width, metres of road before it, 1 if painted, number of the road.
     """
@@ -183,11 +183,25 @@ def build_wires(tables: list[WireTable], ground: Ground) -> FloatArray:
     return np.concatenate(rows)
 
 
-def build_cars(tables: list[CarTable], seed: int) -> FloatArray:
-    """`Things.car`."""
+def build_cars(tables: list[CarTable], seed: int, planes_before: int) -> tuple[FloatArray, FloatArray]:
+    """Planes (5 n, 6) of boxes without a floor, which are to follow ``planes_before`` others, and `Things.car`."""
     paint = generator(seed, "terrain", "cars").uniform(0.1, 0.7, len(tables))
-    rows = [[*t.from_m, *t.to_m, t.speed_mps, paint[index]] for index, t in enumerate(tables)]
-    return np.array(rows, np.float64).reshape(-1, 6)
+    planes, cars = [np.zeros((0, PLANE))], [np.zeros((0, 12))]
+    half_along, half_across, height = np.array(CAR_SIZE_M) * [0.5, 0.5, 1.0]
+    for index, table in enumerate(tables):
+        way = np.subtract(table.to_m, table.from_m)
+        length = float(np.hypot(*way))
+        x, y = way / length if length > 0.0 else (0.0, 1.0)
+        box = np.zeros((5, PLANE))
+        box[:, :3] = np.array([[x, y, 0.0], [-x, -y, 0.0], [y, -x, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+        box[:, 3] = [half_along, half_along, half_across, half_across, height]
+        box[:, 4], box[:, 5] = CAR, paint[index]
+        planes.append(box)
+        first = PLANE * (planes_before + 5 * index)
+        ball = [0.0, 0.0, 0.5 * height, float(np.hypot(half_along, half_across)) + 0.5 * height]
+        car = [*ball, first, first + box.size, *table.from_m, x, y, length, table.speed_mps]
+        cars.append(np.array([car], np.float64))
+    return np.concatenate(planes), np.concatenate(cars)
 
 
 def build_lakes(lakes: list[Lake]) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 from sim.coverage import FloatArray, Grid, Survey, grid_of, summary_of
 from sim.envelope import Ground
 from sim.errors import PlanError
-from sim.picture_map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of
+from sim.picture_map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of, shortened
 from sim.plan import Plan
 from sim.terrain import build_ground
 
@@ -37,6 +37,7 @@ WIDE_PANELS: dict[str, Box] = {
     "table": (11.0, 0.3, 5.7, 4.35),
 }
 HEADER_IN, LARGEST_PITCH_IN, SMALLEST_PITCH_IN = 0.42, 0.24, 0.145  # of the table's rows
+MOST_ROWS = 24
 
 
 def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
@@ -75,6 +76,7 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
 
 def _tall_panels(rows: int, grid: Grid) -> dict[str, Box]:
     """The map at the left; at the right the table takes what it needs, the small maps what suits their shape."""
+    rows = min(rows, MOST_ROWS + 1)
     table = HEADER_IN + rows * float(np.clip(3.3 / rows, SMALLEST_PITCH_IN, LARGEST_PITCH_IN))
     bottom, left, width = 0.3 + table + 0.45, 10.35, 2.95
     maps = min(6.5 - bottom, max(1.6, width * len(grid.north_m) / len(grid.east_m)))
@@ -114,12 +116,12 @@ def _extent(survey: Survey, track: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _framed(low: FloatArray, high: FloatArray, box: Box) -> tuple[FloatArray, FloatArray, float]:
     """The corners, moved apart until they fill a panel; and by how much north is drawn larger than east."""
-    size, panel = high - low, np.array(box[2:])
-    middle = (low + high) / 2
-    scale = float((size / panel).max())
-    stretch = 1.0 if scale < STRETCH * float((size / panel).min()) else scale / float(size[1] / panel[1])
-    half = np.array([panel[0], panel[1] / stretch]) * scale / 2
-    return middle - half, middle + half, stretch
+    panel, middle = np.array(box[2:]), (low + high) / 2
+    scale = (high - low) / panel
+    if scale.max() < STRETCH * scale.min():
+        scale[:] = scale.max()
+    half = panel * scale / 2
+    return middle - half, middle + half, float(scale[0] / scale[1])
 
 
 def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
@@ -133,7 +135,8 @@ def _wide_ground(survey: Survey, low: FloatArray, high: FloatArray) -> Ground:
 
 def _title(figure: Figure, page: tuple[float, float], survey: Survey, rows: Sequence[dict[str, Any]]) -> None:
     tables, total = survey.plan.tables, rows[-1]
-    scanners = "; ".join(f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items())
+    told = [f"{name}: {_scanner_words(table)}" for name, table in tables.scanner.items()]
+    scanners = "; ".join(told) if len(told) < 4 else f"{len(told)} scanners"
     length_m = sum(row["length_m"] for row in rows[:-1])
     words = [
         f"{len(rows) - 1} line{'s' if len(rows) > 2 else ''}, {length_m / 1000:.1f} km",
@@ -160,32 +163,31 @@ def _profile(axes: Axes, survey: Survey, track: FloatArray, ground: Ground) -> N
     ground_m = ground(track[:, 1], track[:, 2])
     low, high = float(ground_m.min()), float(height_m.max())
     bottom, top = low - 0.12 * (high - low), high + 0.16 * (high - low)
-    for number, strip in enumerate(survey.strips):
-        start, end = strip.start_s / unit_s, strip.end_s / unit_s
-        axes.axvspan(start, end, color=colour_of(number), alpha=0.16, lw=0)
-        _, above_m = survey.stations(strip)
-        crowded = len(survey.strips) > 10
-        axes.text(
-            (start + end) / 2,
-            strip.height_m - 0.5 * float(above_m.mean()),
-            f"{above_m.mean():.0f} m",
-            rotation=90 if crowded else 0,
-            fontsize=6.5 if crowded else 7.5,
-            color=colour_of(number),
-            ha="center",
-            va="center",
-        )
-        if not crowded:
-            axes.text((start + end) / 2, top, strip.name, fontsize=6, color=colour_of(number), ha="center", va="bottom")
     axes.fill_between(time, ground_m, bottom, color="#cdbb98", lw=0)
     axes.plot(time, ground_m, color="#8a7752", lw=0.9)
     axes.plot(time, height_m, color=INK, lw=1.4)
     axes.set(xlim=(0.0, time[-1]), ylim=(bottom, top))
+    _profile_lines(axes, survey, unit_s, top)
     axes.set_xlabel(f"time ({unit})", fontsize=8, color=MUTED)
     axes.set_ylabel("ellipsoidal height (m)", fontsize=8, color=MUTED)
     heading(axes, "Height along the flight, above ground on the lines", 16.0, weight="bold")
     axes.grid(axis="y", color="#dddddd", lw=0.5)
     axes.set_axisbelow(True)
+
+
+def _profile_lines(axes: Axes, survey: Survey, unit_s: float, top: float) -> None:
+    """Each line's time in its colour, its height above ground in the middle; its name above where there is room."""
+    crowded = len(survey.strips) > 10
+    for number, strip in enumerate(survey.strips):
+        start, end, colour = strip.start_s / unit_s, strip.end_s / unit_s, colour_of(number)
+        middle = (start + end) / 2
+        axes.axvspan(start, end, color=colour, alpha=0.16, lw=0, zorder=0.5)
+        _, above_m = survey.stations(strip)
+        look: dict[str, Any] = {"rotation": 90, "fontsize": 6.5} if crowded else {"fontsize": 7.5}
+        at_m, text = strip.height_m - 0.5 * float(above_m.mean()), f"{above_m.mean():.0f} m"
+        axes.text(middle, at_m, text, color=colour, ha="center", va="center", **look)
+        if not crowded:
+            axes.text(middle, top, shortened(strip.name, 12), fontsize=6, color=colour, ha="center", va="bottom")
 
 
 def _density(axes: Axes, survey: Survey, grid: Grid) -> None:
@@ -240,8 +242,8 @@ def _bar(axes: Axes, image: Any, labels: Sequence[str]) -> None:
     drawn.outline.set_visible(False)
 
 
-COLUMNS = (  # heading, its place, how a row says it
-    ("line", 0.03, lambda row: row["name"]),
+COLUMNS: tuple[tuple[str, float, Callable[[dict[str, Any]], str]], ...] = (  # heading, its place, how a row says it
+    ("line", 0.03, lambda row: shortened(row["name"], 24)),
     ("length", 0.32, lambda row: f"{row['length_m']:.0f} m"),
     ("time", 0.43, lambda row: f"{row['seconds']:.1f} s"),
     ("above ground\nmin / mean", 0.62, lambda row: f"{row['height_min_m']:.0f} / {row['height_mean_m']:.0f} m"),
@@ -253,10 +255,10 @@ COLUMNS = (  # heading, its place, how a row says it
 
 def _table(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     """The summary's rows, each with its line's colour."""
-    lines = rows[:-1]
+    lines, left_out = rows[:-1][:MOST_ROWS], len(rows) - 1 - MOST_ROWS
     figure = page_of(axes)
     inches = axes.get_position().height * figure.get_size_inches()[1]
-    pitch = min(LARGEST_PITCH_IN, (inches - HEADER_IN) / len(lines))
+    pitch = min(LARGEST_PITCH_IN, (inches - HEADER_IN) / (len(lines) + (left_out > 0)))
     size = min(8.5, 0.66 * 72.0 * pitch)
     axes.axis("off")
     axes.set(xlim=(0.0, 1.0), ylim=(inches, 0.0))
@@ -271,6 +273,9 @@ def _table(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
         for _, x, say in COLUMNS:
             ha = "left" if x < 0.1 else "right"
             axes.text(x, y, say(row), fontsize=size, color=INK, ha=ha, va="center_baseline")
+    if left_out > 0:
+        y = HEADER_IN + (len(lines) + 0.5) * pitch
+        axes.text(COLUMNS[0][1], y, f"and {left_out} more", fontsize=size, color=MUTED, va="center_baseline")
 
 
 def _minutes(seconds: float) -> str:

@@ -46,6 +46,11 @@ def colour_of(number: int) -> str:
     return LINE_COLOURS[number % len(LINE_COLOURS)]
 
 
+def shortened(name: str, most: int) -> str:
+    """A name of so many letters at most."""
+    return name if len(name) <= most else f"{name[: most - 1]}…"
+
+
 def page_of(axes: Axes) -> Figure:
     """That a panel is on."""
     figure = axes.get_figure()
@@ -190,7 +195,7 @@ def _line(axes: Axes, strip: Strip, colour: str) -> None:
     upright = (turned + 90.0) % 180.0 - 90.0
     forward = abs(turned - upright) < 1.0
     axes.annotate(
-        strip.name,
+        shortened(strip.name, 14),
         xy=(start[0], start[1]),
         xytext=(-6.0 * strip.ahead[0], -6.0 * strip.ahead[1]),
         textcoords="offset points",
@@ -282,8 +287,9 @@ def _origin(axes: Axes, survey: Survey, stretch: float) -> None:
         f"origin {abs(lat_deg):.5f}° {'N' if lat_deg >= 0 else 'S'}, {abs(lon_deg):.5f}° {'E' if lon_deg >= 0 else 'W'}"
     )
     text += f"   {crs} {east_m:.1f}, {north_m:.1f}"
-    if stretch > 1.0:
-        text += f"   north drawn {stretch:.2g} × larger than east"
+    if stretch != 1.0:
+        larger = f"north drawn {stretch:.2g} × larger than east" if stretch > 1.0 else ""
+        text += f"   {larger or f'east drawn {1.0 / stretch:.2g} × larger than north'}"
     heading(axes, text, 3.0, x=1.0, fontsize=7.5, color=MUTED, ha="right")
 
 

@@ -7,43 +7,16 @@ site frame of `sim.site`). Heights are ellipsoidal.
 from __future__ import annotations
 
 import datetime as dt
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import Field
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=64)]
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
-Point = Annotated[list[float], Field(min_length=2, max_length=2)]
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Roof = Literal["flat", "gabled", "hipped"]
-
-
-def _zero() -> list[float]:
-    return [0.0, 0.0, 0.0]
-
-
-def _none_of_empty(value: Any) -> Any:
-    """TOML has no null."""
-    return None if value == "" else value
+from sim.plan_base import Matrix, Name, NotNegative, Point, Positive, Section, Vector, Wired
+from sim.plan_terrain import TerrainTable
 
 
 def _identity() -> list[list[float]]:
     return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-
-
-def _all_roofs() -> list[Roof]:
-    return ["gabled", "hipped", "flat"]
-
-
-Wired = Annotated[Name | None, BeforeValidator(_none_of_empty)]
-
-
-class Section(BaseModel):
-    """A table of the plan."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 # ---------------------------------------------------------------------------------------------- flight
@@ -88,96 +61,6 @@ class LineTable(Section):
     to_m: Point = Field(description="east, north")
     height_m: float = Field(description="ellipsoidal")
     speed_mps: float | None = Field(None, ge=10.0, le=150.0, description="over the ground")
-
-
-# ---------------------------------------------------------------------------------------------- terrain
-
-
-class VillageTable(Section):
-    """``[[terrain.village]]``: houses along roads that cross."""
-
-    center_m: Point = Field(description="east, north")
-    size_m: Point = Field(description="east, north extent")
-    heading_deg: float = Field(0.0, description="of its streets")
-    houses: int = Field(
-        60, ge=1, le=100_000, description="on lots along its streets; what has no room beside other things is left out"
-    )
-    roofs: list[Roof] = Field(default_factory=_all_roofs, min_length=1, description="drawn from these")
-
-
-class BuildingTable(Section):
-    """``[[terrain.building]]``: one building on a level floor at the terrain's height."""
-
-    center_m: Point = Field(description="east, north")
-    size_m: Point = Field(description="along, across its ridge")
-    heading_deg: float = Field(0.0, description="of its ridge")
-    eaves_m: Positive = Field(6.0, description="above the terrain")
-    roof: Roof = Field("gabled", description="flat, of two planes, or of four")
-    roof_pitch_deg: float = Field(35.0, gt=0.0, le=70.0, description="of its planes")
-
-
-class RoadTable(Section):
-    """``[[terrain.road]]``: asphalt with painted lines along its edges and middle."""
-
-    points_m: list[Point] = Field(min_length=2, description="east, north of its bends")
-    width_m: Positive = Field(6.0, description="of the asphalt")
-    markings: bool = Field(True, description="painted lines, brighter than asphalt")
-
-
-class WaterTable(Section):
-    """``[[terrain.water]]``: a level lake; most pulses give no return."""
-
-    center_m: Point = Field(description="east, north")
-    radius_m: Positive = Field(description="of its shore")
-    returns: float = Field(0.1, ge=0.0, le=1.0, description="share of pulses that come back near nadir")
-
-
-class ForestTable(Section):
-    """``[[terrain.forest]]``: trees at random."""
-
-    center_m: Point = Field(description="east, north")
-    size_m: Point = Field(description="east, north extent")
-    trees_per_ha: Positive = Field(150.0, description="on average")
-    height_m: Positive = Field(18.0, description="of its trees, about")
-
-
-class WireTable(Section):
-    """``[[terrain.wire]]``: a conductor between two masts."""
-
-    from_m: Point = Field(description="east, north")
-    to_m: Point = Field(description="east, north")
-    height_m: Positive = Field(20.0, description="of its ends above the terrain")
-    sag_m: NotNegative = Field(4.0, description="of its middle below its ends")
-    diameter_m: Positive = Field(0.03, description="of the conductor")
-
-
-class CarTable(Section):
-    """``[[terrain.car]]``: drives from one point to the other and back again."""
-
-    from_m: Point = Field(description="east, north")
-    to_m: Point = Field(description="east, north")
-    speed_mps: NotNegative = Field(14.0, description="on the way; 0: parked")
-
-
-class TerrainTable(Section):
-    """``[terrain]``: the ground and what stands on it."""
-
-    height_m: float = Field(450.0, ge=-500.0, le=9000.0, description="ellipsoidal, at the origin")
-    slope_percent: float = Field(0.0, ge=0.0, le=100.0, description="of the whole site")
-    slope_towards_deg: float = Field(0.0, description="azimuth it falls towards")
-    relief_m: float = Field(0.0, ge=0.0, le=2000.0, description="height of hills above valleys")
-    wavelength_m: float = Field(800.0, ge=50.0, description="from hill to hill")
-    raster: str = Field("", description="GeoTIFF of ellipsoidal heights instead; relative to the plan")
-    cell_m: float = Field(5.0, ge=0.25, le=100.0, description="of the grid the ground is kept in")
-    reflectance: float = Field(0.35, gt=0.0, le=1.0, description="of the ground")
-    seed: int = Field(1, ge=0, lt=2**63, description="of what is placed at random: hills, houses, trees")
-    village: list[VillageTable] = Field(default_factory=list)
-    building: list[BuildingTable] = Field(default_factory=list)
-    road: list[RoadTable] = Field(default_factory=list)
-    water: list[WaterTable] = Field(default_factory=list)
-    forest: list[ForestTable] = Field(default_factory=list)
-    wire: list[WireTable] = Field(default_factory=list)
-    car: list[CarTable] = Field(default_factory=list)
 
 
 class ControlTable(Section):

@@ -7,12 +7,11 @@ metres from the origin; infinity: never.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from sim.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 Ray = tuple[float, float, float, float, float, float, float, float]
@@ -20,17 +19,6 @@ Ray = tuple[float, float, float, float, float, float, float, float]
 PLANE = 6  # numbers of a plane's row
 NEVER = math.inf
 UNDERGROUND = -1.0
-Compiled = TypeVar("Compiled", bound=Callable[..., Any])
-
-
-def kernel(function: Compiled) -> Compiled:
-    """Compile for other compiled functions alone: no way in from Python; x / 0 is infinite, which spares a branch."""
-    compiled: Compiled = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
-        function
-    )
-    return compiled
-
-
 _MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _ODD_1, _ODD_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD1B54A32D192ED03)
 _ODD_3, _ODD_4 = np.uint64(0x8CB92BA72F3D8DD7), np.uint64(0xAEF17502108EF2D9)

@@ -28,7 +28,8 @@ from sim.objects import (
     near_pieces,
 )
 from sim.plan import Plan
-from sim.plan_tables import RoadTable, ScannerTable, TerrainTable
+from sim.plan_tables import ScannerTable
+from sim.plan_terrain import CarTable, RoadTable, TerrainTable, WireTable
 from sim.shots import Echoes
 from sim.site import Site
 from sim.terrain import Ground, build_ground, fill_lake
@@ -127,7 +128,7 @@ class Scene:
         draws = generator(seed, "control", "places")
         low, high = np.min(self.corners, axis=0), np.max(self.corners, axis=0)
         places = draws.uniform(low, high, (2000 + 50 * count, 2))
-        if len(self.corners) > 3:
+        if np.linalg.matrix_rank(self.corners - self.corners[0]) == 2:
             places = places[Delaunay(self.corners).find_simplex(places) >= 0]
         places = places[~self._occupied(places, CONTROL_CLEAR_M)]
         if len(places) < 2 * count:
@@ -182,9 +183,10 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
     road = build_roads(roads)
     solids = build_solids(houses, ground, table.seed)
     wires = [wire for wire in table.wire if _covered(ground, [wire.from_m, wire.to_m])]
-    cars = build_cars([car for car in table.car if _covered(ground, [car.from_m, car.to_m])], table.seed)
+    driven = [car for car in table.car if _covered(ground, [car.from_m, car.to_m])]
+    planes, cars = build_cars(driven, table.seed, len(solids.plane))
     things = Things(
-        solids.plane,
+        np.concatenate([solids.plane, planes]),
         solids.solid,
         _standing(build_trees(table.forest, ground, table.seed), ground, houses, road, water),
         build_wires(wires, ground),
@@ -200,10 +202,15 @@ def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
         roads,
         water[:, [0, 1, 6]],
         np.column_stack([things.tree[:, :2], 1 / things.tree[:, 3]]),
-        np.array([[*wire.from_m, *wire.to_m] for wire in wires]).reshape(-1, 4),
-        cars[:, :4],
-        _arrays(plan, ground, things, solids),
+        _ends(wires),
+        _ends(driven),
+        _arrays(plan, ground, things, solids, _ends(driven)),
     )
+
+
+def _ends(tables: list[WireTable] | list[CarTable]) -> FloatArray:
+    """(n, 4) from, to."""
+    return np.array([[*table.from_m, *table.to_m] for table in tables], np.float64).reshape(-1, 4)
 
 
 def _covered(ground: Ground, places: list[list[float]]) -> bool:
@@ -242,23 +249,23 @@ def _standing(trees: FloatArray, ground: Ground, houses: Houses, road: FloatArra
     return trees[~taken & ground.covers(place[:, 0], place[:, 1])]
 
 
-def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids) -> SceneArrays:
+def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids, ways: FloatArray) -> SceneArrays:
     """Tables and lists for the compiled functions."""
     foot_m = _footprint_m(list(plan.tables.scanner.values()))
     rows, starts = flat(things)
     tree, wire, lake = things.tree, things.wire, things.lake
     of_wire = np.concatenate([np.minimum(wire[:, :2], wire[:, 3:5]), np.maximum(wire[:, :2], wire[:, 3:5])], axis=1)
     piece, of_road = _pieces(things.road[:, :4])
-    driven, of_car, car_top = _driven(things.car, ground)
+    driven, of_car, car_top = _driven(ways, ground)
     cells = build_cells(
         ground,
         [
-            _listed(THINGS, SOLIDS, starts["solid"], solids.box, solids.top_z, foot_m),
+            _listed(THINGS, SOLIDS, starts["solid"], solids.box, solids.top_z + foot_m, foot_m),
             _listed(
                 THINGS, TREES, starts["tree"], _around(tree[:, :2], 1 / tree[:, 3]), tree[:, 2] + 1 / tree[:, 4], 0.0
             ),
             _listed(THINGS, WIRES, starts["wire"], of_wire, np.maximum(wire[:, 2], wire[:, 5]) + foot_m, foot_m),
-            _listed(THINGS, CARS, starts["car"][driven], of_car, car_top, foot_m + _CAR_REACH_M),
+            _listed(THINGS, CARS, starts["car"][driven], of_car, car_top + foot_m, foot_m + _CAR_REACH_M),
         ],
         [
             _listed(COVERS, ROADS, starts["road"][piece], of_road, np.zeros(len(piece)), things.road[piece, 4]),
@@ -302,9 +309,9 @@ def _pieces(lines: FloatArray) -> tuple[IntArray, FloatArray]:
     return row, np.concatenate([np.minimum(first, last), np.maximum(first, last)], axis=1)
 
 
-def _driven(cars: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
+def _driven(ways: FloatArray, ground: Ground) -> tuple[IntArray, FloatArray, FloatArray]:
     """Pieces of the cars' ways: the car of each, its box (m, 4), and what the car does not exceed there (m,)."""
-    row, box = _pieces(cars[:, :4])
+    row, box = _pieces(ways)
     across = np.linspace(0.0, 1.0, 2 + int(2 * CELL_M / ground.cell_m))
     x = box[:, np.newaxis, :1] + across[:, np.newaxis] * (box[:, 2:3] - box[:, :1])[:, np.newaxis]
     y = box[:, np.newaxis, 1:2] + across[:, np.newaxis] * (box[:, 3:] - box[:, 1:2])[:, np.newaxis]

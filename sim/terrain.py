@@ -12,7 +12,7 @@ from scipy.interpolate import RectBivariateSpline
 from sim.clocks import generator
 from sim.errors import PlanError
 from sim.plan import Plan
-from sim.plan_tables import TerrainTable
+from sim.plan_terrain import TerrainTable
 from sim.raster import RasterHeights
 from sim.site import Site
 
@@ -212,12 +212,17 @@ def fill_lake(ground: Ground, center_m: list[float], radius_m: float, returns: f
     level_m = np.min(rim_m)
     center = ground.site.site_from_ground(*(np.array([value]) for value in (*center_m, level_m)))
     up = ups(ground.site, center)[0]
-    rows, columns = ground.z.shape
-    x = ground.west_m + ground.cell_m * np.arange(columns)[np.newaxis, :] - center_m[0]
-    y = ground.south_m + ground.cell_m * np.arange(rows)[:, np.newaxis] - center_m[1]
+    wide = int(2 * radius_m / ground.cell_m)
+    columns, rows = (
+        np.arange(max(0, int(np.ceil((middle - radius_m - first) / ground.cell_m))), count)[: wide + 1]
+        for middle, first, count in zip(center_m, (ground.west_m, ground.south_m), ground.z.shape[::-1], strict=True)
+    )
+    x = ground.west_m + ground.cell_m * columns[np.newaxis, :] - center_m[0]
+    y = ground.south_m + ground.cell_m * rows[:, np.newaxis] - center_m[1]
     within = np.hypot(x, y) <= radius_m - np.sqrt(2.0) * ground.cell_m
     bed = center[0, 2] - (up[0] * x + up[1] * y) / up[2] - LAKE_DEPTH_M
-    ground.z[within] = np.minimum(ground.z, bed)[within]
+    z = ground.z[np.ix_(rows, columns)]
+    ground.z[np.ix_(rows, columns)] = np.where(within, np.minimum(z, bed), z)
     return Lake(center[0], up, radius_m, returns)
 
 

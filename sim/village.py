@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim.clocks import generator
 from sim.errors import PlanError
-from sim.plan_tables import BuildingTable, RoadTable, VillageTable
+from sim.plan_terrain import BuildingTable, RoadTable, VillageTable
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -134,7 +134,8 @@ def ground_points(
 
 def bent_towards_nadir(origin_e: FloatArray, along_e: FloatArray, bending: Bending) -> FloatArray:
     """Beams (n, 3) with their lengths, turned about the horizontal by Δd (NGA Eq. 4, 5)."""
-    lon, lat, height_m = TO_GEODETIC.transform(*origin_e.T)
+    x, y, z = origin_e.T
+    lon, lat, height_m = TO_GEODETIC.transform(x, y, z)
     lat, lon = np.radians(lat), np.radians(lon)
     down = -np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
     length = np.linalg.norm(along_e, axis=1)

@@ -13,7 +13,7 @@ import pytest
 
 from sim.coverage import FloatArray, Strip, Survey, corners, fan_of, grid_of, plan_summary, pulse_rate_hz, strip_of
 from sim.errors import PlanError
-from sim.picture import draw_plan
+from sim.picture import _framed, draw_plan
 from sim.plan import Plan, parse_plan
 from sim.plan_tables import ScannerTable
 from sim.scanners.line_heads import LineHead
@@ -228,6 +228,21 @@ def png_size(path: Path) -> tuple[int, int]:
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     width, height = struct.unpack(">II", data[16:24])
     return width, height
+
+
+class TestFrames:
+    BOX = (0.0, 0.0, 8.0, 4.0)
+
+    def test_a_map_fills_its_panel_to_scale(self) -> None:
+        low, high, stretch = _framed(np.array([0.0, 0.0]), np.array([1000.0, 2000.0]), self.BOX)
+        assert low == pytest.approx([-1500.0, 0.0])
+        assert high == pytest.approx([2500.0, 2000.0])
+        assert stretch == 1.0
+
+    def test_what_is_long_and_thin_is_stretched(self) -> None:
+        low, high, stretch = _framed(np.array([0.0, 0.0]), np.array([500.0, 40_000.0]), self.BOX)
+        assert [*low, *high] == pytest.approx([0.0, 0.0, 500.0, 40_000.0])
+        assert stretch == pytest.approx((500.0 / 8.0) / (40_000.0 / 4.0))
 
 
 class TestDrawing:
