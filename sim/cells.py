@@ -14,18 +14,21 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 CELL_M = 20.0
+MOST_CELLS = 4_000_000  # above, they are made larger
 
 
 class Cells(NamedTuple):
-    """Cells of `CELL_M` from the ground's south-west corner on; rows go north.
+    """Square cells from the ground's south-west corner on; rows go north.
 
     Attributes:
+        size_m: of a cell.
         top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
         first: (2, cells + 1) cell c lists ``item[first[0, c] : first[0, c + 1]]`` of what stands on the ground, by
             row 1 what covers it.
         item: codes as `Listed` had them.
     """
 
+    size_m: float
     top: FloatArray
     first: IntArray
     item: IntArray
@@ -48,16 +51,18 @@ class Listed:
 
 def build_cells(ground: Ground, things: list[Listed], covers: list[Listed]) -> Cells:
     """The lists of all cells over the ground."""
-    size = (ground.east_m - ground.west_m, ground.north_m - ground.south_m)
-    columns, rows = (max(1, int(np.ceil(length / CELL_M))) for length in size)
-    ground_top = _ground_top(ground, rows, columns)
-    cell, item, top_z = _spread(ground, _joined(things), rows, columns)
+    extent = (ground.east_m - ground.west_m, ground.north_m - ground.south_m)
+    size_m = CELL_M * np.ceil(np.sqrt(extent[0] * extent[1] / (CELL_M**2 * MOST_CELLS)))
+    columns, rows = (max(1, int(np.ceil(length / size_m))) for length in extent)
+    ground_top = _ground_top(ground, size_m, rows, columns)
+    cell, item, top_z = _spread(ground, size_m, _joined(things), rows, columns)
     top = ground_top.ravel().copy()
     np.maximum.at(top, cell, top_z)
     first, item = _lists(cell, item, rows * columns)
-    cell, cover, _ = _spread(ground, _joined(covers), rows, columns)
+    cell, cover, _ = _spread(ground, size_m, _joined(covers), rows, columns)
     first_cover, cover = _lists(cell, cover, rows * columns)
     return Cells(
+        float(size_m),
         np.stack([top.reshape(rows, columns), ground_top]),
         np.stack([first, first_cover + len(item)]),
         np.concatenate([item, cover]),
@@ -68,11 +73,11 @@ def _joined(listed: list[Listed]) -> Listed:
     return Listed(*(np.concatenate([getattr(one, name) for one in listed]) for name in ("item", "box", "top_z")))
 
 
-def _ground_top(ground: Ground, rows: int, columns: int) -> FloatArray:
+def _ground_top(ground: Ground, size_m: float, rows: int, columns: int) -> FloatArray:
     """(rows, columns) the highest node of each cell and of the patches that it cuts."""
 
     def spans(count: int, nodes: int) -> tuple[IntArray, IntArray]:
-        edge = np.arange(count + 1) * CELL_M / ground.cell_m
+        edge = np.arange(count + 1) * size_m / ground.cell_m
         first = np.clip(np.floor(edge[:-1] - 1e-6).astype(np.int64), 0, nodes - 2)
         last = np.clip(np.ceil(edge[1:] + 1e-6).astype(np.int64), 1, nodes - 1)
         return first, last
@@ -88,11 +93,13 @@ def _ground_top(ground: Ground, rows: int, columns: int) -> FloatArray:
     return np.ascontiguousarray(highest(by_rows.T, *spans(columns, ground.z.shape[1])).T)
 
 
-def _spread(ground: Ground, listed: Listed, rows: int, columns: int) -> tuple[IntArray, IntArray, FloatArray]:
+def _spread(
+    ground: Ground, size_m: float, listed: Listed, rows: int, columns: int
+) -> tuple[IntArray, IntArray, FloatArray]:
     """(cell, item, top_z) of every cell that every box touches; what lies off the grid is left out."""
     origin = np.array([ground.west_m, ground.south_m])
-    low = np.floor((listed.box[:, :2] - origin) / CELL_M).astype(np.int64)
-    high = np.floor((listed.box[:, 2:] - origin) / CELL_M).astype(np.int64)
+    low = np.floor((listed.box[:, :2] - origin) / size_m).astype(np.int64)
+    high = np.floor((listed.box[:, 2:] - origin) / size_m).astype(np.int64)
     low, high = np.maximum(low, 0), np.minimum(high, [columns - 1, rows - 1])
     extent = np.maximum(high - low + 1, 0)
     count = extent[:, 0] * extent[:, 1]

@@ -10,6 +10,7 @@ import numpy as np
 
 from sim.calibration_files import calibration_text
 from sim.clocks import generator
+from sim.coverage import control_points
 from sim.gnss_wire import config_table as gnss_config
 from sim.imu_wire import config_table as imu_config
 from sim.imu_wire import dbc_text
@@ -105,8 +106,7 @@ def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
 
 def control_points_e(plan: Plan, site: Site, scene: Scene) -> FloatArray:
     """(k, 3) true ECEF of the control points."""
-    points = scene.control_points(plan.tables.control.points, plan.tables.flight.seed)
-    return site.e_from_site(points)
+    return site.e_from_site(control_points(plan, scene))
 
 
 def control_text(plan: Plan, points_e: FloatArray) -> str:

@@ -199,6 +199,8 @@ def corners(plan: Plan) -> FloatArray:
         ends = np.array([-more_m, -more_m, strip.length_m + more_m, strip.length_m + more_m])
         sides = np.array([left_m - more_m, right_m + more_m, left_m - more_m, right_m + more_m])
         found.append(np.stack(strip.point(ends, sides), axis=-1))
+    if plan.tables.ground is not None:
+        found.append(np.array([plan.tables.ground.runway_m]))
     return np.concatenate(found)
 
 
@@ -209,6 +211,21 @@ def _tilt_rad(plan: Plan) -> float:
     flight = plan.tables.flight
     shaken_deg = 4.0 * INTENSITY[flight.turbulence] * max(ANGLE_RMS_DEG.values())
     return math.radians(mounted_deg + shaken_deg + abs(flight.pitch_deg))
+
+
+def control_points(plan: Plan, scene: Scene) -> FloatArray:
+    """(k, 3) site frame: the plan's ground control points, where some line sees them.
+
+    Raises:
+        PlanError: ``control.points``: there is no room for so many.
+    """
+    strips = [strip_of(plan, index, 0.0, 0.0) for index in range(len(plan.tables.line))]
+
+    def seen(east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
+        ground_m = scene.ground_m(east_m, north_m)
+        return np.any([strip.covers(east_m, north_m, ground_m) for strip in strips], axis=0)
+
+    return scene.control_points(plan.tables.control.points, plan.tables.flight.seed, seen)
 
 
 def refuse_ranges(plan: Plan, ground_m: Ground) -> None:

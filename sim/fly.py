@@ -133,7 +133,7 @@ class VirtualFlight:
         air = Air(tables.atmosphere, table.wavelength_nm)
         ranging = Ranging(table, air, flight.seed, name, flight.noise)
         place = self.trajectory, self.scene, self.site
-        return Scanner(table, head, ranging, wire, *place, air, self.plan.start_gps_ns)
+        return Scanner(name, table, head, ranging, wire, *place, air, self.plan.start_gps_ns)
 
     def _pulse(self, key: str, name: str | None) -> PulsePerSecond | None:
         if name is None:

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
 from pyproj import Transformer
 
-from sim.coverage import FloatArray, Strip, Survey
+from sim.coverage import FloatArray, Strip, Survey, control_points
 from sim.envelope import Ground
 from sim.village import STREET_M
 
@@ -93,7 +93,7 @@ def draw_map(
     axes.plot(*track[-1, 1:3], marker="s", ms=5, color=INK, mec="white", mew=0.8, zorder=8)
     for number, strip in enumerate(survey.strips):
         _line(axes, strip, colour_of(number))
-    control = survey.scene.control_points(survey.plan.tables.control.points, survey.plan.tables.flight.seed)
+    control = control_points(survey.plan, survey.scene)
     axes.plot(control[:, 0], control[:, 1], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7, zorder=7)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     for axis, where, size_m in ((axes.xaxis, "east", high[0] - low[0]), (axes.yaxis, "north", high[1] - low[1])):

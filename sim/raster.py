@@ -58,19 +58,19 @@ class RasterHeights:
 
         Where a place is on the map depends a little on its height: 0.8 m of 500 m at 10 km. Three turns settle it.
         """
-        height_m: FloatArray | float = self._height_m
+        height_m = np.full((len(north_m), len(east_m)), self._height_m)
         for _ in range(3):
             column, row = (pixel(east_m, north_m, height_m) for pixel in (self._column, self._row))
             height_m = self._pixels.sample(column, row)
-        assert isinstance(height_m, np.ndarray)
-        if not np.isfinite(height_m).all():
-            at_row, at_column = np.argwhere(~np.isfinite(height_m))[0]
-            place = [np.array([value]) for value in (east_m[at_column], north_m[at_row], self._height_m)]
-            easting, northing = self._to_crs(*place)
-            raise PlanError(
-                KEY, f"has no data at {easting[0]:.1f}, {northing[0]:.1f}; want heights all over the lines' swaths"
-            )
+            if not np.isfinite(height_m).all():
+                at_row, at_column = np.argwhere(~np.isfinite(height_m))[0]
+                self._refuse_hole(float(east_m[at_column]), float(north_m[at_row]))
         return height_m
+
+    def _refuse_hole(self, east_m: float, north_m: float) -> None:
+        easting, northing = self._to_crs(*(np.array([value]) for value in (east_m, north_m, self._height_m)))
+        place = f"{easting[0]:.1f}, {northing[0]:.1f}"
+        raise PlanError(KEY, f"has no data at {place}; want heights all over the lines' swaths")
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,38 @@ class _Projected:
         return np.asarray(easting), np.asarray(northing)
 
 
+class _Edges:
+    """Columns and rows of places on the map, by the six numbers of a raster's affine transform."""
+
+    def __init__(self, transform: Any) -> None:
+        self._inverse = np.linalg.inv([[transform.a, transform.b], [transform.d, transform.e]])
+        self._corner = np.array([transform.c, transform.f])
+
+    def __call__(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) each."""
+        x, y = easting - self._corner[0], northing - self._corner[1]
+        (to_column_x, to_column_y), (to_row_x, to_row_y) = self._inverse
+        return to_column_x * x + to_column_y * y, to_row_x * x + to_row_y * y
+
+
 @dataclass(frozen=True)
 class _Pixels:
-    """A window of the raster: values (rows, columns), nan where there is none; ``inverse`` takes the map to pixels."""
+    """A window of the raster.
+
+    Attributes:
+        values: (rows, columns), nan where there is none.
+        first: column and row of the window in the raster.
+        edges: takes the map to columns and rows of the raster, whole at the pixels' edges.
+    """
 
     values: FloatArray
-    inverse: Any
+    first: NDArray[np.int64]
+    edges: _Edges
 
     def at(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Column and row, whole at the pixels' centres."""
-        column, row = self.inverse * (easting, northing)
-        return column - 0.5, row - 0.5
+        """Column and row in the window, whole at the pixels' centres."""
+        column, row = self.edges(easting, northing)
+        return column - self.first[0] - 0.5, row - self.first[1] - 0.5
 
     def sample(self, column: FloatArray, row: FloatArray) -> FloatArray:
         """Bilinear; in the outer half of the outermost pixels as at their centres."""
@@ -140,14 +161,15 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
         with rasterio.open(path) as source:
             _check_crs(source.crs, to_crs.crs, path)
             easting, northing = to_crs(corners[:, 0], corners[:, 1], np.full(4, height_m))
-            column, row = ~source.transform * (easting, northing)
+            edges = _Edges(source.transform)
+            column, row = edges(easting, northing)
             _check_cover(np.stack([column, row], axis=1), (source.width, source.height), easting, northing, path)
             first = np.floor([min(column), min(row)]).astype(int) - 2
             last = np.ceil([max(column), max(row)]).astype(int) + 2
             first, last = np.maximum(first, 0), np.minimum(last, [source.width, source.height])
             window = Window(*map(int, first), *map(int, last - first))
             values = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
-            return _Pixels(values, ~source.window_transform(window))
+            return _Pixels(values, first, edges)
     except rasterio.errors.RasterioError as error:
         reason = str(error).splitlines()[0]
         raise PlanError(KEY, f"{path} cannot be read: {reason}; want a GeoTIFF of heights") from None

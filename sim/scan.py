@@ -6,6 +6,7 @@ leaves and returns at its pose of emission, as ISO/TS 19159-2 Eq. 10 has it.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -30,7 +31,7 @@ class Scanner:
     """One scanner of the plan.
 
     Args:
-        table: of the plan.
+        name, table: of the plan.
         head, ranging, wire: its parts.
         trajectory, scene, site, air: what it flies through.
         start_gps_ns: of the plan.
@@ -38,6 +39,7 @@ class Scanner:
 
     def __init__(
         self,
+        name: str,
         table: ScannerTable,
         head: Head,
         ranging: Ranging,
@@ -52,6 +54,7 @@ class Scanner:
         self._trajectory, self._scene, self._site, self._air = trajectory, scene, site, air
         self._start_gps_ns = start_gps_ns
         self._mounting = Mounting(table)
+        self._first_number = zlib.crc32(name.encode()) << 31  # the scene draws by it: two scanners see other leaves
 
     def work(self, stop_s: float) -> Iterator[tuple[list[WireUnit], StructArray]]:
         """Everything until a time, block by block: units in order of time, truth of the returns in them."""
@@ -101,7 +104,7 @@ class Scanner:
             beams.origin,
             direction,
             pulses.time_s,
-            pulses.number,
+            self._first_number + pulses.number,
             1e-3 * table.divergence_mrad,
             0.5 * LIGHT_MPS * 1e-9 * table.pulse_ns,
             table.return_slots,

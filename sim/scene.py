@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,7 @@ from sim.village import Houses, build_village
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Seen = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 
 FOOTPRINT_M = (1.0, 20.0)  # least and greatest radius of a beam for which objects are listed in the cells beside them
 CONTROL_CLEAR_M = 4.0
@@ -119,8 +121,13 @@ class Scene:
         )
         return Echoes(range_m, reflectance, incidence_rad, surface)
 
-    def control_points(self, count: int, seed: int) -> FloatArray:
+    def control_points(self, count: int, seed: int, seen: Seen | None = None) -> FloatArray:
         """(count, 3) places on the ground, site frame: in the open, on the flatter half of it, far from each other.
+
+        Args:
+            count: how many.
+            seed: of the choice.
+            seen: which places (n,) east and north count; None: all between the corners.
 
         Raises:
             PlanError: ``control.points``: there are not so many.
@@ -130,6 +137,8 @@ class Scene:
         places = draws.uniform(low, high, (2000 + 50 * count, 2))
         if np.linalg.matrix_rank(self.corners - self.corners[0]) == 2:
             places = places[Delaunay(self.corners).find_simplex(places) >= 0]
+        if seen is not None:
+            places = places[seen(places[:, 0], places[:, 1])]
         places = places[~self._occupied(places, CONTROL_CLEAR_M)]
         if len(places) < 2 * count:
             raise PlanError("control.points", f"no room for {count} in the open; want at most {len(places) // 2}")
@@ -274,8 +283,8 @@ def _arrays(plan: Plan, ground: Ground, things: Things, solids: Solids, ways: Fl
     )
     floor_z, roof_z = float(np.min(ground.z)) - 1.0, float(np.max(cells.top)) + 1.0
     table = plan.tables.terrain
-    frame = Frame(ground.west_m, ground.south_m, ground.cell_m, CELL_M, floor_z, roof_z, table.reflectance)
-    return SceneArrays(frame, ground.z, *cells, rows, plan.tables.flight.seed)
+    frame = Frame(ground.west_m, ground.south_m, ground.cell_m, cells.size_m, floor_z, roof_z, table.reflectance)
+    return SceneArrays(frame, ground.z, *cells[1:], rows, plan.tables.flight.seed)
 
 
 def _around(center: FloatArray, radius: FloatArray) -> FloatArray:

@@ -1,0 +1,166 @@
+"""Ground from GeoTIFFs, and rasters that cannot be used."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from pyproj import Transformer
+from rasterio.transform import Affine
+
+from sim.errors import PlanError
+from sim.scene import Scene, build_scene
+from sim.site import Site, geodetic_from_e
+from tests.sim.scenes import plan_of
+
+FloatArray = NDArray[np.float64]
+CRS = "EPSG:25832"
+CENTER = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(8.9, 47.5)
+SQUARE = 200.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def heights_at(easting: FloatArray, northing: FloatArray) -> FloatArray:
+    """A plane: bilinear interpolation gives it back."""
+    height_m: FloatArray = 500.0 + 0.03 * (easting - CENTER[0]) - 0.05 * (northing - CENTER[1])
+    return height_m
+
+
+def pixel_centers(transform: Affine, count: int) -> tuple[FloatArray, FloatArray]:
+    """Easting and northing of the pixels of a square raster."""
+    column, row = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
+    a, b, c, d, e, f = transform[:6]
+    return a * column + b * row + c, d * column + e * row + f
+
+
+def write(folder: Path, half_m: float = 400.0, pixel_m: float = 5.0, **others: Any) -> None:
+    """``dem.tif`` around the site's origin."""
+    transform = Affine(pixel_m, 0.0, CENTER[0] - half_m, 0.0, -pixel_m, CENTER[1] + half_m)
+    count = int(2 * half_m / pixel_m)
+    values = heights_at(*pixel_centers(transform, count))
+    profile = {"crs": CRS, "transform": transform, "nodata": None} | others
+    values = profile.pop("change", lambda same: same)(values)
+    with rasterio.open(
+        folder / "dem.tif", "w", driver="GTiff", width=count, height=count, count=1, dtype="float64", **profile
+    ) as file:
+        file.write(values, 1)
+
+
+def scene_in(folder: Path, text: str = "", corners: FloatArray = SQUARE) -> Scene:
+    """The scene over the raster."""
+    plan = plan_of(f"raster = 'dem.tif'\nheight_m = 480\n{text}", folder)
+    return build_scene(plan, Site.at(*plan.tables.flight.origin_deg), corners)
+
+
+def refused(folder: Path, text: str = "", corners: FloatArray = SQUARE) -> str:
+    """The one line that says why not."""
+    with pytest.raises(PlanError) as error:
+        scene_in(folder, text, corners)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("rotated", [False, True])
+def test_heights_are_those_of_the_map_at_every_node(tmp_path: Path, rotated: bool) -> None:
+    write(tmp_path)
+    if rotated:
+        cos, sin = 5.0 * np.cos(np.radians(30.0)), 5.0 * np.sin(np.radians(30.0))
+        corner = CENTER[0] - 90 * cos - 90 * sin, CENTER[1] - 90 * sin + 90 * cos
+        turn = Affine(cos, sin, corner[0], sin, -cos, corner[1])
+        with rasterio.open(
+            tmp_path / "dem.tif", "w", driver="GTiff", width=180, height=180, count=1, dtype="float64", crs=CRS,
+            transform=turn,
+        ) as file:  # fmt: skip
+            file.write(heights_at(*pixel_centers(turn, 180)), 1)
+    scene = scene_in(tmp_path)
+    east, north = (axis.ravel() for axis in np.meshgrid(np.arange(-200.0, 201.0, 25.0), np.arange(-200.0, 201.0, 25.0)))
+    points = np.stack([east, north, scene.site_z(east, north)], axis=1)
+    lat, lon, height_m = geodetic_from_e(scene.site.e_from_site(points))
+    easting, northing = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(
+        np.degrees(lon), np.degrees(lat)
+    )
+    np.testing.assert_allclose(height_m, heights_at(easting, northing), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(scene.ground_m(east, north), height_m, rtol=0, atol=1e-9)
+
+
+def test_far_from_the_origin_places_are_found_at_their_height(tmp_path: Path) -> None:
+    """At 8 km, 300 m of height move a place on the map by 0.4 m: 40 mm on a slope of a tenth."""
+    east_m = 8000.0
+    transform = Affine(10.0, 0.0, CENTER[0] + east_m - 600.0, 0.0, -10.0, CENTER[1] + 600.0)
+    easting, _ = pixel_centers(transform, 120)
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=120, height=120, count=1, dtype="float64", crs=CRS,
+        transform=transform,
+    ) as file:  # fmt: skip
+        file.write(800.0 + 0.1 * (easting - CENTER[0] - east_m), 1)
+    scene = scene_in(tmp_path, corners=SQUARE + np.array([east_m, 0.0]))
+    place = np.array([[east_m, 0.0], [east_m + 150.0, -100.0]]).T
+    points = np.stack([*place, scene.site_z(*place)], axis=1)
+    lat, lon, height_m = geodetic_from_e(scene.site.e_from_site(points))
+    found, _ = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(np.degrees(lon), np.degrees(lat))
+    np.testing.assert_allclose(height_m, 800.0 + 0.1 * (found - CENTER[0] - east_m), rtol=0, atol=1e-5)
+
+
+def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
+    assert refused(tmp_path).startswith(f"terrain.raster: there is no file {tmp_path / 'dem.tif'}; want")
+    (tmp_path / "dem.tif").write_text("no raster")
+    assert refused(tmp_path).startswith(f"terrain.raster: {tmp_path / 'dem.tif'} cannot be read: ")
+
+
+def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> None:
+    write(tmp_path, crs="EPSG:32632")
+    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:32632; want flight.crs, EPSG:25832"
+    write(tmp_path, crs=None)
+    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} has no CRS; want flight.crs, EPSG:25832"
+
+
+def test_a_compound_crs_is_asked_for_its_horizontal_part(tmp_path: Path) -> None:
+    write(tmp_path)
+    plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:25832+7837"}})
+    scene = build_scene(plan, Site.at(47.5, 8.9), SQUARE)
+    assert scene.ground_m(np.zeros(1), np.zeros(1))[0] == pytest.approx(500.0, abs=0.01)
+
+
+def test_a_crs_that_nobody_knows_is_the_flight_s_mistake(tmp_path: Path) -> None:
+    write(tmp_path)
+    plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:0"}})
+    with pytest.raises(PlanError, match=r"^flight\.crs: PROJ knows no 'EPSG:0'; want as EPSG:25832$"):
+        build_scene(plan, Site.at(47.5, 8.9), SQUARE)
+
+
+def test_a_raster_too_small_names_the_corner_it_does_not_reach(tmp_path: Path) -> None:
+    write(tmp_path, half_m=250.0)
+    assert "does not reach the south-west corner at" in refused(tmp_path)
+    write(tmp_path)
+    assert "does not reach the south-east corner at" in refused(tmp_path, corners=SQUARE + np.array([105.0, 60.0]))
+
+
+@pytest.mark.parametrize("nothing", [-9999.0, np.nan])
+def test_a_hole_is_named_with_its_place(tmp_path: Path, nothing: float) -> None:
+    def pierced(values: FloatArray) -> FloatArray:
+        values[60, 100] = nothing
+        return values
+
+    write(tmp_path, change=pierced, nodata=-9999.0)
+    message = refused(tmp_path, "cell_m = 2.5")
+    assert message.startswith("terrain.raster: has no data at ")
+    at = [float(number.rstrip(";")) for number in message.split()[5:7] for number in [number.rstrip(",")]]
+    np.testing.assert_allclose(at, [CENTER[0] - 400.0 + 502.5, CENTER[1] + 400.0 - 302.5], rtol=0, atol=8.0)
+
+
+def test_holes_outside_the_area_do_no_harm(tmp_path: Path) -> None:
+    def framed(values: FloatArray) -> FloatArray:
+        values[:10] = -9999.0
+        return values
+
+    write(tmp_path, change=framed, nodata=-9999.0)
+    assert np.isfinite(scene_in(tmp_path).ground.z).all()
+
+
+def test_without_rasterio_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    assert "pip install 'swath[raster]'" in refused(tmp_path)
