@@ -223,7 +223,10 @@ def control_points(plan: Plan, scene: Scene) -> FloatArray:
 
     def seen(east_m: FloatArray, north_m: FloatArray) -> NDArray[np.bool_]:
         ground_m = scene.ground_m(east_m, north_m)
-        return np.any([strip.covers(east_m, north_m, ground_m) for strip in strips], axis=0)
+        covered = np.zeros(ground_m.shape, np.bool_)
+        for strip in strips:
+            covered |= strip.covers(east_m, north_m, ground_m)
+        return covered
 
     return scene.control_points(plan.tables.control.points, plan.tables.flight.seed, seen)
 

@@ -52,7 +52,7 @@ TOP = {
     "scan_hz": 10.0,
     "installation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
     "range_min_m": 1.0,
-    "range_max_m": 120.0,
+    "range_max_m": 400.0,
 }
 
 
