@@ -122,7 +122,7 @@ class Flown:
         return Track(time_s, lat, lon, height, attitude)
 
 
-def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 17.5) -> Flown:
+def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 15.5) -> Flown:
     """Fly the plan, feed the scanner's packets to its driver."""
     plan = parse_plan(PLAN, folder).changed(changes)
     path = folder / "truth.npz"
@@ -373,7 +373,7 @@ SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forw
 def test_vlp16(tmp_path: Path, dual: bool) -> None:
     scanner = {"kind": "vlp16", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "dual_return": dual}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
-    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=3.0)
+    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=1.3)
     points_s = velodyne_points(corrected_rows(flown, 10.0), VLP16.beams)
     angle_quantum_rad = np.radians(0.01) * vlp16_quanta(flown.truth["left.pulse"], groups=6 if dual else 12)
     check_spinning(flown, points_s, range_quantum_m=0.002, angle_quantum_rad=angle_quantum_rad, time_quantum_s=1e-6)
@@ -394,7 +394,7 @@ def vlp16_quanta(pulse: NDArray[np.int64], groups: int) -> FloatArray:
 def test_os1(tmp_path: Path) -> None:
     scanner = {"kind": "os1", "scan_hz": 10.0, "true": SPINNING_ERRORS, "installation": SIDEWAYS, "serial": "1"}
     scanner |= {"range_min_m": 1.0, "range_max_m": 120.0, "reference_range_m": 60.0}
-    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=3.0)
+    flown = fly_and_decode(tmp_path, LOW_AND_SLOW | {"scanner": {"left": scanner}}, stop_s=1.3)
     points_s = ouster_points(corrected_rows(flown, -10.0), read_head(flown.files["left.json"]))
     check_spinning(flown, points_s, range_quantum_m=0.001, angle_quantum_rad=0.0, time_quantum_s=1e-9)
 
