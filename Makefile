@@ -20,7 +20,7 @@ export PIP_ROOT_USER_ACTION := ignore
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
-demo: $(VENV)/.runs ## play real recordings through real wires into a recorder, about 30 s
+demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through real wires into a recorder, about 2 min
 	@$(BIN)/python -m demo
 
 test: lint $(VENV)/.tools ## install and run everything: style, types, import rules, tests
@@ -61,13 +61,13 @@ clean: ## remove the virtual environment and everything built
 $(VENV)/bin/python:
 	@sh systemd/setup.sh venv "$(PYTHON)" "$(VENV)"
 
-$(VENV)/.runs: pyproject.toml | $(VENV)/bin/python
-	@sh systemd/setup.sh pip "$(VENV)" .
+$(VENV)/.flies: pyproject.toml | $(VENV)/bin/python
+	@sh systemd/setup.sh pip "$(VENV)" '.[sim]'
 	@touch $@
 
 $(VENV)/.tests: pyproject.toml | $(VENV)/bin/python
 	@sh systemd/setup.sh pip "$(VENV)" '.[test]'
-	@touch $@ $(VENV)/.runs
+	@touch $@ $(VENV)/.flies
 
 # the units and rules are tested with systemd's own tools
 $(VENV)/.tools: | $(VENV)/bin/python

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from daemon.config import Config
@@ -40,6 +41,19 @@ def source_of_topic(topic: str) -> str | None:
     return topic[1 : -len("/raw")] if topic.endswith("/raw") else None
 
 
+def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], Output]]:
+    """What makes the sending end of every transport that a configuration names; each raises TransportError."""
+    makers: dict[str, Callable[[], Output]] = {}
+    for device in config.devices():
+        for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
+            if spec is not None and spec.kind != "gnss":
+                makers[device.source + suffix] = partial(open_output, spec)
+    for name, pps in config.pps.items():
+        if with_pps and pps.source.startswith(_FIXED):
+            makers[f"pps/{name}"] = partial(PpsOutput, Path(pps.source.removeprefix(_FIXED)))
+    return makers
+
+
 def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
     """The sending ends of every transport that a configuration names.
 
@@ -48,20 +62,15 @@ def open_outputs(config: Config, *, with_pps: bool) -> dict[str, Output]:
     """
     outputs: dict[str, Output] = {}
     try:
-        for device in config.devices():
-            for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
-                if spec is not None and spec.kind != "gnss":
-                    outputs[device.source + suffix] = open_output(spec)
-        for name, pps in config.pps.items():
-            if with_pps and pps.source.startswith(_FIXED):
-                outputs[f"pps/{name}"] = PpsOutput(Path(pps.source.removeprefix(_FIXED)))
+        for source, make in output_makers(config, with_pps=with_pps).items():
+            outputs[source] = make()
     except OSError:
         close_outputs(outputs)
         raise
     return outputs
 
 
-def close_outputs(outputs: dict[str, Output]) -> None:
+def close_outputs(outputs: Mapping[str, Output]) -> None:
     """Close them all."""
     for output in outputs.values():
         output.close()

@@ -16,7 +16,7 @@ from daemon.acquire_pps import PpsReceiver
 from daemon.answers import FirstUnits
 from daemon.block_queue import BlockQueue
 from daemon.channels import ChannelTable, JsonChannel
-from daemon.config import Config, DeviceEntry
+from daemon.config import Config, DeviceEntry, GnssConfig
 from daemon.errors import ExitCode
 from daemon.events import Events
 from daemon.host_clock import HostClock
@@ -90,7 +90,7 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
         fsync_s=config.session.fsync_s,
         reserve_bytes=int(config.session.reserve_mb * 1e6),
     )
-    timekeeper = TimeKeeper(events, clock.offset_ns)
+    timekeeper = make_timekeeper(config, events, clock.offset_ns)
     recorder = Recorder(
         parts, settings, queue, channels, events, clock, lambda source: timekeeper.status(source, clock.now_ns())
     )
@@ -112,11 +112,29 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
     return assembly
 
 
+def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int) -> TimeKeeper:
+    """A clock for each PPS of a configuration, and the receivers that name its seconds."""
+    keeper = TimeKeeper(events, host_minus_monotonic_ns)
+    leap_of = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps}
+    for name, pps in config.pps.items():
+        keeper.add_pps(f"pps/{name}", leap_of.get(name), pps.delay_ns)
+    for device in config.devices():
+        if device.kind == "gnss" and device.transport.kind != "gnss":
+            _add_gnss_time(keeper, device, config.gnss[device.name])
+    return keeper
+
+
+def _add_gnss_time(keeper: TimeKeeper, device: DeviceEntry, gnss: GnssConfig) -> None:
+    driver = find_driver("gnss", device.protocol)
+    names = None if gnss.names_edge == "auto" else NamesEdge(gnss.names_edge)
+    make_parser = driver.make_time_parser or driver.make_parser
+    pps_source = f"pps/{gnss.pps}" if gnss.pps else None
+    keeper.add_gnss(device.source, pps_source, make_parser(device.settings), names, gnss.leap_seconds)
+
+
 def _add_pps(assembly: Assembly) -> None:
-    leap_of = {gnss.pps: gnss.leap_seconds for gnss in assembly.config.gnss.values() if gnss.pps}
     for name, pps in assembly.config.pps.items():
         source = f"pps/{name}"
-        assembly.timekeeper.add_pps(source, leap_of.get(name), pps.delay_ns)
         session = Session(lambda pps=pps: parse_pps(pps.source, edge=pps.edge))  # type: ignore[misc]
         edge_seen = assembly.timekeeper.edge_seen(source)
         overwrites = not pps.source.startswith("fixed:")
@@ -131,7 +149,6 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
     assembly.first_units.append(first_units)
     units_seen: list[UnitsSeen] = [first_units.add]
     if device.kind == "gnss":
-        _add_gnss_time(assembly, device)
         units_seen.append(assembly.timekeeper.units_seen(device.source))
     main = make_wire(device, device.transport, "")
     session = Session(lambda: open_transport(device.transport))
@@ -141,16 +158,6 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
         aux_session = Session(lambda: open_transport(auxiliary))
         aux = make_wire(device, auxiliary, "/aux")
         assembly.receivers.append(UnitReceiver(aux, aux_session, assembly.shared))
-
-
-def _add_gnss_time(assembly: Assembly, device: DeviceEntry) -> None:
-    driver = find_driver("gnss", device.protocol)
-    gnss = assembly.config.gnss[device.name]
-    names = None if gnss.names_edge == "auto" else NamesEdge(gnss.names_edge)
-    make_parser = driver.make_time_parser or driver.make_parser
-    pps_source = f"pps/{gnss.pps}" if gnss.pps else None
-    parser = make_parser(device.settings)
-    assembly.timekeeper.add_gnss(device.source, pps_source, parser, names, gnss.leap_seconds)
 
 
 def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:

@@ -17,7 +17,7 @@ from drivers.core.parser import Parser
 from georef.records import ChunkBatch, Int64Array
 
 USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
-GAP_MIN_NS = 100_000_000
+GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still speaks ten times a second
 MAX_MARKS = 10_000  # nobody marks more in a flight; a stranger's log may say anything
 MAX_WORDS = 32
 _ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
@@ -47,7 +47,7 @@ class Intervals:
             self.longest_ns, self.longest_at_ns = int(steps[widest]), int(times_ns[widest])
 
     def gaps(self) -> int:
-        """Intervals in a higher bin than the usual ones, so up to twice as long or longer, and of at least 0.1 s."""
+        """Intervals in a higher bin than the usual ones, so up to twice as long or longer, and above `GAP_MIN_NS`."""
         total = int(self.bins.sum())
         if total < 3:
             return 0

@@ -1,1 +1,1 @@
-"""The demonstration: real recordings played into a real recorder."""
+"""The demonstration: real recordings and the virtual aircraft, played into a real recorder."""

@@ -178,12 +178,30 @@ def test_the_example_of_a_new_device_is_a_driver() -> None:
     assert parser.counters.bytes == parser.counters.bytes_skipped == 3
 
 
-def test_importing_the_recorder_loads_nothing_of_processing() -> None:
-    code = (
-        "import sys, daemon.run, drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]; print(*sys.modules)"
-    )
+def loaded_by(code: str) -> set[str]:
+    """Top-level names of all modules that a new interpreter has after running this."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in done.stdout.split()}
+
+
+def test_importing_the_recorder_loads_nothing_of_processing() -> None:
+    loaded = loaded_by("import daemon.run, drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]")
     assert "daemon" in loaded
-    assert loaded & PROCESSING_ONLY == set()
+    assert loaded & (PROCESSING_ONLY | {"sim"}) == set()
+
+
+def test_importing_the_command_line_loads_nothing_of_processing_or_of_the_virtual_aircraft() -> None:
+    code = "import daemon.cli.main, daemon.cli.sim, daemon.sim_plans, daemon.sim_log, daemon.sim_wire, daemon.sim_ahead"
+    loaded = loaded_by(code)
+    assert "daemon" in loaded
+    assert loaded & (PROCESSING_ONLY | {"sim"}) == set()
+
+
+def test_one_module_alone_takes_the_virtual_aircraft_into_the_daemon() -> None:
+    """And nothing else is let through the contract that keeps the recorder light."""
+    light = contract("the recorder stays light")
+    assert light["source_modules"] == ["daemon", "drivers"]
+    assert {"numba", "scipy", "pyproj", "laspy", "matplotlib", "sim"} <= set(light["forbidden_modules"])
+    assert light["ignore_imports"] == ["drivers.compiled.rows -> numba", "daemon.sim_plans -> sim.*"]

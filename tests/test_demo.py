@@ -10,12 +10,20 @@ import pytest
 from rich.console import Console
 
 from daemon.wire_player import Output, PlayReport
-from demo.__main__ import Hashed, prove
+from demo.proof import Hashed, prove
 from tests.daemon.log_check import LogContent, read_log
 
 ROOT = Path(__file__).resolve().parent.parent
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]  # it is played once, by one worker
-SOURCES = ("gnss/rover", "imu/main", "scanner/top", "scanner/top/aux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(400),
+    pytest.mark.xdist_group("demo"),
+]  # it is played once, by one worker
+SOURCES = {
+    "recordings": ("gnss/rover", "imu/main", "scanner/top", "scanner/top/aux"),
+    "flight": ("gnss/rover", "imu/main", "scanner/left"),
+}
+EVERY = [(part, source) for part, sources in SOURCES.items() for source in (*sources, "pps/main")]
 
 
 class Nowhere(Output):
@@ -31,15 +39,15 @@ class Nowhere(Output):
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     folder = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "demo", "--seconds", "20", "--keep", str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    command = [sys.executable, "-m", "demo", "--seconds", "20", "--flight-seconds", "20", "--keep", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout, folder / "logs"
+    return done.stdout, folder
 
 
-def sent_as_logged(content: LogContent, report: PlayReport) -> dict[str, Hashed]:
+def sent_as_logged(content: LogContent, report: PlayReport, sources: tuple[str, ...]) -> dict[str, Hashed]:
     """Outputs that have sent exactly what is in a log."""
-    outputs: dict[str, Hashed] = {source: Hashed(Nowhere()) for source in SOURCES}
+    outputs: dict[str, Hashed] = {source: Hashed(Nowhere()) for source in sources}
     for source, output in outputs.items():
         for _, data in content.units[source]:
             output.send(data, 0)
@@ -48,22 +56,23 @@ def sent_as_logged(content: LogContent, report: PlayReport) -> dict[str, Hashed]
 
 
 def test_it_passes_and_shows_what_a_person_wants_to_see(played: tuple[str, Path]) -> None:
-    text, logs = played
+    text, folder = played
     assert "demonstration passed" in text
-    assert "every unit is accounted for" in text
-    assert text.count(" same ") == 5
-    assert "LOCKED" in text
-    content = read_log(logs)
-    assert all(content.units[source] for source in SOURCES)
-    assert [event["severity"] for _, event in content.messages["/events"] if event["severity"] != "info"] == []
+    assert text.count("every unit is accounted for") == 2
+    assert text.count(" same ") == 5 + 4
+    assert text.count("LOCKED") == 4  # receiver and pulse, of both
+    for part, sources in SOURCES.items():
+        content = read_log(folder / part / "logs")
+        assert all(content.units[source] for source in sources)
+        assert [event["severity"] for _, event in content.messages["/events"] if event["severity"] != "info"] == []
 
 
-@pytest.mark.parametrize("source", [*SOURCES, "pps/main"])
-def test_its_proof_fails_when_anything_differs(played: tuple[str, Path], source: str) -> None:
-    _, logs = played
+@pytest.mark.parametrize(("part", "source"), EVERY)
+def test_its_proof_fails_when_anything_differs(played: tuple[str, Path], part: str, source: str) -> None:
+    logs = played[1] / part / "logs"
     content, report = read_log(logs), PlayReport()
     quiet = Console(quiet=True)
-    outputs = sent_as_logged(content, report)
+    outputs = sent_as_logged(content, report, SOURCES[part])
     assert prove(quiet, logs, outputs, report)
     if source == "pps/main":
         report.units[source] += 1

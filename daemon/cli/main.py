@@ -64,6 +64,7 @@ COMMANDS = (
     Listed("export", "Write a log as the files that the devices' own tools read.", "Logs"),
     Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
     Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
+    Listed("sim", "Fly a virtual aircraft into a log or on wires; draw its plan.", "Simulation"),
     Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
     Listed("setup", "Show, or send, the messages the devices need before a survey.", "Setup"),
     Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
@@ -93,8 +94,11 @@ def make_app() -> typer.Typer:
     made.callback(help=HELP, epilog=EPILOG)(_callback)
     for listed in COMMANDS:
         if importlib.util.find_spec(listed.module) is not None:
-            command = importlib.import_module(listed.module).command
-            made.command(listed.name, short_help=listed.summary, rich_help_panel=listed.panel)(command)
+            module = importlib.import_module(listed.module)
+            if hasattr(module, "app"):  # commands of its own
+                made.add_typer(module.app, name=listed.name, short_help=listed.summary, rich_help_panel=listed.panel)
+            else:
+                made.command(listed.name, short_help=listed.summary, rich_help_panel=listed.panel)(module.command)
     return made
 
 

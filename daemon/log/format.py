@@ -48,7 +48,8 @@ class SessionInfo:
 
     Attributes:
         realtime_ns, monotonic_ns: one reading of both clocks; log_time = monotonic + (realtime_ns − monotonic_ns).
-        origin: "import" for a log made from captures; None for a recording.
+        origin: "import" for a log made from captures, "simulation" for a flight of the virtual aircraft; None for a
+            recording.
     """
 
     session_id: str

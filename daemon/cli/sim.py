@@ -1,0 +1,326 @@
+"""``swath sim``: the virtual aircraft."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from daemon.sim_ahead import Ahead, FlightFacts
+    from daemon.sim_folder import FlightFolder
+    from daemon.sim_log import SimReport
+    from daemon.sim_plans import Wish
+    from daemon.wire_player import Output, PlayReport
+
+PRESETS = "small, calibration, corridor, block, bench"  # sim.plan's
+CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
+SETTLE_S = 1.0  # from the last reader at a port to the first unit: nobody can see whether UDP and CAN are read
+LATE_S = 0.5  # a time message that comes later than this after its edge may be taken for the next one's
+INTERRUPTED = 130  # 128 + SIGINT
+
+PlanArgument = Annotated[str, typer.Argument(metavar="PLAN", help=f"A plan's file, or a preset: {PRESETS}.")]
+
+app = typer.Typer(
+    help="The virtual aircraft: a whole survey flight from a plan, into a log or on wires, with known truth.",
+    rich_markup_mode="markdown",
+)
+
+
+@app.callback(invoke_without_command=True)
+def _callback(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit(int(ExitCode.USAGE))
+
+
+@app.command("fly", short_help="Fly a plan: into a log as fast as it goes, or on wires in real time.")
+def fly(
+    plan: PlanArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="LOG", help="A folder, or the log's name (….mcap). --wire: a folder."),
+    ] = None,
+    wire: Annotated[bool, typer.Option("--wire", help="In real time on ptys, CAN, UDP and PPS FIFOs.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="--wire: the configuration whose wires to fly on.")
+    ] = None,
+    wait: Annotated[float, typer.Option(help="--wire: seconds to wait for a reader at every port.", min=0)] = 60.0,
+    set_clock: Annotated[
+        bool, typer.Option("--set-clock", help="--wire: faults may step this computer's clock (root).")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="Instead of the plan's: other noise.", min=0)] = None,
+    seconds: Annotated[float | None, typer.Option(help="The first seconds only.", min=0.1)] = None,
+    no_truth: Annotated[bool, typer.Option("--no-truth", help="Leave truth.npz out.")] = False,
+) -> None:
+    """Fly a plan.
+
+    With `-o` as fast as it goes, into a log as the recorder would have written it; beside it the configuration that
+    records it, nominal and true calibration, ground control and the truth. With `--wire` in real time, for a recorder
+    in another terminal.
+    """
+    from rich.console import Console
+
+    from daemon.sim_plans import Wish
+
+    logging.getLogger("swath").addHandler(logging.NullHandler())  # events of the log are in the log
+    console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
+    wish = Wish(plan, seed, seconds)
+    if wire:
+        if config is not None and output is not None:
+            raise UserError("-o makes wires, --config names some; give one of them", ExitCode.USAGE)
+        _fly_on_wires(console, wish, output, config, wait, set_clock=set_clock)
+        return
+    if config is not None or set_clock:
+        raise UserError(f"{'--config' if config else '--set-clock'} belongs to --wire", ExitCode.USAGE)
+    if output is None:
+        raise UserError("say where to: -o LOG, or --wire", ExitCode.USAGE)
+    _fly_into_log(console, wish, output, with_truth=not no_truth)
+
+
+@app.command("plan", short_help="Draw a plan, and say what it covers.")
+def plan_(
+    plan: PlanArgument,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="PNG, PDF or SVG; else <plan>.png, here.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Draw a plan: map of lines, swaths and buildings, height profile, point density, overlap; the same as a table."""
+    from rich.console import Console
+
+    from daemon.sim_plans import Wish, draw
+
+    picture = output if output is not None else Path(f"{Path(plan).stem}.png")
+    try:
+        with Console(stderr=True).status("drawing"):
+            rows = draw(Wish(plan), picture)
+    except OSError as error:
+        raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
+    if as_json:
+        print(json.dumps({"picture": str(picture), "lines": rows[:-1], "total": rows[-1]}, indent=2))
+        return
+    _print_lines(Console(), rows)
+    print(one_line(str(picture)))
+
+
+def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("line", "length", "time", "above ground, least", "mean", "swath", "pulses/m²", "overlap"):
+        table.add_column(column, justify="left" if column == "line" else "right")
+    for row in rows[:-1]:
+        figures = ("length_m", "seconds", "height_min_m", "height_mean_m", "swath_m", "density_per_m2")
+        units = ("m", "s", "m", "m", "m", "")
+        told = [
+            f"{row[key]:,.{0 if unit == 'm' else 1}f} {unit}".strip() for key, unit in zip(figures, units, strict=True)
+        ]
+        overlap = f"{row['overlap_percent']:.0f} %" if row["overlap_percent"] else "–"
+        table.add_row(one_line(row["name"]), *told, overlap)
+    console.print(table)
+    total = rows[-1]
+    console.print(
+        f"{total['seconds']:.0f} s in all, {total['line_s']:.0f} s on lines; "
+        f"about {total['pulses'] / 1e6:,.1f} M pulses, a log of {total['log_bytes'] / 1e6:,.0f} MB",
+        highlight=False,
+    )
+
+
+# ---------------------------------------------------------------------------------------------- into a log
+
+
+def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: bool) -> None:
+    from daemon.sim_folder import FlightFolder
+
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    started_s = time.monotonic()
+    try:
+        with FlightFolder(output) as folder:
+            report, names = _make_log(console, wish, folder, with_truth=with_truth)
+            logs = folder.keep(report.paths)
+    except KeyboardInterrupt:
+        console.print(f"interrupted: everything of this flight was removed from {folder.place}")
+        raise
+    except OSError as error:
+        text = f"{error.filename or output}: {error.strerror or error}; nothing is left of this flight"
+        raise UserError(one_line(text), ExitCode.IO) from error
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    _print_flown(report, time.monotonic() - started_s, logs, names)
+
+
+def _make_log(console: Console, wish: Wish, folder: FlightFolder, *, with_truth: bool) -> tuple[SimReport, list[str]]:
+    """Everything of a flight, in the folder's place out of sight."""
+    from daemon.config import load_config
+    from daemon.sim_log import fly_into_log, sim_session_info
+    from daemon.sim_plans import configuration, make_flight
+
+    plan = wish.load()
+    folder.refuse_taken([CONFIG_NAME])  # before anything that takes its time
+    with console.status("getting ready"):
+        flight, files = make_flight(wish, folder.work / TRUTH_NAME if with_truth else None)
+    files[CONFIG_NAME] = configuration(plan, None, ".")
+    names = sorted([*files, *([TRUTH_NAME] if with_truth else [])])
+    folder.refuse_taken(names)
+    folder.write(files)
+    config = load_config(folder.work / CONFIG_NAME)
+    flight_seed = plan.tables.flight.seed
+    folder.refuse_session(sim_session_info(config.session.name, flight.host_clock, flight_seed).session_id)
+    with _progress(console) as bar:
+        task = bar.add_task(config.session.name, total=flight.duration_s, told="")
+        begun_s = time.monotonic()
+
+        def tell(flown_s: float, units: int, returns: int, size: int) -> None:
+            mb_per_s = size / 1e6 / max(time.monotonic() - begun_s, 1e-3)
+            told = f"{flown_s:.0f} of {flight.duration_s:.0f} s flown, {units:,} units, {returns:,} returns"
+            bar.update(task, completed=flown_s, told=f"{told}, {mb_per_s:.1f} MB/s")
+
+        report = fly_into_log(config, folder.work, flight, flight_seed, tell)
+    with console.status("packing the truth"):
+        flight.finish_truth()
+    return report, names
+
+
+def _progress(console: Console) -> Progress:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _print_flown(report: SimReport, took_s: float, logs: list[Path], names: list[str]) -> None:
+    print(
+        f"{report.session_id}: {report.seconds:.1f} s flown in {took_s:.1f} s, {sum(report.units.values()):,} units, "
+        f"{report.returns:,} returns, {report.bytes / 1e6:.1f} MB"
+    )
+    for path in logs:
+        print(one_line(f"  {path}"))
+    print(f"  beside it: {', '.join(names)}")
+
+
+# ---------------------------------------------------------------------------------------------- on wires
+
+
+def _fly_on_wires(
+    console: Console, wish: Wish, folder: Path | None, config_path: Path | None, wait_s: float, *, set_clock: bool
+) -> None:
+    from daemon.config import load_config
+    from daemon.replay import close_outputs
+    from daemon.sim_ahead import Ahead
+    from daemon.sim_plans import make_flight_in_time
+    from daemon.sim_wire import check_steps, open_wires
+
+    plan = wish.load()
+    config = load_config(config_path) if config_path is not None else None
+    ahead = Ahead(partial(make_flight_in_time, wish))
+    stop: list[int] = []
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with console.status("getting ready"):
+            facts = ahead.facts
+        check_steps(facts, set_clock=set_clock)
+        if config_path is None or config is None:
+            config_path = _make_wires(console, plan, facts, folder)
+            config = load_config(config_path)
+        outputs, others = open_wires(config, facts)
+        for signum in before:
+            signal.signal(signum, lambda number, frame: stop.append(number))
+        try:
+            _await_readers(console, outputs, wait_s, lambda: bool(stop))
+            report = _play(console, plan.tables.flight.name, ahead, outputs, others, lambda: bool(stop))
+        finally:
+            close_outputs(outputs)
+            close_outputs(others)
+    except OSError as error:
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        raise UserError(one_line(text), ExitCode.IO) from error
+    finally:
+        ahead.close()
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+    _tell_report(console, report, facts, outputs, config_path)
+    if stop:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | None) -> Path:
+    """A folder with ports, FIFOs and the configuration that records from them."""
+    from daemon.sim_plans import configuration
+    from daemon.sim_wire import own_wires
+
+    place = Path(tempfile.mkdtemp(prefix="swath-sim-")) if folder is None else folder.absolute()
+    path = place / CONFIG_NAME
+    baud = {f"gnss/{name}": table.baud for name, table in plan.tables.gnss.items()}
+    files = facts.files | {CONFIG_NAME: configuration(plan, own_wires(place, facts.sources, baud), LOGS_NAME)}
+    if path.exists():
+        text = f"{path}: is there already; fly on its wires with --config {path}, or give another folder"
+        raise UserError(one_line(text), ExitCode.IO)
+    place.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        (place / name).write_bytes(data)
+    console.print(f"the flight's wires are in {place}; record it in another terminal:\n\n  swath run {path}\n")
+    return path
+
+
+def _await_readers(console: Console, outputs: Mapping[str, Output], wait_s: float, stopped: Callable[[], bool]) -> None:
+    from daemon.wire_player import wait_for_readers
+
+    with console.status("waiting for somebody to open the ports"):
+        for source in wait_for_readers(outputs, wait_s, stopped):
+            console.print(f"{source}: nobody has opened it; flying all the same")
+        settled_s = time.monotonic() + SETTLE_S
+        while time.monotonic() < settled_s and not stopped():
+            time.sleep(0.05)
+
+
+def _play(
+    console: Console,
+    name: str,
+    ahead: Ahead,
+    outputs: Mapping[str, Output],
+    others: Mapping[str, Output],
+    stopped: Callable[[], bool],
+) -> PlayReport:
+    from daemon.sim_wire import fly_on_wires
+
+    with _progress(console) as bar:
+        duration_s = ahead.facts.duration_s
+        task = bar.add_task(name, total=duration_s, told="")
+
+        def tell(flown_s: float, report: PlayReport) -> None:
+            told = f"{flown_s:.0f} of {duration_s:.0f} s flown, {report.units.total():,} units"
+            told += f", {report.bytes.total() / 1e6:.1f} MB, latest {1e3 * report.latest_s:.0f} ms late"
+            bar.update(task, completed=flown_s, told=told)
+
+        return fly_on_wires(ahead.units(), ahead.facts, outputs, others, progress=tell, stopped=stopped)
+
+
+def _tell_report(
+    console: Console, report: PlayReport, facts: FlightFacts, outputs: Mapping[str, Output], config: Path
+) -> None:
+    for source in sorted(report.passed_over):
+        console.print(f"{source}: in the flight, not in {config}; not flown")
+    for source in sorted(outputs):
+        if source not in facts.sources:
+            console.print(f"{source}: in {config}, not in the flight")
+            continue
+        refused = f", {report.refused[source]:,} refused by a reader" if report.refused[source] else ""
+        console.print(f"{source}: {report.units[source]:,} units, {report.bytes[source]:,} bytes{refused}")
+    slow = report.latest_s > LATE_S and not report.refused  # else it may have waited for a reader
+    remark = "; this computer is too slow for this flight in real time" if slow else ""
+    console.print(f"the latest unit left {report.latest_s:.3f} s after its time{remark}")

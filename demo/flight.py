@@ -1,0 +1,42 @@
+"""The second part: the virtual aircraft, a whole flight of it in real time."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from daemon.sim_ahead import Ahead
+from daemon.sim_plans import Wish, configuration, make_flight_in_time
+from daemon.sim_wire import own_wires
+from demo.proof import Show
+
+PLAN = "small"
+WHAT = {
+    "gnss/rover": "NovAtel receiver, RTK, two antennas, its own INS, through a pty",
+    "imu/main": "tactical IMU, 200 Hz, latches PPS, through a CAN bus (udp_multicast)",
+    "scanner/left": "oscillating mirror, 70 000 pulses a second, SREP/1 through UDP",
+    "pps/main": "the receiver's pulse, wired to computer, IMU and scanner",
+}
+REMARK = (
+    "All of it is one flight, made while it is flown: `swath sim fly small -o LOG` flies it into a log, with the "
+    "truth of every return beside it."
+)
+
+
+def take_off(seconds: float) -> Ahead:
+    """Begin to make the flight, in a process of its own."""
+    return Ahead(partial(make_flight_in_time, Wish(PLAN, seconds=seconds)))
+
+
+def prepare(console: Console, folder: Path, ahead: Ahead) -> Show:
+    """Write the configuration and the files that it names."""
+    with console.status("getting the virtual aircraft ready (the first time, it is compiled)"):
+        facts = ahead.facts
+    plan = Wish(PLAN).load()
+    folder.mkdir(parents=True, exist_ok=True)
+    wires = own_wires(folder, facts.sources, {f"gnss/{name}": table.baud for name, table in plan.tables.gnss.items()})
+    for name, data in (facts.files | {"swath.toml": configuration(plan, wires, "logs")}).items():
+        (folder / name).write_bytes(data)
+    return Show("the virtual aircraft, in real time", WHAT, ahead.units(), facts.duration_s, REMARK)
