@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+from scipy.spatial.transform import Rotation
 
 from drivers.core.frame_kinds import XBUS, XBUS_MAX_DATA_BYTES
 from drivers.core.framing import Framer
