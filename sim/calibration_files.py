@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from sim.errors import PlanError
 from sim.plan import Plan
-from sim.plan_tables import ScannerTable
+from sim.plan_tables import ScannerTable, Tables
 from sim.toml_text import toml_text
 
 CONVENTIONS_VERSION = 1
@@ -17,6 +18,19 @@ def mirror_factor(table: ScannerTable) -> float:
     return 2.0 if table.kind == "oscillating" else 1.0
 
 
+def check_latencies(tables: Tables) -> None:
+    """A scanner's IMU latency is the IMU's own: refuse it where it has no effect; raises `PlanError`."""
+    for name, table in tables.scanner.items():
+        if table.true.imu_latency_us != 0.0:
+            key = f"scanner.{name}.true.imu_latency_us"
+            raise PlanError(key, "want 0, and imu.<name>.latency_us instead: it is the IMU's stamps that are late")
+
+
+def _imu_latency_us(tables: Tables) -> float:
+    """Of the first IMU, which the attitude is taken from."""
+    return next((table.latency_us for table in tables.imu.values()), 0.0)
+
+
 def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
     """A calibration file: the true one with every error there is, or the nominal one."""
     table = plan.tables.scanner[scanner]
@@ -25,6 +39,7 @@ def calibration_text(plan: Plan, scanner: str, *, true: bool) -> str:
         "parameters": (table.true if true else table.nominal).model_dump(),
     }
     if true:
+        document["parameters"]["imu_latency_us"] = _imu_latency_us(plan.tables)
         document |= _tables(table)
     return toml_text(document)
 

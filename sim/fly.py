@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.atmosphere import Air
+from sim.calibration_files import check_latencies
 from sim.clocks import PulsePerSecond, generator
 from sim.companions import control_points_e
 from sim.coverage import corners, refuse_ranges
@@ -61,6 +62,7 @@ class VirtualFlight:
     def __init__(self, plan: Plan, truth: TruthWriter | None = None, stop_s: float = math.inf) -> None:
         tables, flight = plan.tables, plan.tables.flight
         check_faults(tables)
+        check_latencies(tables)
         self.plan, self._truth = plan, truth
         self.site = Site.at(*flight.origin_deg)
         self.scene = build_scene(plan, self.site, corners(plan))

@@ -200,7 +200,7 @@ class ParameterTable(Section):
     lever_arm_y_m: float = Field(-0.03, description="x_s^b")
     lever_arm_z_m: float = Field(0.28, description="x_s^b")
     time_offset_us: float = Field(0.0, description="the scanner's stamps are early by this")
-    imu_latency_us: float = Field(0.0, description="attitude is taken so much later")
+    imu_latency_us: float = Field(0.0, description="of nominal; the true one is `latency_us` of the IMU")
     encoder_latency_us: float = Field(0.0, description="times the scan's rate, added to the angle")
     torsion_us2: float = Field(0.0, description="times the scan's acceleration, added to the angle")
     pitch_slope_ppm: float = Field(0.0, description="of φ with the scan angle")

@@ -13,6 +13,7 @@ import pytest
 from drivers.core.parser import DeviceSettings
 from drivers.core.registry import find_driver
 from georef.records import Chunk, GnssFix, ScannerReturns
+from sim.calibration_files import calibration_text
 from sim.companions import companion_files, config_text, default_wires
 from sim.errors import PlanError
 from sim.fly import VirtualFlight, open_truth
@@ -196,3 +197,11 @@ def test_a_device_without_its_edges_says_so() -> None:
 def test_an_unknown_pps_names_the_key() -> None:
     with pytest.raises(PlanError, match=r"^scanner\.left\.pps: the plan has no \[pps\.second\]"):
         VirtualFlight(plan(scanner={"left": {"pps": "second"}}))
+
+
+def test_a_late_imu_is_in_the_true_calibration_and_only_there() -> None:
+    late = plan(imu={"main": {"latency_us": 300.0}})
+    assert "imu_latency_us = 300.0" in calibration_text(late, "left", true=True)
+    assert "imu_latency_us = 0.0" in calibration_text(late, "left", true=False)
+    with pytest.raises(PlanError, match=r"^scanner\.left\.true\.imu_latency_us: want 0, and imu\.<name>\.latency_us"):
+        VirtualFlight(plan(scanner={"left": {"true": {"imu_latency_us": 300.0}}}))
