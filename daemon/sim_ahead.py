@@ -18,7 +18,7 @@ from daemon.errors import ExitCode, UserError
 from daemon.sim_flight import Flight
 from daemon.wire_player import TimedUnit
 
-AHEAD_S = 3.0  # of flight that wait, at most
+AHEAD_S = 5.0  # of flight that wait, at most
 BATCH_S = 0.1
 END_S = 5.0
 

@@ -154,7 +154,7 @@ def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: boo
             report, names = _make_log(console, wish, folder, with_truth=with_truth)
             logs = folder.keep(report.paths)
     except KeyboardInterrupt:
-        console.print(f"interrupted: everything of this flight was removed from {folder.place}")
+        console.print("interrupted: what was written of this flight has been removed")
         raise
     except OSError as error:
         text = f"{error.filename or output}: {error.strerror or error}; nothing is left of this flight"
@@ -267,9 +267,10 @@ def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | 
     path = place / CONFIG_NAME
     baud = {f"gnss/{name}": table.baud for name, table in plan.tables.gnss.items()}
     files = facts.files | {CONFIG_NAME: configuration(plan, own_wires(place, facts.sources, baud), LOGS_NAME)}
-    if path.exists():
-        text = f"{path}: is there already; fly on its wires with --config {path}, or give another folder"
-        raise UserError(one_line(text), ExitCode.IO)
+    for name in (CONFIG_NAME, *facts.files):
+        if (place / name).exists():
+            instead = f"fly on its wires with --config {path}, or " if name == CONFIG_NAME else ""
+            raise UserError(one_line(f"{place / name}: is there already; {instead}give another folder"), ExitCode.IO)
     place.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         (place / name).write_bytes(data)

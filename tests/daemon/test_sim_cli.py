@@ -167,7 +167,7 @@ class TestIntoALog:
             _, said = flying.communicate(timeout=30)
         assert (flying.returncode, said.splitlines()) == (
             cli.INTERRUPTED,
-            [f"interrupted: everything of this flight was removed from {folder}"],
+            ["interrupted: what was written of this flight has been removed"],
         )
         assert list(tmp_path.iterdir()) == []
 
@@ -429,6 +429,17 @@ class TestWires:
             assert f"{source}: {len(got.units[source]):,} units, " in said
         assert len(got.messages["/pps/main"]) == len(sent.messages["/pps/main"])
         assert load_config(folder / "swath.toml").session.directory == str(folder / "logs")
+
+    def test_a_folder_of_wires_is_not_made_twice(
+        self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("daemon.sim_plans.make_flight_in_time", standin_for)
+        path = tmp_path / "swath.toml"
+        path.write_text("")
+        code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path))
+        line = f"swath: {path}: is there already; fly on its wires with --config {path}, or give another folder\n"
+        assert (code, said) == (ExitCode.IO, line)
+        assert path.read_text() == ""
 
     def test_wires_of_a_configuration_and_sources_that_do_not_meet(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
