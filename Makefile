@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-JOBS ?= 2
+JOBS ?= 3
 SECONDS ?= 600
 MINUTES ?= 60
 RATE ?= 0.1

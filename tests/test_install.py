@@ -12,7 +12,6 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
 PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib")
-WITH_NUMBA = {"drivers.compiled.rows"}
 PLACED = {
     "etc/chrony/conf.d/swath.conf",
     "etc/swath/swath.toml",
@@ -92,16 +91,40 @@ def test_bare_install_imports_all_packages_and_nothing_of_processing(installed: 
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
+def wants_an_extra(name: str) -> bool:
+    """Whether a module imports what only an extra brings: the compiled loops, and all of the virtual aircraft."""
+    return name == "drivers.compiled.rows" or name.startswith("sim.")
+
+
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
-    """All modules are there; all but the compiled loops import without the extras."""
+    """All modules are there; all that want no extra import without the extras."""
     names = [
         str(path.relative_to(ROOT).with_suffix("")).replace("/", ".").removesuffix(".__init__")
         for package in PACKAGES
         for path in sorted((ROOT / package).rglob("*.py"))
     ]
-    code = f"import importlib.util as u; [n in {WITH_NUMBA} or __import__(n) for n in {names!r}]"
-    done = run_installed(installed, "-c", f"{code}; print({{n for n in {WITH_NUMBA} if u.find_spec(n)}})")
-    assert (done.returncode, done.stdout.strip()) == (0, str(WITH_NUMBA)), done.stderr
+    extra = [name for name in names if wants_an_extra(name)]
+    assert len(extra) > 30
+    bare = [name for name in names if name not in extra]
+    absent = f"[n for n in {extra!r} if not u.find_spec(n)]"
+    done = run_installed(
+        installed, "-c", f"import importlib.util as u; [__import__(n) for n in {bare!r}]; print({absent})"
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
+
+
+def test_bare_install_says_what_the_virtual_aircraft_wants(installed: Path, tmp_path: Path) -> None:
+    done = run_installed(installed, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(tmp_path / "small"))
+    assert done.returncode == 2
+    assert "pip install 'swath[sim]'" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "small").exists()
+
+
+def test_presets_are_installed(installed: Path) -> None:
+    code = "from importlib import resources as r; print(sorted(p.name for p in (r.files('sim') / 'presets').iterdir()))"
+    done = run_installed(installed, "-c", code)
+    assert "'small.toml'" in done.stdout, done.stderr
 
 
 def test_bare_install_lists_its_devices(installed: Path) -> None:
