@@ -10,6 +10,9 @@ greatest Allan deviation of the drifting part of a bias, which is what data shee
 - mems: gyroscopes of an Analog Devices ADIS16488 (in run 6 °/h, 0.3 °/√h, axes to 0.05°), accelerometers of a Sensonor
   STIM300 (in run 0.05 mg, 0.07 m/s/√h); biases at turn-on and scale factors are those of a unit calibrated over
   temperature, not the sheets' repeatability over years.
+
+What is named above is of the makers' sheets; the instabilities of the first two grades, all misalignments and the
+biases and scale factors of the third are of the size such units have, and of no sheet.
 """
 
 from __future__ import annotations

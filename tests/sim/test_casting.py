@@ -12,6 +12,8 @@ from sim.shots import CAR, GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, ROOF, WALL
 from sim.site import geodetic_from_e
 from tests.sim.scenes import cast, plan_of, scene_of, towards
 
+pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
+
 FloatArray = NDArray[np.float64]
 FAR_M = (3000.0, -2000.0)  # where the ellipsoid's normal leans 0.6 mrad against the site's z
 

@@ -21,6 +21,8 @@ from sim.plan import Plan, parse_plan
 from sim.shots import WireUnit
 from tests.sim.direct import TO_ECEF
 
+pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
+
 PLAN = """
 [flight]
 name = "short"

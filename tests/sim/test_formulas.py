@@ -21,6 +21,8 @@ from sim.scanners.mirrors import swung_mirror
 from sim.shots import Pulses
 from sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
+pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
+
 FloatArray = NDArray[np.float64]
 
 LAT_DEG, LON_DEG, HEIGHT_M = 47.1234567, 8.7, 1512.3

@@ -40,6 +40,8 @@ from tests.sim.direct import (
     line_direction,
 )
 
+pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
+
 FloatArray = NDArray[np.float64]
 
 PLAN = """

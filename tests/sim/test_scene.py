@@ -18,6 +18,8 @@ from sim.terrain import LARGEST_NODES, MARGIN_M, analytic_heights, ups
 from sim.village import ROOFS, build_village
 from tests.sim.scenes import cast, plan_of, scene_of
 
+pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
+
 FloatArray = NDArray[np.float64]
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
