@@ -138,7 +138,7 @@ def _make_ahead(make: MakeFlight, sending: Connection) -> None:
         return  # nobody takes them any more
     except UserError as error:
         sending.send(_Failed(error.message, error.exit_code))
-    except Exception:
+    except Exception:  # the end of a process: what nobody foresaw is told where somebody can say it
         sending.send(_Failed(traceback.format_exc()))
 
 

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim.compiled import kept, kernel
 from sim.flight import Poses
 from sim.plan_tables import ScannerTable
 from sim.shots import FloatArray, Pulses
 from sim.site import Site
+
+Three = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +52,8 @@ class Mounting:
         return Beams(origin_e, origin, direction)
 
 
-@numba.njit(cache=True)
-def _turned(rotation, vector):  # type: ignore[no-untyped-def]
+@kernel
+def _turned(rotation: FloatArray, vector: FloatArray | Three) -> Three:
     """A vector (3,) by a matrix (3, 3), as three numbers."""
     return (
         rotation[0, 0] * vector[0] + rotation[0, 1] * vector[1] + rotation[0, 2] * vector[2],
@@ -60,8 +62,14 @@ def _turned(rotation, vector):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True)
-def _axes(pulses, mounting, poses, site, out):  # type: ignore[no-untyped-def]
+@kept
+def _axes(
+    pulses: tuple[FloatArray, FloatArray, FloatArray],
+    mounting: tuple[FloatArray, float, FloatArray, FloatArray],
+    poses: tuple[FloatArray, FloatArray],
+    site: tuple[FloatArray, FloatArray],
+    out: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
     """s → b (installation and κ, then φ with each pulse's slope, then ω) → e → site frame, pulse by pulse."""
     origin_s, direction_s, phi_extra = pulses
     rot_kappa_installation, phi, rot_omega, lever_arm_b = mounting

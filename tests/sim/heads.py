@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.core.parser import PacketParser
-from georef.records import Record
+from georef.records import DeviceClockSamples, Record, ScannerReturns
 from sim.clocks import PulsePerSecond
 from sim.plan import Plan, parse_plan
 from sim.shots import Measured, Pulses, WireUnit
@@ -89,9 +89,9 @@ def feed(parser: PacketParser, units: Iterable[WireUnit]) -> list[Record]:
     return records
 
 
-def rows_of(records: Sequence[Record], kind: type) -> StructArray:
+def rows_of(records: Sequence[Record], kind: type[ScannerReturns | DeviceClockSamples]) -> StructArray:
     """The rows of all records of a kind."""
-    return np.concatenate([record.rows for record in records if isinstance(record, kind)])  # type: ignore[union-attr]
+    return np.concatenate([record.rows for record in records if isinstance(record, kind)])
 
 
 def joined(pieces: Sequence[Pulses]) -> dict[str, NDArray[Any]]:

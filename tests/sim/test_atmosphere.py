@@ -204,13 +204,17 @@ def test_rays_agree_with_another_integration_of_the_ray(height_m: float, nadir_d
         up = np.array([state[0], radius_m + height_m + state[1]]) / radius
         return [*(state[2:] / index(height)), *(gradient * up)]
 
-    def above(_: float, state: FloatArray) -> float:
-        return float(np.hypot(state[0], radius_m + height_m + state[1]) - radius_m - 200.0)
+    class Ground:
+        """The event that ends the ray: it is down at 200 m."""
 
-    above.terminal = True  # type: ignore[attr-defined]
+        terminal = True
+
+        def __call__(self, _: float, state: FloatArray) -> float:
+            return float(np.hypot(state[0], radius_m + height_m + state[1]) - radius_m - 200.0)
+
     nadir = np.radians(nadir_deg)
     start = index(height_m) * np.array([np.sin(nadir), -np.cos(nadir)])
-    solved = solve_ivp(ray, (0.0, 1e6), [0.0, 0.0, *start], events=above, rtol=1e-12, atol=1e-9, max_step=2e4)
+    solved = solve_ivp(ray, (0.0, 1e6), [0.0, 0.0, *start], events=Ground(), rtol=1e-12, atol=1e-9, max_step=2e4)
     east, up = solved.y_events[0][0][:2]
     bent = bending_by_layers(one(float(nadir)), one(height_m), one(200.0), constant)
     assert 1e6 * bent[0] == pytest.approx(1e6 * (nadir - np.arctan2(east, -up)), abs=0.01)

@@ -187,7 +187,8 @@ def bound(
     flown: Flown, *, range_quantum_m: float, angle_quantum_rad: float | FloatArray, time_quantum_s: float
 ) -> FloatArray:
     """1 mm and half of each quantum carried to the ground."""
-    carried = angle_quantum_rad * flown.truth["left.range_m"] + range_quantum_m + time_quantum_s * 75.0
+    fastest_mps = np.linalg.norm(flown.truth["trajectory.velocity_l"], axis=1).max()
+    carried = angle_quantum_rad * flown.truth["left.range_m"] + range_quantum_m + time_quantum_s * fastest_mps
     limits: FloatArray = 1e-3 + 0.5 * carried
     return limits
 
