@@ -1,0 +1,125 @@
+"""Points: what georeferencing gives, and what became of the returns that gave none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import Int64Array
+
+FloatArray = NDArray[np.float64]
+SingleArray = NDArray[np.float32]
+ByteArray = NDArray[np.uint8]
+
+
+class Fate(IntEnum):
+    """What became of a return; every one that was read has exactly one."""
+
+    GEOREFERENCED = 0
+    NO_TIME = 1
+    OUTSIDE_TRAJECTORY = 2
+    TRAJECTORY_GAP = 3
+    BELOW_RANGE_GATE = 4
+    ABOVE_RANGE_GATE = 5
+    MTA_GAP = 6
+    MTA_AMBIGUOUS = 7
+    NOT_FINITE = 8
+    SKIPPED = 9
+
+
+FATE_NAMES = {fate: fate.name.lower() for fate in Fate}
+
+
+@dataclass(slots=True)
+class Points:
+    """Georeferenced returns, one row each.
+
+    Attributes:
+        time_ns: (n,) GPS time of the pulse, time_offset applied.
+        points_map: (n, 3) easting, northing, height in metres; e where there is no mapping frame.
+        sigma_map: (n, 3) one sigma along the same axes, metres; None: not computed.
+        scan_angle_rad: (n,) θ; of spinning heads the azimuth.
+        range_m: (n,) as corrected.
+        intensity: (n,) as the device says it.
+        return_number, number_of_returns: (n,).
+        channel: (n,) beam or facet.
+        mta_zone: (n,) pulses in air − 1; 255: unknown.
+    """
+
+    time_ns: Int64Array
+    points_map: FloatArray
+    sigma_map: SingleArray | None
+    scan_angle_rad: SingleArray
+    range_m: SingleArray
+    intensity: SingleArray
+    return_number: ByteArray
+    number_of_returns: ByteArray
+    channel: NDArray[np.uint16]
+    mta_zone: ByteArray
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.time_ns)
+
+    def take(self, which: Any) -> Points:
+        """Rows by index array, mask or slice."""
+        columns: list[Any] = [getattr(self, field.name) for field in fields(self)]
+        taken: list[Any] = [None if column is None else column[which] for column in columns]
+        return Points(*taken)
+
+    @classmethod
+    def concatenate(cls, pieces: Sequence[Points]) -> Points:
+        """One after the other; sigmas only where all have them. At least one piece."""
+        joined: list[Any] = []
+        for field in fields(cls):
+            columns = [getattr(piece, field.name) for piece in pieces]
+            joined.append(None if any(column is None for column in columns) else np.concatenate(columns))
+        return cls(*joined)
+
+
+@dataclass(slots=True)
+class Rays:
+    """What the sensor model made of returns on their way to the ground; (n,) or (n, …), one row a return.
+
+    The second half is there where axes were asked for: it is what the Jacobian and the covariance are made of.
+
+    Attributes:
+        fate: `Fate`; what lies in the rows of others than GEOREFERENCED is undefined.
+        time_ns: GPS time of the pulse, time_offset applied.
+        points_e: (n, 3) metres.
+        origin_e: (n, 3) of the scanner.
+        angle_rad: θ as corrected.
+        range_m: ρ as corrected.
+        q_e_from_b: (n, 4) attitude taken, scalar first.
+        epoch, share: of the trajectory: the epoch before the pulse, and where between it and the next, 0 … 1.
+        arm_b: (n, 3) from the body's origin to the point.
+        range_axis_b: (n, 3) ∂point/∂ρ.
+        angle_axis_b: (n, 3) ∂point/∂θ, m/rad.
+        tilt_axis_b: (n, 3) ∂point/∂Δη, m/rad.
+        measured_m: range as measured.
+        encoder_rad: encoder reading.
+        encoder_rate, encoder_acceleration: rad/s, rad/s²; zero where nobody asked.
+    """
+
+    fate: ByteArray
+    time_ns: Int64Array
+    points_e: FloatArray
+    origin_e: FloatArray
+    angle_rad: FloatArray
+    range_m: FloatArray
+    q_e_from_b: FloatArray | None = None
+    epoch: Int64Array | None = None
+    share: FloatArray | None = None
+    arm_b: FloatArray | None = None
+    range_axis_b: FloatArray | None = None
+    angle_axis_b: FloatArray | None = None
+    tilt_axis_b: FloatArray | None = None
+    measured_m: FloatArray | None = None
+    encoder_rad: FloatArray | None = None
+    encoder_rate: FloatArray | None = None
+    encoder_acceleration: FloatArray | None = None
