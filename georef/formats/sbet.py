@@ -1,0 +1,190 @@
+"""SBET and smrmsg, the binary trajectories of Applanix POSPac and of many others.
+
+SBET: 17 little-endian doubles a record: time (s of the GPS week), latitude, longitude (rad), height (m), velocity
+x, y, z (m/s), roll, pitch, platform heading, wander angle (rad), body accelerations x, y, z (m/s²), body rates (rad/s).
+The platform's x axis points wander angle α west of north, so true heading = platform heading − α. POSPac's y axis
+points left and z up, so that v_N = x cos α − y sin α, v_E = −x sin α − y cos α; others write right and down, and α = 0.
+Which it is, the positions tell.
+
+smrmsg: 10 doubles: time, sigmas of north, east, down (m), of the velocities (m/s), of roll, pitch and heading (arc
+minutes), once a second or as often as the SBET.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.formats.trajectory_columns import (
+    Span,
+    TrajectoryColumns,
+    continuous_of_week,
+    course_pieces,
+    mean_over,
+    moved_l,
+    placed_in_week,
+    unsaid,
+)
+from georef.quaternions import conjugate, rotated
+from georef.records import Int64Array
+from georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
+from georef.trajectory import Trajectory, TrajectoryError
+
+FloatArray = NDArray[np.float64]
+
+SBET_DOUBLES, SMRMSG_DOUBLES = 17, 10
+SBET_BYTES, SMRMSG_BYTES = 8 * SBET_DOUBLES, 8 * SMRMSG_DOUBLES
+ARC_MINUTE = float(np.radians(1.0 / 60.0))
+# Signs of the platform's y and z axes against right and down: plain north, east, down; POSPac's; east, up
+AXES = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Sigmas:
+    """Sigmas of a trajectory at their own epochs.
+
+    Attributes:
+        of_week_ns: (n,) nanoseconds since the start of the week of the first one.
+        position_l, velocity_l: (n, 3) m, m/s, north, east, down.
+        attitude_rad: (n, 3) roll, pitch, heading.
+    """
+
+    of_week_ns: Int64Array
+    position_l: FloatArray
+    velocity_l: FloatArray
+    attitude_rad: FloatArray
+
+
+def read_sbet(
+    data: bytes, name: str, *, span_ns: Span | None = None, week: int | None = None, sigmas: Sigmas | None = None
+) -> TrajectoryColumns:
+    """Rows of an SBET.
+
+    Args:
+        data: the file.
+        name: for messages.
+        span_ns: GPS time of the first and last record of the log which it belongs to: tells the week.
+        week: GPS week of the first record; goes before span_ns.
+        sigmas: of the smrmsg beside it.
+    """
+    table = _table(data, name, "SBET", SBET_DOUBLES)
+    of_week_ns = continuous_of_week(table[:, 0], name)
+    time_ns = placed_in_week(of_week_ns, name, span_ns, week)
+    lat, lon, height = table[:, 1:4].T
+    position, attitude = _sigmas_at(of_week_ns, sigmas, name)
+    columns = TrajectoryColumns(
+        time_ns,
+        *(lat, lon, height, table[:, 4:7]),
+        *(table[:, 7], table[:, 8], _once_round(table[:, 9] - table[:, 10])),
+        *(position, attitude),
+        angles_in="radians",
+    )
+    if np.isfinite(table[:, 1:11]).all() and len(table) > 1 and (np.diff(time_ns) > 0).all():
+        columns.velocity_l = _velocity_l(columns, table[:, 10])
+    return columns
+
+
+def read_smrmsg(data: bytes, name: str) -> Sigmas:
+    """Sigmas of a trajectory; TrajectoryError where the file is none."""
+    table = _table(data, name, "smrmsg", SMRMSG_DOUBLES)
+    bad = (table[:, 1:] < 0.0).any(axis=1)  # nan: unsaid
+    if bad.any():
+        raise TrajectoryError(f"{name}: a sigma at record {int(np.argmax(bad)) + 1} is negative; smrmsg is expected")
+    return Sigmas(continuous_of_week(table[:, 0], name), table[:, 1:4], table[:, 4:7], table[:, 7:10] * ARC_MINUTE)
+
+
+def sbet_bytes(trajectory: Trajectory) -> bytes:
+    """The trajectory as an SBET: wander angle 0, velocities north, east, down, time running past the week's end.
+
+    Accelerations are those of the velocities relative to the earth, without gravity, and rates those relative to e.
+    """
+    trajectory.require_attitude()
+    n = len(trajectory)
+    table = np.zeros((n, SBET_DOUBLES), dtype="<f8")
+    table[:, 0] = _of_first_week_ns(trajectory) / SECOND_NS
+    table[:, 1:4] = np.stack(trajectory.geodetic(), axis=1)
+    table[:, 4:7] = trajectory.velocity_l()
+    table[:, 7:10] = np.stack(trajectory.attitude(), axis=1)
+    if n > 1:
+        step_s = np.diff(trajectory.time_ns)[:, np.newaxis] / SECOND_NS
+        acceleration_e = np.diff(trajectory.velocity_e, axis=0) / step_s
+        table[:-1, 11:14] = rotated(conjugate(trajectory.q_e_from_b[:-1]), acceleration_e)
+        table[:-1, 14:17] = trajectory.turn_rates_b()
+        table[-1, 11:17] = table[-2, 11:17]
+    return table.tobytes()
+
+
+def smrmsg_bytes(trajectory: Trajectory) -> bytes:
+    """The trajectory's sigmas as an smrmsg, an epoch each; unsaid ones, as those of the velocities, are nan."""
+    table = np.full((len(trajectory), SMRMSG_DOUBLES), np.nan, dtype="<f8")
+    table[:, 0] = _of_first_week_ns(trajectory) / SECOND_NS
+    table[:, 1:4] = trajectory.position_sigma_l
+    table[:, 7:10] = trajectory.attitude_sigma_rad / ARC_MINUTE
+    return table.tobytes()
+
+
+def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
+    size = 8 * doubles
+    over = len(data) % size
+    if not data or over:
+        whole = len(data) // size
+        raise TrajectoryError(
+            f"{name}: {len(data)} bytes are {whole} records of {kind} ({size} bytes) and {over} over: truncated or none"
+        )
+    table = np.frombuffer(data, dtype="<f8").reshape(-1, doubles).astype(np.float64)
+    time_s = table[:, 0]
+    wrong = ~((time_s >= 0.0) & (time_s < 10.0 * WEEK_S))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise TrajectoryError(
+            f"{name}: time {time_s[at]:.6g} at record {at + 1} is no second of a week; {kind} is expected"
+        )
+    return table
+
+
+def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray) -> FloatArray:
+    """North, east, down, by those axes of the platform with which velocities go the way the positions go."""
+    x, y, z = columns.velocity_l.T
+    cos, sin = np.cos(wander_rad), np.sin(wander_rad)
+    pieces = course_pieces(columns.time_ns)
+    moved = moved_l(columns.time_ns, columns.lat_rad, columns.lon_rad, columns.height_m, pieces)
+    velocities = []
+    misfits = []
+    for right, down in AXES:
+        velocity = np.stack([x * cos + right * y * sin, right * y * cos - x * sin, down * z], axis=1)
+        velocities.append(velocity)
+        misfits.append(float(((mean_over(columns.time_ns, velocity, pieces) - moved) ** 2).sum()))
+    return velocities[int(np.argmin(misfits))]
+
+
+def _sigmas_at(of_week_ns: Int64Array, sigmas: Sigmas | None, name: str) -> tuple[FloatArray, FloatArray]:
+    """Position and attitude sigmas at the SBET's epochs, linear between theirs; unsaid before and after them."""
+    if sigmas is None:
+        return unsaid(len(of_week_ns)), unsaid(len(of_week_ns))
+    for shift_ns in (0, WEEK_NS, -WEEK_NS):  # one of the files may begin only after the week's end
+        theirs = sigmas.of_week_ns + shift_ns
+        if theirs[0] <= of_week_ns[-1] and of_week_ns[0] <= theirs[-1]:
+            break
+    else:
+        raise TrajectoryError(f"{name}: the smrmsg beside it is of another time")
+    inside = (of_week_ns >= theirs[0]) & (of_week_ns <= theirs[-1])
+
+    def linear(column: FloatArray) -> FloatArray:
+        at = np.stack([np.interp(of_week_ns, theirs, column[:, k]) for k in range(3)], axis=1)
+        at[~inside] = np.nan
+        return at
+
+    return linear(sigmas.position_l), linear(sigmas.attitude_rad)
+
+
+def _once_round(angle_rad: FloatArray) -> FloatArray:
+    """0 … 2π, for angles within one turn of it: others stay as they are, to be refused."""
+    return np.where(np.abs(angle_rad) <= 4 * np.pi, angle_rad % (2 * np.pi), angle_rad)
+
+
+def _of_first_week_ns(trajectory: Trajectory) -> Int64Array:
+    week, _ = week_from_gps(trajectory.span[0])
+    since: Int64Array = trajectory.time_ns - week * WEEK_NS
+    return since

@@ -1,0 +1,272 @@
+"""What every trajectory file comes to, and the checks that tell a wrong file from a wrong map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.earth import e_from_geodetic
+from georef.quaternions import about, conjugate, product, rotated
+from georef.records import Int64Array
+from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
+from georef.trajectory import Trajectory, TrajectoryError, gps_text
+
+FloatArray = NDArray[np.float64]
+Span = tuple[int, int]
+
+LOWEST_M, HIGHEST_M = -1000.0, 50_000.0
+GREATEST_SPEED_MPS = 1000.0
+COURSE_FROM_MPS, GREATEST_COURSE_ERROR_RAD, COURSE_OUTLIERS = 20.0, float(np.radians(5.0)), 0.01
+COURSE_PIECE_NS, LONGEST_PIECE_NS = SECOND_NS, 3 * SECOND_NS  # pieces of flight whose course is looked at
+HEADING_OFF_RAD = float(np.radians(45.0))  # more than any drift angle
+
+
+@dataclass(slots=True)
+class TrajectoryColumns:
+    """Rows of a file in SI units; (n,) or (n, 3); nan where the file does not say.
+
+    Attributes:
+        time_ns: GPS time.
+        lat_rad, lon_rad, height_m: height above the ellipsoid.
+        velocity_l: north, east, down.
+        roll_rad, pitch_rad, heading_rad: heading from true north.
+        position_sigma_l, attitude_sigma_rad: one standard deviation.
+        row: what a row is called in messages: record, line.
+        first_row: number of the first one.
+        angles_in: the unit which the file should have for attitudes and positions, for messages.
+    """
+
+    time_ns: Int64Array
+    lat_rad: FloatArray
+    lon_rad: FloatArray
+    height_m: FloatArray
+    velocity_l: FloatArray
+    roll_rad: FloatArray
+    pitch_rad: FloatArray
+    heading_rad: FloatArray
+    position_sigma_l: FloatArray
+    attitude_sigma_rad: FloatArray
+    row: str = "record"
+    first_row: int = 1
+    angles_in: str = "degrees"
+
+    def at(self, where: NDArray[np.bool_]) -> str:
+        """The first row at which something is so, by name."""
+        return f"{self.row} {int(np.argmax(where)) + self.first_row}"
+
+
+def unsaid(n: int) -> FloatArray:
+    """(n, 3) of nan."""
+    return np.full((n, 3), np.nan)
+
+
+def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Trajectory:
+    """The trajectory of a file's rows; TrajectoryError where they cannot be meant."""
+    if len(columns.time_ns) < 2:
+        raise TrajectoryError(f"{name}: has {len(columns.time_ns)} epochs; a trajectory needs two")
+    for check in (_check_finite, _check_position, _check_attitude, _check_time, _check_course):
+        check(columns, name)
+    return Trajectory.from_geodetic(
+        columns.time_ns,
+        columns.lat_rad,
+        columns.lon_rad,
+        columns.height_m,
+        columns.velocity_l,
+        columns.roll_rad,
+        columns.pitch_rad,
+        columns.heading_rad,
+        position_sigma_l=columns.position_sigma_l,
+        attitude_sigma_rad=columns.attitude_sigma_rad,
+        max_gap_ns=max_gap_ns,
+        name=name,
+    )
+
+
+# --- time of week ---
+
+
+def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first_row: int = 1) -> Int64Array:
+    """Nanoseconds since the start of the first one's week, of seconds of week that may begin anew at its end."""
+    steps = np.diff(time_s)
+    crossing = np.abs(steps + WEEK_S) <= 1.0
+    back = (steps < 0) & ~crossing
+    if back.any():
+        at = int(np.argmax(back))
+        raise TrajectoryError(f"{name}: time goes back by {-steps[at]:.3f} s at {row} {at + 1 + first_row}")
+    weeks = np.r_[0, np.cumsum(crossing)].astype(np.int64)
+    since: Int64Array = np.rint(time_s * SECOND_NS).astype(np.int64) + weeks * WEEK_NS
+    return since
+
+
+def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week: int | None) -> Int64Array:
+    """GPS time of nanoseconds of a week: the week given, or the one in which they overlap a log's span most."""
+    if week is not None:
+        return of_week_ns + week * WEEK_NS
+    if span_ns is None:
+        raise TrajectoryError(f"{name}: says seconds of the week but no week; give the GPS week (--week)")
+    first, last = int(of_week_ns[0]), int(of_week_ns[-1])
+    near = week_from_gps(span_ns[0])[0]
+
+    def overlap_ns(of_week: int) -> int:
+        return min(span_ns[1], last + of_week * WEEK_NS) - max(span_ns[0], first + of_week * WEEK_NS)
+
+    best = max(range(near - 2, near + 3), key=overlap_ns)
+    if overlap_ns(best) < 0:
+        raise TrajectoryError(_no_overlap(first, last, name, span_ns))
+    return of_week_ns + best * WEEK_NS
+
+
+def _no_overlap(first: int, last: int, name: str, span_ns: Span) -> str:
+    week, begin = week_from_gps(span_ns[0])
+    end = begin + span_ns[1] - span_ns[0]
+    hint = "it belongs to another flight, or its time is not GPS time"
+    if last < DAY_NS:
+        days = [day for day in range(8) if first + day * DAY_NS <= end and last + day * DAY_NS >= begin]
+        if days:
+            hint = f"its times look like seconds of the day; add {days[0] * 86_400} s to have seconds of the week"
+    spans = [f"{a / SECOND_NS:.1f} to {b / SECOND_NS:.1f} s" for a, b in ((first, last), (begin, end))]
+    return f"{name}: {spans[0]} of the week does not overlap the log, {spans[1]} of GPS week {week}: {hint}"
+
+
+# --- checks ---
+
+
+def _check_finite(columns: TrajectoryColumns, name: str) -> None:
+    for column in ("lat_rad", "lon_rad", "height_m"):
+        bad: NDArray[np.bool_] = ~np.isfinite(getattr(columns, column))
+        if bad.any():
+            raise TrajectoryError(f"{name}: no number for {column.split('_')[0]} at {columns.at(bad)}")
+    attitude = np.stack([columns.roll_rad, columns.pitch_rad, columns.heading_rad], axis=1)
+    missing = np.asarray(~np.isfinite(attitude).all(axis=1))
+    if missing.any() and not np.isnan(attitude).all():
+        raise TrajectoryError(f"{name}: no number for roll, pitch or heading at {columns.at(missing)}")
+
+
+def _check_position(columns: TrajectoryColumns, name: str) -> None:
+    beyond: NDArray[np.bool_] = np.abs(columns.lat_rad) > np.pi / 2
+    if beyond.any():
+        value = columns.lat_rad[int(np.argmax(beyond))]
+        said = value if columns.angles_in == "radians" else np.degrees(value)
+        hint = f"{columns.angles_in} north are expected"
+        if columns.angles_in == "radians" and abs(said) <= 90.0:
+            hint += "; these look like degrees"
+        elif (np.abs(columns.lon_rad) <= np.pi / 2).all():
+            hint += "; latitude and longitude may be swapped"
+        raise TrajectoryError(f"{name}: latitude {said:.6g} at {columns.at(beyond)}: {hint}")
+    around: NDArray[np.bool_] = np.abs(columns.lon_rad) > 2 * np.pi
+    if around.any():
+        raise TrajectoryError(f"{name}: longitude at {columns.at(around)} is more than once round the earth")
+    high: NDArray[np.bool_] = (columns.height_m < LOWEST_M) | (columns.height_m > HIGHEST_M)
+    if high.any():
+        height = columns.height_m[int(np.argmax(high))]
+        raise TrajectoryError(
+            f"{name}: height {height:.1f} at {columns.at(high)}: metres above the ellipsoid are expected"
+        )
+
+
+def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
+    limits = (("roll", columns.roll_rad, np.pi), ("pitch", columns.pitch_rad, np.pi / 2))
+    for what, angle, limit in (*limits, ("heading", columns.heading_rad, 2 * np.pi)):
+        beyond: NDArray[np.bool_] = np.abs(angle) > limit + 1e-6
+        if beyond.any():
+            value = angle[int(np.argmax(beyond))]
+            said = value if columns.angles_in == "radians" else np.degrees(value)
+            hint = "; these look like degrees" if columns.angles_in == "radians" else ""
+            where = columns.at(beyond)
+            raise TrajectoryError(f"{name}: {what} {said:.6g} at {where}: {columns.angles_in} are expected{hint}")
+
+
+def _check_time(columns: TrajectoryColumns, name: str) -> None:
+    steps = np.diff(columns.time_ns)
+    stuck = np.r_[False, steps <= 0]
+    if stuck.any():
+        at = int(np.argmax(stuck))
+        what = f"goes back by {-steps[at - 1] / SECOND_NS:.3f} s" if steps[at - 1] else "stands still"
+        raise TrajectoryError(f"{name}: time {what} at {columns.at(stuck)}, {gps_text(columns.time_ns[at])}")
+
+
+def _check_course(columns: TrajectoryColumns, name: str) -> None:
+    """The way the positions go against the velocities, and against the nose: wrong signs, swapped columns, units."""
+    pieces = course_pieces(columns.time_ns)
+    if not len(pieces):
+        return
+    moved = moved_l(columns.time_ns, columns.lat_rad, columns.lon_rad, columns.height_m, pieces)
+    speed = np.linalg.norm(moved, axis=1)
+    if np.median(speed) > GREATEST_SPEED_MPS:
+        raise TrajectoryError(
+            f"{name}: its positions move at {np.median(speed):.0f} m/s; latitude, longitude or time has another unit"
+        )
+    said = mean_over(columns.time_ns, columns.velocity_l, pieces)
+    fast = (np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS) & (np.hypot(*said[:, :2].T) > COURSE_FROM_MPS)
+    error = _course_error(moved, said)
+    off = fast & (np.abs(error) > GREATEST_COURSE_ERROR_RAD)
+    if off.sum() > COURSE_OUTLIERS * fast.sum():
+        at = pieces[int(np.argmax(off)), 0]
+        swapped = moved_l(columns.time_ns, columns.lon_rad, columns.lat_rad, columns.height_m, pieces)
+        hint = "the velocities are not north, east, down, or the wander angle has another sign"
+        mirrored = said * np.array([1.0, -1.0, 1.0])  # axes of an SBET may have been taken wrongly after the positions
+        fits = [np.median(np.abs(_course_error(swapped, velocity))[fast]) for velocity in (said, mirrored)]
+        if min(fits) < GREATEST_COURSE_ERROR_RAD:
+            hint = "latitude and longitude are swapped"
+        degrees = np.degrees(np.median(np.abs(error[off])))
+        where = f"{columns.row} {at + columns.first_row}"
+        what = f"from {where} on positions and velocities differ in course by {degrees:.0f}°"
+        raise TrajectoryError(f"{name}: {what}: {hint}")
+    _check_heading_unit(columns, name, pieces, moved)
+
+
+def _check_heading_unit(columns: TrajectoryColumns, name: str, pieces: Int64Array, moved: FloatArray) -> None:
+    """No heading is beyond 6.3°, and as radians they point where it flies: so they are radians."""
+    fast = np.hypot(*moved[:, :2].T) > COURSE_FROM_MPS
+    if columns.angles_in == "radians" or not fast.any() or np.degrees(np.abs(columns.heading_rad)).max() > 2 * np.pi:
+        return
+    course, nose = np.arctan2(moved[:, 1], moved[:, 0])[fast], columns.heading_rad[pieces[:, 0]][fast]
+    off, off_as_radians = (np.median(np.abs(_folded(course - heading))) for heading in (nose, np.degrees(nose)))
+    if off > HEADING_OFF_RAD > off_as_radians:
+        raise TrajectoryError(f"{name}: degrees are expected; roll, pitch and heading look like radians")
+
+
+# --- pieces of flight ---
+
+
+def course_pieces(time_ns: Int64Array) -> Int64Array:
+    """(k, 2) rows at the ends of pieces of some second, none over a gap."""
+    wanted = np.arange(time_ns[0], time_ns[-1], COURSE_PIECE_NS)
+    rows = np.unique(np.r_[np.searchsorted(time_ns, wanted), len(time_ns) - 1])
+    pieces = np.stack([rows[:-1], rows[1:]], axis=1)
+    short: Int64Array = pieces[np.diff(time_ns[rows]) <= LONGEST_PIECE_NS]
+    return short
+
+
+def moved_l(
+    time_ns: Int64Array, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray, pieces: Int64Array
+) -> FloatArray:
+    """(k, 3) mean velocity of each piece by its positions, north, east, down in its middle, m/s."""
+    begin, end = pieces[:, 0], pieces[:, 1]
+    places_e = [e_from_geodetic(lat_rad[rows], lon_rad[rows], height_m[rows]) for rows in (begin, end)]
+    lat = (lat_rad[begin] + lat_rad[end]) / 2
+    lon = lon_rad[begin] + _folded(lon_rad[end] - lon_rad[begin]) / 2
+    q_e_from_l = product(about(2, lon), about(1, -lat - np.pi / 2))
+    length_s = np.diff(time_ns[pieces], axis=1) / SECOND_NS
+    moved: FloatArray = rotated(conjugate(q_e_from_l), places_e[1] - places_e[0]) / length_s
+    return moved
+
+
+def mean_over(time_ns: Int64Array, values: FloatArray, pieces: Int64Array) -> FloatArray:
+    """(k, 3) mean of values (n, 3), linear between rows, over each piece."""
+    step_s = np.diff(time_ns)[:, np.newaxis] / SECOND_NS
+    area = np.concatenate([np.zeros((1, 3)), np.cumsum(step_s * (values[1:] + values[:-1]) / 2, axis=0)])
+    length_s = np.diff(time_ns[pieces], axis=1) / SECOND_NS
+    mean: FloatArray = (area[pieces[:, 1]] - area[pieces[:, 0]]) / length_s
+    return mean
+
+
+def _course_error(moved: FloatArray, said: FloatArray) -> FloatArray:
+    return _folded(np.arctan2(moved[:, 1], moved[:, 0]) - np.arctan2(said[:, 1], said[:, 0]))
+
+
+def _folded(angle_rad: FloatArray) -> FloatArray:
+    folded: FloatArray = (angle_rad + np.pi) % (2 * np.pi) - np.pi
+    return folded

@@ -1,0 +1,76 @@
+"""Trajectory files of every kind, told apart by what is in them."""
+
+from __future__ import annotations
+
+from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
+from georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, read_smrmsg
+from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
+from georef.formats.trajectory_csv import is_csv, read_csv
+from georef.formats.waypoint import is_waypoint, read_waypoint
+from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
+
+LOOKED_AT = 65_536  # bytes that tell text from numbers
+
+
+def read_trajectory(
+    data: bytes,
+    name: str,
+    *,
+    span_ns: Span | None = None,
+    week: int | None = None,
+    leap_seconds: int | None = None,
+    smrmsg: bytes | None = None,
+    max_gap_ns: int = DEFAULT_MAX_GAP_NS,
+    needs_attitude: bool = True,
+) -> Trajectory:
+    """The trajectory in a file: SBET, Waypoint text, RTKLIB .pos or trajectory CSV.
+
+    Args:
+        data: the file.
+        name: for messages, and of the trajectory.
+        span_ns: GPS time of the first and last record of the log which it is for: the week of files that say none.
+        week: GPS week of the file's first record; goes before span_ns.
+        leap_seconds: GPS − UTC as the log knows it, for files in UTC.
+        smrmsg: the sigmas that came with an SBET.
+        max_gap_ns: longer intervals are gaps.
+        needs_attitude: refuse positions alone.
+
+    Raises:
+        TrajectoryError: in one line what is wrong.
+    """
+    text = _text_of(data)
+    if text is None:
+        sigmas = None if smrmsg is None else read_smrmsg(smrmsg, f"smrmsg of {name}")
+        columns = _sbet(data, name, span_ns, week, sigmas)
+    elif is_csv(text):
+        columns = read_csv(text, name)
+    elif is_rtklib_pos(text):
+        columns = read_rtklib_pos(text, name, leap_seconds=leap_seconds)
+    elif is_waypoint(text):
+        columns = read_waypoint(text, name, span_ns=span_ns, week=week, leap_seconds=leap_seconds)
+    else:
+        raise TrajectoryError(f"{name}: is no trajectory: SBET, Waypoint text, RTKLIB .pos or trajectory CSV")
+    trajectory = trajectory_of(columns, name, max_gap_ns)
+    if needs_attitude:
+        trajectory.require_attitude()
+    return trajectory
+
+
+def _text_of(data: bytes) -> str | None:
+    """The text; None: these are numbers."""
+    head = data[:LOOKED_AT]
+    if not data or any(byte < 9 or 13 < byte < 32 for byte in head):
+        return None
+    return data.decode("utf-8", errors="replace")
+
+
+def _sbet(data: bytes, name: str, span_ns: Span | None, week: int | None, sigmas: Sigmas | None) -> TrajectoryColumns:
+    """An SBET; what is one of smrmsg instead is named."""
+    if len(data) % SBET_BYTES and data and not len(data) % SMRMSG_BYTES:
+        try:
+            read_smrmsg(data, name)
+        except TrajectoryError:
+            pass
+        else:
+            raise TrajectoryError(f"{name}: is an smrmsg, the sigmas of a trajectory; give the SBET (sbet_….out)")
+    return read_sbet(data, name, span_ns=span_ns, week=week, sigmas=sigmas)

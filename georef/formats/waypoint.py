@@ -1,0 +1,257 @@
+"""Text of Waypoint's export profiles (Inertial Explorer, GrafNav): free columns under a line of names and one of units.
+
+    Week     GPSTime       Latitude      Longitude      H-Ell         Roll        Pitch      Heading
+               (sec)     (+/-D M S)     (+/-D M S)        (m)        (deg)        (deg)        (deg)
+
+Attitude is that of a body whose y axis points forward: roll, pitch and heading mean the same as here. Time is GPS time
+by week and second of the week, or by date; UTC needs the offset which the header may say.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.formats.rtklib_pos import degrees_of
+from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on
+from georef.formats.trajectory_columns import Span, TrajectoryColumns, continuous_of_week, placed_in_week
+from georef.records import Int64Array
+from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS
+from georef.trajectory import TrajectoryError
+
+FloatArray = NDArray[np.float64]
+
+# What a column is called in export profiles, in lower case and without marks -> what it is
+NAMES = {
+    **dict.fromkeys(("week", "gpsweek"), "week"),
+    **dict.fromkeys(("gpstime", "corrtime", "gpssow", "gpstow", "sow", "tow", "gpstod", "time"), "time"),
+    **dict.fromkeys(("utctime", "utctod", "utcsow"), "utc_time"),
+    **dict.fromkeys(("date", "gpsdate"), "date"),
+    **dict.fromkeys(("utcdate",), "utc_date"),
+    **dict.fromkeys(("latitude", "lat"), "lat"),
+    **dict.fromkeys(("longitude", "lon", "long"), "lon"),
+    **dict.fromkeys(("hell", "ellheight", "ellipsoidalheight"), "height"),
+    **dict.fromkeys(("hmsl", "horth", "hort", "orthheight"), "height_above_geoid"),
+    **{f"v{name}": f"v_{name}" for name in ("north", "east", "up")},
+    **dict.fromkeys(("roll",), "roll"),
+    **dict.fromkeys(("pitch",), "pitch"),
+    **dict.fromkeys(("heading", "azimuth", "yaw"), "heading"),
+    **dict.fromkeys(("sdnorth",), "sigma_n"),
+    **dict.fromkeys(("sdeast",), "sigma_e"),
+    **dict.fromkeys(("sdheight", "sdup", "sdhell"), "sigma_d"),
+    **dict.fromkeys(("rollsd", "sdroll"), "sigma_roll"),
+    **dict.fromkeys(("pitchsd", "sdpitch"), "sigma_pitch"),
+    **dict.fromkeys(("headingsd", "hdngsd", "sdheading", "headsd"), "sigma_heading"),
+}
+NEEDED = {"lat": "Latitude", "lon": "Longitude", "height": "H-Ell"}
+TOKEN = re.compile(r"\([^)]*\)|\S+")
+UTC_OFFSET = re.compile(r"^\s*UTC Offset:\s*-?(\d+)(?:\.0*)?\s*s?\s*$", re.MULTILINE | re.IGNORECASE)
+SCALING = re.compile(r"^\s*(Position|Attitude):\s*(\d+(?:\.\d+)?)\s*$", re.MULTILINE)
+DATE_ORDERS = {"(MDY)": "MDY", "(YMD)": "YMD", "(DMY)": "DMY"}
+RADIANS = {"(deg)": np.pi / 180, "(rad)": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: what it is, its unit as printed, and the words of a line that are its."""
+
+    unit: str
+    first: int
+    words: int
+
+
+@dataclass(slots=True)
+class Sheet:
+    """The file taken apart.
+
+    Attributes:
+        header: the lines above the table.
+        columns: by what they are.
+        lines: of data.
+        first_line: number of the first of them.
+        name: of the file.
+    """
+
+    header: str
+    columns: dict[str, Column]
+    lines: list[str]
+    first_line: int
+    name: str
+
+    def words(self, what: str) -> list[str]:
+        """(n,) one word a line."""
+        at = self.columns[what].first
+        return [line.split()[at] for line in self.lines]
+
+    def numbers(self, what: str) -> FloatArray:
+        """(n, words) or, of one word, (n,); nan where there is no such column."""
+        column = self.columns.get(what)
+        if column is None:
+            return np.full(len(self.lines), np.nan)
+        words = range(column.first, column.first + column.words)
+        try:
+            table = np.loadtxt(self.lines, dtype=np.float64, usecols=words, ndmin=2, comments=None)
+        except ValueError as error:
+            raise TrajectoryError(f"{self.name}: {error}, counted from line {self.first_line}") from None
+        return table[:, 0] if column.words == 1 else table
+
+    def angle_rad(self, what: str) -> FloatArray:
+        """(n,) of a column in degrees, in degrees, minutes and seconds, or in radians."""
+        column = self.columns.get(what)
+        if column is not None and column.words == 3:
+            return np.radians(degrees_of(self.numbers(what)))
+        factor = RADIANS.get(column.unit.lower(), RADIANS["(deg)"]) if column is not None else 1.0
+        return self.numbers(what) * factor
+
+
+def is_waypoint(text: str) -> bool:
+    """Whether a line of known names is followed by one of units."""
+    return _title_line(text.splitlines()) is not None
+
+
+def read_waypoint(
+    text: str, name: str, *, span_ns: Span | None = None, week: int | None = None, leap_seconds: int | None = None
+) -> TrajectoryColumns:
+    """Rows of an export; attitude is nan where it has none.
+
+    Args:
+        text: of the file.
+        name: for messages.
+        span_ns: GPS time of the log's first and last record: the week where the file says none.
+        week: goes before span_ns.
+        leap_seconds: GPS − UTC for times in UTC; the file's header goes before it.
+    """
+    sheet = _sheet(text, name)
+    if "height" not in sheet.columns and "height_above_geoid" in sheet.columns:
+        raise TrajectoryError(f"{name}: its heights are above the geoid (H-MSL); export H-Ell")
+    for what, title in NEEDED.items():
+        if what not in sheet.columns:
+            raise TrajectoryError(f"{name}: has no column {title}; export latitude, longitude and ellipsoidal height")
+    angles = ("roll", "pitch", "heading")
+    absent = [angle for angle in angles if angle not in sheet.columns]
+    if 0 < len(absent) < len(angles):
+        raise TrajectoryError(f"{name}: has no column {absent[0].title()}; export roll, pitch and heading")
+    scale = {what.lower(): float(factor) for what, factor in SCALING.findall(sheet.header)}
+    up = np.array([1.0, 1.0, -1.0])
+    sigmas = [sheet.numbers(f"sigma_{axis}") / scale.get("position", 1.0) for axis in "ned"]
+    angle_sigmas = [sheet.angle_rad(f"sigma_{angle}") / scale.get("attitude", 1.0) for angle in angles]
+    return TrajectoryColumns(
+        _gps_ns(sheet, span_ns, week, leap_seconds),
+        *(sheet.angle_rad("lat"), sheet.angle_rad("lon"), sheet.numbers("height")),
+        np.stack([sheet.numbers(f"v_{axis}") for axis in ("north", "east", "up")], axis=1) * up,
+        *(sheet.angle_rad("roll"), sheet.angle_rad("pitch"), sheet.angle_rad("heading")),
+        *(np.stack(sigmas, axis=1), np.stack(angle_sigmas, axis=1)),
+        "line",
+        sheet.first_line,
+    )
+
+
+# --- the table ---
+
+
+def _title_line(lines: list[str]) -> int | None:
+    """Number of the line of names: those of a position are among them, and units stand below."""
+    for number, (line, below) in enumerate(pairwise(lines)):
+        known = {NAMES.get(_plain(word)) for word in line.split()}
+        if {"lat", "lon"} <= known and re.search(r"\((sec|m|deg|rad|HMS|\+/-D M S|D M S)\)", below):
+            return number
+    return None
+
+
+def _plain(title: str) -> str:
+    return re.sub(r"[^a-z]", "", title.lower())
+
+
+def _sheet(text: str, name: str) -> Sheet:
+    lines = text.lstrip("\ufeff").splitlines()
+    at = _title_line(lines)
+    if at is None:
+        raise TrajectoryError(f"{name}: no line of column names (Latitude, Longitude, …) with their units below it")
+    columns, words = _layout(lines[at], lines[at + 1])
+    counts = [len(line.split()) for line in lines[at + 2 :]]
+    rows = [number for number, count in enumerate(counts) if count == words]
+    if not rows:
+        raise TrajectoryError(f"{name}: no line of {words} words, as its columns have, below line {at + 2}")
+    for number in range(rows[0], rows[-1]):  # a header and a footer may be there; a gap between may not
+        if counts[number] != words:
+            what = f"{words} words are expected, {counts[number]} are there"
+            raise TrajectoryError(f"{name}: line {number + at + 3}: {what}")
+    data = lines[at + 2 + rows[0] : at + 3 + rows[-1]]
+    return Sheet("\n".join(lines[:at]), columns, data, at + 3 + rows[0], name)
+
+
+def _layout(titles: str, units: str) -> tuple[dict[str, Column], int]:
+    """Columns, and the number of words in a line. A unit belongs to the name above it."""
+    names, below = list(TOKEN.finditer(titles)), list(TOKEN.finditer(units))
+    unit_of = {}
+    if len(names) == len(below):
+        unit_of = {i: mark[0] for i, mark in enumerate(below)}
+    else:
+        for mark in below:
+            distance = [abs(title.start() + title.end() - mark.start() - mark.end()) for title in names]
+            unit_of[int(np.argmin(distance))] = mark[0]
+    columns: dict[str, Column] = {}
+    first = 0
+    for i, title in enumerate(names):
+        unit = unit_of.get(i, "")
+        words = 3 if re.search(r"D M S", unit) else 1
+        columns.setdefault(NAMES.get(_plain(title[0]), title[0]), Column(unit, first, words))
+        first += words
+    return columns, first
+
+
+# --- time ---
+
+
+def _gps_ns(sheet: Sheet, span_ns: Span | None, week: int | None, leap_seconds: int | None) -> Int64Array:
+    name, columns = sheet.name, sheet.columns
+    utc = "time" not in columns
+    time = "utc_time" if utc else "time"
+    if time not in columns:
+        raise TrajectoryError(f"{name}: has no column of time; export GPSTime and Week")
+    date = next((what for what in (("utc_date", "date") if utc else ("date",)) if what in columns), None)
+    offset = UTC_OFFSET.search(sheet.header)
+    leap = int(offset[1]) if offset else leap_seconds
+    clock = columns[time].unit.upper() == "(HMS)"
+    if utc and date is None and leap is None:
+        raise TrajectoryError(f"{name}: its time is UTC, of unknown leap seconds; export GPSTime and Week")
+    days = None if date is None else gps_days(sheet.words(date), _date_order(columns[date].unit), name)
+    if clock:
+        if days is None:
+            raise TrajectoryError(f"{name}: a time of day without a date; export GPSTime and Week")
+        gps_ns = gps_ns_of_day(days, clock_ns(sheet.words(time), name))
+    else:
+        if utc and leap is not None and span_ns is not None:
+            span_ns = span_ns[0] - leap * SECOND_NS, span_ns[1] - leap * SECOND_NS
+        gps_ns = _of_seconds(sheet, time, days, span_ns, week)
+    if not utc:
+        return gps_ns
+    return gps_ns + leap_seconds_on(int(gps_ns[0]) // DAY_NS, leap, name) * SECOND_NS
+
+
+def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span | None, week: int | None) -> Int64Array:
+    """Seconds of the week, or of the day where a date says that they are."""
+    seconds = sheet.numbers(time)
+    if not np.isfinite(seconds).all():
+        raise TrajectoryError(f"{sheet.name}: a time is no number")
+    if "week" in sheet.columns and week is None:
+        weeks = np.rint(sheet.numbers("week")).astype(np.int64)
+        gps_ns: Int64Array = weeks * WEEK_NS + np.rint(seconds * SECOND_NS).astype(np.int64)
+        return gps_ns
+    if days is not None:
+        if seconds[0] // 86_400 == days[0] % 7:
+            since_ns = continuous_of_week(seconds, sheet.name, "line", sheet.first_line)
+            return placed_in_week(since_ns, sheet.name, None, int(days[0]) // 7)
+        if seconds.max() < 86_401:
+            return gps_ns_of_day(days, np.rint(seconds * SECOND_NS).astype(np.int64))
+        raise TrajectoryError(f"{sheet.name}: its dates and its seconds of the week are of different days")
+    of_week_ns = continuous_of_week(seconds, sheet.name, "line", sheet.first_line)
+    return placed_in_week(of_week_ns, sheet.name, span_ns, week)
+
+
+def _date_order(unit: str) -> str:
+    return DATE_ORDERS.get(unit.upper(), "MDY")

@@ -1,0 +1,149 @@
+"""Times of trajectories that are wrong by an amount the test knows, in rough air of the virtual aircraft."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from georef.trajectory import Trajectory, TrajectoryError
+from georef.trajectory_time import TimeShift, correlate_turn_rates
+from sim.inertial import true_increments
+from tests.georef.flown import START_NS, flown
+from tests.sim.inertial_motion import rough_flight
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+DAY_S = 86_400
+FIRST_S, LAST_S, RATE_HZ = 60.0, 240.0, 100
+
+
+class Felt(NamedTuple):
+    time_ns: NDArray[np.int64]
+    rate_b: FloatArray
+
+
+class Flight(NamedTuple):
+    trajectory: Trajectory
+    felt: Felt
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Three minutes with a turn; the IMU of MEMS grade and shaken, the attitude off by 0.02° from epoch to epoch."""
+    truth = rough_flight(Path(tmp_path_factory.mktemp("plan")))
+    rng = np.random.default_rng(4)
+    edges_s = np.arange(FIRST_S, LAST_S, 1 / RATE_HZ)
+    rate_b = true_increments(truth, edges_s).angle_b * RATE_HZ
+    rate_b += rng.normal([0.002, -0.001, 0.003], 0.01, rate_b.shape)
+    samples_ns = START_NS + np.rint(edges_s * 1e9).astype(np.int64)
+    epochs_s = np.arange(FIRST_S - 30, LAST_S + 30, 1 / 50)
+    motion = truth.motion(epochs_s)
+    body = Rotation.from_matrix(motion.rot_e_from_b) * Rotation.from_rotvec(rng.normal(0, 2e-4, (len(epochs_s), 3)))
+    nothing = np.full((len(epochs_s), 3), np.nan)
+    trajectory = Trajectory(
+        START_NS + np.rint(epochs_s * 1e9).astype(np.int64),
+        motion.position_e,
+        np.roll(body.as_quat(), 1, axis=1),
+        motion.velocity_e,
+        nothing,
+        nothing,
+        name="flown",
+    )
+    return Flight(trajectory, Felt(samples_ns, np.concatenate([rate_b[:1], rate_b])))
+
+
+def late(trajectory: Trajectory, seconds: float) -> Trajectory:
+    """Stamps that are too small by so much."""
+    return replace(trajectory, time_ns=trajectory.time_ns - round(seconds * 1e9))
+
+
+def shift_of(flight: Flight, seconds: float) -> TimeShift:
+    return correlate_turn_rates(late(flight.trajectory, seconds), *flight.felt)
+
+
+def test_right_time_is_called_right(flight: Flight) -> None:
+    shift = shift_of(flight, 0.0)
+    assert shift.correlation > 0.9
+    assert abs(shift.seconds) < 0.005
+    assert not shift.is_wrong
+    assert shift.what == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "what"),
+    [
+        (18.0, r"^its time is UTC, not GPS: \+18 s would be right$"),
+        (-18.0, r"^leap seconds were added to it twice: -18 s would be right$"),
+        (3.3, r"^its time is off: \+3\.\d+ s would be right$"),
+        (-0.25, r"^its time is off: -0\.2\d+ s would be right$"),
+        (7.0 * DAY_S, r"^its week is another: \+1 would be right$"),
+        (-14.0 * DAY_S, r"^its week is another: -2 would be right$"),
+        (7.0 * DAY_S + 18.0, r"^its week is another: \+1 would be right; its time is UTC, not GPS: \+18 s"),
+        (6.0 * DAY_S, r"^its time looks like seconds of the day: \+518400 s would be right$"),
+        (1024 * 7.0 * DAY_S, r"^its week is another: \+1024 would be right$"),
+    ],
+)
+def test_wrong_time_is_named(flight: Flight, seconds: float, what: str) -> None:
+    shift = shift_of(flight, seconds)
+    assert shift.seconds == pytest.approx(seconds, abs=0.005)
+    assert shift.correlation > 0.9
+    assert shift.is_wrong
+    assert re.search(what, shift.what), shift.what
+
+
+def test_before_leap_seconds_utc_is_no_wrong_time(flight: Flight) -> None:
+    early_ns = START_NS - 10**9 * 604_800 * 10
+    trajectory = replace(flight.trajectory, time_ns=flight.trajectory.time_ns - early_ns)
+    shift = correlate_turn_rates(late(trajectory, 7.0 * DAY_S), flight.felt.time_ns - early_ns, flight.felt.rate_b)
+    assert shift.what == "its week is another: +1 would be right"
+
+
+def test_sigma_is_honest(flight: Flight) -> None:
+    """The shift found differs from the true one by a few of its sigmas, over parts of the flight."""
+    errors = []
+    for begin in range(0, 16_000, 2_000):
+        felt = Felt(flight.felt.time_ns[begin : begin + 4_000], flight.felt.rate_b[begin : begin + 4_000])
+        shift = correlate_turn_rates(late(flight.trajectory, 1.2345), *felt)
+        errors.append((shift.seconds - 1.2345) / shift.sigma)
+    assert 0.1 < float(np.sqrt(np.mean(np.square(errors)))) < 4.0
+
+
+def test_another_flight_is_nothing_certain(flight: Flight) -> None:
+    other = flown(12_000, step_s=0.02, start_ns=int(flight.felt.time_ns[0]) - 30 * 10**9)
+    shift = correlate_turn_rates(other, *flight.felt)
+    assert not shift.is_certain
+    assert shift.what == ""
+
+
+def test_too_little_in_common_is_nothing_certain(flight: Flight) -> None:
+    felt = Felt(flight.felt.time_ns[:1000], flight.felt.rate_b[:1000])
+    shift = correlate_turn_rates(flight.trajectory, *felt)
+    assert np.isnan(shift.correlation)
+    assert not shift.is_wrong
+
+
+def test_gaps_do_not_count(flight: Flight) -> None:
+    keep = np.ones(len(flight.trajectory), np.bool_)
+    keep[3000:4500] = False
+    columns = {
+        name: getattr(flight.trajectory, name)[keep]
+        for name in ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+    }
+    holed = Trajectory(**columns, name="holed")
+    shift = correlate_turn_rates(late(holed, 2.0), *flight.felt)
+    assert shift.seconds == pytest.approx(2.0, abs=0.005)
+    assert shift.correlation > 0.9
+
+
+def test_positions_alone_do_not_turn(flight: Flight) -> None:
+    bare = replace(flight.trajectory, q_e_from_b=np.full_like(flight.trajectory.q_e_from_b, np.nan))
+    with pytest.raises(TrajectoryError, match="no attitude"):
+        correlate_turn_rates(bare, *flight.felt)
