@@ -1,0 +1,363 @@
+"""Which mapping frames are taken, and by which operation of PROJ positions come there: judged, or refused.
+
+PROJ always answers: with an identity where it knows nothing better than 1 m, with ellipsoidal heights where a geoid's
+grid is missing. Here an operation is taken only if its steps are known to 5 cm, none is a guess ("ballpark"), and no
+better one is left out for a missing grid. Two things are stated and not judged: how well a geoid model stands for its
+vertical datum, since the grid is what defines the heights; and which member of a datum ensemble (ETRS89, WGS 84) the
+output stands for, since every member is a valid one.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.crs import CoordinateOperation  # type: ignore[attr-defined]
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
+from pyproj.transformer import AreaOfInterest, TransformerGroup
+
+Area = tuple[float, float, float, float]
+
+ACCURACY_M = 0.05
+WGS84 = "EPSG:4978"
+SAME = "same"
+_NAMED = 'name their datum (gnss.datum or --trajectory-datum, such as "EPSG:7912", ITRF2014, with output.epoch)'
+_SAME = 'say "same" if they are in {datum} already'
+_NOTHING = "PROJ knows no operation there"
+_METRE = "metre"
+_GEOCENTRIC_AXES = [
+    {"name": f"Geocentric {name}", "abbreviation": name, "direction": f"geocentric{name}", "unit": _METRE}
+    for name in "XYZ"
+]
+
+
+class MappingError(ValueError):
+    """A mapping frame, datum or position that is refused: one line that says what, and what would settle it."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A mapping frame: its horizontal CRS (projected, or geocentric with `vertical` None), and what it is called."""
+
+    text: str
+    crs: CRS
+    horizontal: CRS
+    vertical: CRS | None
+
+    @property
+    def datum_name(self) -> str:
+        """The name of the horizontal datum."""
+        geodetic = self.horizontal.geodetic_crs
+        return str(geodetic.name) if geodetic is not None else "its datum"
+
+
+@dataclass(frozen=True)
+class Operation:
+    """How positions in e come to the mapping frame.
+
+    `definition` is PROJ's pipeline; `accuracy_m` is of the steps that were judged, `stated_accuracy_m` is PROJ's own
+    sum, geoid and ensembles included (None: unknown); `realisation` is the member of the output's datum ensemble.
+    """
+
+    name: str
+    definition: str
+    accuracy_m: float
+    stated_accuracy_m: float | None
+    realisation: str
+    grids: tuple[str, ...]
+
+    @property
+    def moves(self) -> bool:
+        """Whether it needs an epoch: rates of a frame, or a model of deformation."""
+        return "t_epoch=" in self.definition or "proj=defmodel" in self.definition
+
+
+@dataclass(frozen=True)
+class _Judgement:
+    """One operation of PROJ, judged: `fault` is empty where it may be taken."""
+
+    operation: Operation | None
+    fault: str
+
+
+def read_target(text: str) -> Target:
+    """A mapping frame as the user wrote it (anything PROJ reads).
+
+    Raises MappingError for what is not projected (geocentric is taken: ECEF), for axes other than east and north, and
+    for depths.
+    """
+    crs = _read(text, "output.crs")
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    horizontal, vertical = _unbound(parts[0]), parts[1] if crs.is_compound else None
+    if horizontal.is_geographic:
+        raise MappingError(
+            f'output.crs = "{text}" ({crs.name}) is geographic, in degrees: a projected one is wanted, such as '
+            f'"EPSG:326ZZ" for UTM zone ZZ north on WGS 84'
+        )
+    if horizontal.is_vertical:
+        raise MappingError(
+            f'output.crs = "{text}" ({crs.name}) is heights alone: write it behind a projected one, "EPSG:25832+7837"'
+        )
+    if not (horizontal.is_projected or (horizontal.is_geocentric and vertical is None)):
+        raise MappingError(f'output.crs = "{text}" ({crs.name}) is neither projected nor geocentric')
+    _refuse_axes(text, crs, horizontal, vertical)
+    return Target(text=text, crs=crs, horizontal=horizontal, vertical=vertical)
+
+
+def read_source(datum: str | None, target: Target) -> CRS:
+    """The geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own datum."""
+    if datum == SAME:
+        return _geocentric(target.horizontal)
+    if datum is None:
+        return CRS.from_user_input(WGS84)
+    crs = _unbound(_read(datum, "datum"))
+    if not (crs.is_geographic or crs.is_geocentric):
+        geodetic = crs.geodetic_crs
+        base = "" if geodetic is None else f', "{":".join(geodetic.to_authority() or (geodetic.name,))}"'
+        raise MappingError(f'datum = "{datum}" ({crs.name}) is no datum of positions: name its geodetic CRS{base}')
+    return _geocentric(crs)
+
+
+def choose(
+    source: CRS, target: Target, datum: str | None, area: Area | None, accuracy_m: float
+) -> tuple[Operation, bool]:
+    """The best operation from positions to the mapping frame in an area (west, south, east, north in degrees).
+
+    Without an area the frame's own is looked at: False says that another operation may be best in a part of it. Raises
+    MappingError where the best is refused, or nothing in the frame's area could be taken.
+    """
+    used = area or _area_of_use(target)
+    flat = _candidates(_key(source), _key(target.horizontal), used)
+    judged = [_judge(one, target, accuracy_m) for one in flat.operations] or [_Judgement(None, _NOTHING)]
+    good = [one.operation for one in judged if one.operation is not None and not one.fault]
+    open_still = area is None and flat.several and bool(good)
+    faults = (
+        []
+        if open_still or (good and not flat.missing and not judged[0].fault)
+        else [_refusal(flat, judged, target, datum)]
+    )
+    whole = None if target.vertical is None else _candidates(_key(source), _key(target.crs), used)
+    if whole is not None:
+        sure = [one for one in whole.operations if not _guesses(one)]
+        if area is None and whole.several and sure:
+            open_still = True
+        elif whole.missing or not sure or _guesses(whole.operations[0]):
+            faults.insert(0, _vertical_fault(whole))
+    if faults:
+        raise MappingError(f'output.crs = "{target.text}" ({target.crs.name}): ' + "; and ".join(faults))
+    if whole is None or open_still:
+        return good[0], not open_still
+    return _with_heights(whole.operations[0], good[0], target, used, accuracy_m), True
+
+
+def _area_of_use(target: Target) -> Area:
+    area = target.horizontal.area_of_use
+    return (-180.0, -90.0, 180.0, 90.0) if area is None else (area.west, area.south, area.east, area.north)
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """PROJ's operations from one CRS to another, best first, and the grids that the best of all lacks.
+
+    A grid is its file's name, and whether PROJ's server has it.
+    """
+
+    operations: tuple[Transformer, ...]
+    several: bool
+    missing: tuple[tuple[str, bool], ...]
+    best_name: str
+
+
+def _key(crs: CRS) -> str:
+    """A text of a CRS that PROJ reads back without loss."""
+    authority = crs.to_authority(min_confidence=100)
+    return ":".join(authority) if authority and CRS.from_user_input(":".join(authority)) == crs else crs.to_json()
+
+
+@functools.lru_cache(maxsize=64)
+def _candidates(source: str, target: str, area: Area) -> _Candidates:
+    """Ask PROJ, which takes up to a second, with grids looked for on this machine alone."""
+    set_network_enabled(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        one, other = CRS.from_user_input(source), CRS.from_user_input(target)
+        try:
+            group = TransformerGroup(one, other, always_xy=True, area_of_interest=AreaOfInterest(*area))
+        except ProjError:
+            return _Candidates((), False, (), "")
+    lacking: tuple[tuple[str, bool], ...] = ()
+    name = ""
+    wanting = [one for one in group.unavailable_operations if not one.has_ballpark_transformation]
+    if not group.best_available and wanting:
+        lacking = tuple(
+            dict.fromkeys((grid.short_name, bool(grid.url)) for grid in wanting[0].grids if not grid.available)
+        )
+        name = str(wanting[0].name)
+    several = len(group.transformers) + len(group.unavailable_operations) > 1
+    return _Candidates(tuple(group.transformers), several, lacking, name)
+
+
+def _judge(candidate: Transformer, target: Target, accuracy_m: float) -> _Judgement:
+    """Sum up what the steps are good to; a step from a member of the output's own ensemble to the ensemble is none."""
+    total, realisation, grids = 0.0, "", []
+    for step in _steps(candidate):
+        grids += [grid.short_name for grid in step.grids]
+        if step.has_ballpark_transformation:
+            return _Judgement(None, f"PROJ knows no operation there and would guess ({step.name})")
+        if step.type_name == "Conversion":
+            continue
+        member = _member(step, target)
+        if member:
+            realisation = member
+        elif step.accuracy < 0.0:
+            return _Judgement(None, f'the accuracy of PROJ\'s best operation, "{step.name}", is unknown')
+        else:
+            total += step.accuracy
+    operation = _operation(candidate, total, realisation, tuple(grids))
+    if total > accuracy_m + 1e-9:
+        return _Judgement(operation, f'PROJ\'s best operation, "{_short(operation.name)}", is good to {total:g} m only')
+    return _Judgement(operation, "")
+
+
+def _steps(candidate: Transformer) -> tuple[CoordinateOperation, ...]:
+    """The steps of an operation; one that has a single step is that step."""
+    return tuple(candidate.operations or ()) or (CoordinateOperation.from_string(candidate.to_wkt()),)
+
+
+def _operation(candidate: Transformer, accuracy_m: float, realisation: str, grids: tuple[str, ...]) -> Operation:
+    return Operation(
+        name=str(candidate.description),
+        definition=str(candidate.definition),
+        accuracy_m=accuracy_m,
+        stated_accuracy_m=None if candidate.accuracy < 0.0 else float(candidate.accuracy),
+        realisation=realisation,
+        grids=tuple(dict.fromkeys(grids)),
+    )
+
+
+def _member(step: CoordinateOperation, target: Target) -> str:
+    """The realisation's name, if a step does nothing but call it by the name of the output's ensemble."""
+    text: dict[str, Any] = step.to_json_dict()
+    source, ensemble = text.get("source_crs") or {}, (text.get("target_crs") or {}).get("datum_ensemble")
+    geodetic = target.horizontal.geodetic_crs
+    if ensemble is None or geodetic is None or geodetic.datum is None or ensemble["name"] != geodetic.datum.name:
+        return ""
+    names = {member["name"] for member in ensemble["members"]}
+    return str(source["name"]) if source.get("datum", {}).get("name") in names else ""
+
+
+def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum: str | None) -> str:
+    """Why the datum part is refused, and what would settle it."""
+    if flat.missing:
+        return f'PROJ\'s best operation, "{_short(flat.best_name)}", lacks {_how_to_get(flat.missing)}'
+    first = judged[0]
+    same = _SAME.format(datum=target.datum_name)
+    if datum is None:
+        return f"the positions are in WGS 84 of unknown realisation, and {first.fault}: {_NAMED}, or {same}"
+    fault = f'the positions are in "{datum}", and {first.fault}: name another datum, or {same}'
+    if first.operation is None:
+        return fault
+    return f"{fault}; or take it with output.datum_accuracy_m = {first.operation.accuracy_m:g}"
+
+
+def _vertical_fault(whole: _Candidates) -> str:
+    """Why the heights are refused."""
+    if whole.missing:
+        return f"its heights lack {_how_to_get(whole.missing)}"
+    return "PROJ knows no geoid model for its heights: take a vertical CRS it has one for, or ellipsoidal heights"
+
+
+def _guesses(candidate: Transformer) -> bool:
+    return any(step.has_ballpark_transformation for step in _steps(candidate))
+
+
+def _with_heights(best: Transformer, flat: Operation, target: Target, area: Area, accuracy_m: float) -> Operation:
+    """The operation with heights, which has to agree with the judged one in the plane."""
+    grids = tuple(grid.short_name for step in _steps(best) for grid in step.grids)
+    operation = _operation(best, flat.accuracy_m, flat.realisation, grids or _named_grids(str(best.definition)))
+    if _apart_m(operation, flat, area) > max(accuracy_m, flat.stated_accuracy_m or 0.0):
+        raise MappingError(
+            f'output.crs = "{target.text}": PROJ\'s operation with heights, "{_short(operation.name)}", is not '
+            f'"{_short(flat.name)}" in the plane: take ellipsoidal heights, or another datum'
+        )
+    return operation
+
+
+def _named_grids(definition: str) -> tuple[str, ...]:
+    return tuple(word.removeprefix("grids=") for word in definition.split() if word.startswith("grids="))
+
+
+def _apart_m(one: Operation, other: Operation, area: Area) -> float:
+    """Distance in the plane between two operations in the middle of an area (in units of the map)."""
+    lon, lat = (area[0] + area[2] + (360.0 if area[2] < area[0] else 0.0)) / 2.0, (area[1] + area[3]) / 2.0
+    xyz = Transformer.from_pipeline("+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart")
+    at = (*xyz.transform(lon, lat, 0.0), 2020.0)
+    plane = [np.array(transformer_of(each).transform(*at, errcheck=False)[:2], dtype=float) for each in (one, other)]
+    distance = float(np.linalg.norm(plane[0] - plane[1]))
+    return distance if math.isfinite(distance) else 0.0  # the middle of a frame may lie outside its grids
+
+
+def transformer_of(operation: Operation) -> Transformer:
+    """PROJ's transformer of an operation, the same in every process. Raises MappingError where a grid has gone."""
+    set_network_enabled(False)
+    try:
+        return Transformer.from_pipeline(operation.definition)
+    except ProjError as error:
+        grids = ", ".join(operation.grids) or "none"
+        raise MappingError(f"PROJ cannot set up '{_short(operation.name)}' (grids: {grids}): {error}") from error
+
+
+def _how_to_get(grids: tuple[tuple[str, bool], ...]) -> str:
+    listed = ", ".join(name for name, _ in grids)
+    command = " ".join(f"--file {name}" for name, offered in grids if offered)
+    get = f"`projsync {command}` (or `pyproj sync`), the package proj-data, or " if command else ""
+    return f"the grid {listed}, which is not installed: {get}a copy in a folder that PROJ_DATA names"
+
+
+def _short(name: str) -> str:
+    """An operation's name without its conversions."""
+    parts = [part for part in name.split(" + ") if not part.startswith(("Conversion from", "axis order", "Null geo"))]
+    return " + ".join(parts) or name
+
+
+def _read(text: str, key: str) -> CRS:
+    try:
+        return CRS.from_user_input(text)
+    except CRSError as error:
+        raise MappingError(
+            f'{key} = "{text}" is none that PROJ knows (EPSG:CODE, EPSG:CODE+CODE with heights, WKT): {error}'
+        ) from error
+
+
+def _unbound(crs: CRS) -> CRS:
+    return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+
+
+def _geocentric(crs: CRS) -> CRS:
+    """The geocentric CRS on the datum of another."""
+    if crs.is_geocentric:
+        return crs
+    geodetic = crs.geodetic_crs
+    if geodetic is None:
+        raise MappingError(f"{crs.name} has no datum that positions could be in")
+    text = geodetic.to_json_dict()
+    kept = {key: text[key] for key in ("name", "datum", "datum_ensemble", "prime_meridian") if key in text}
+    system = {"subtype": "Cartesian", "axis": _GEOCENTRIC_AXES}
+    return CRS.from_json_dict({"type": "GeodeticCRS", **kept, "coordinate_system": system})
+
+
+def _refuse_axes(text: str, crs: CRS, horizontal: CRS, vertical: CRS | None) -> None:
+    """PROJ swaps northing and easting, but leaves axes that point west or south as they are."""
+    if any(axis.direction == "west" for axis in horizontal.axis_info) and horizontal.is_projected:
+        raise MappingError(
+            f'output.crs = "{text}" ({crs.name}) counts towards the west and south: points are written as easting, '
+            f"northing, height, so take the frame's version with these axes"
+        )
+    if vertical is not None and any(axis.direction == "down" for axis in vertical.axis_info):
+        raise MappingError(f'output.crs = "{text}" ({crs.name}) counts depths: take heights, which count upwards')
