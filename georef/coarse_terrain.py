@@ -1,0 +1,92 @@
+"""A coarse terrain model: what range a beam is about to have, so that pulses in air find their zone (FORMULAS 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from georef.earth import geodetic_from_e, rot_e_from_l
+
+FloatArray = NDArray[np.float64]
+ToGrid = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+STEPS = 30
+NEAR_M = 0.5  # a beam has arrived when it is this close to the terrain's height
+STEEPEST_COS = 0.05  # of beams that reach the ground within a swath
+
+
+class TerrainError(ValueError):
+    """A grid that is none."""
+
+
+class CoarseTerrain:
+    """Ellipsoidal heights at the nodes of a regular grid, bilinear in between.
+
+    Args:
+        height_m: (rows, columns) ellipsoidal; nan where nothing is known.
+        first: x and y of height_m[0, 0]: longitude and latitude in radians, or what ``to_grid`` gives.
+        step: from column to column and from row to row; either may be negative.
+        to_grid: x and y of the grid of latitudes and longitudes (n,) in radians; None: the grid is in those.
+
+    Raises:
+        TerrainError: no grid of two by two at least, or a step of 0.
+    """
+
+    def __init__(
+        self, height_m: ArrayLike, first: tuple[float, float], step: tuple[float, float], to_grid: ToGrid | None = None
+    ) -> None:
+        self._height_m = np.asarray(height_m, dtype=np.float64)
+        if self._height_m.ndim != 2 or min(self._height_m.shape) < 2:
+            raise TerrainError(f"terrain: got heights of shape {self._height_m.shape}, want a grid of 2 by 2 or more")
+        if not (step[0] and step[1]):
+            raise TerrainError(f"terrain: got steps of {step[0]:g} and {step[1]:g}, want none that is 0")
+        self._first, self._step, self._to_grid = first, step, to_grid
+
+    def height_at(self, lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
+        """(n,) ellipsoidal heights, nan outside the grid."""
+        lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
+        x, y = (lon, lat) if self._to_grid is None else self._to_grid(lat, lon)
+        column, row = (x - self._first[0]) / self._step[0], (y - self._first[1]) / self._step[1]
+        rows, columns = self._height_m.shape
+        inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
+        left = np.where(inside, np.minimum(column, columns - 2), 0).astype(np.intp)
+        lower = np.where(inside, np.minimum(row, rows - 2), 0).astype(np.intp)
+        across, along = column - left, row - lower
+        grid = self._height_m
+        near = (1.0 - across) * grid[lower, left] + across * grid[lower, left + 1]
+        far = (1.0 - across) * grid[lower + 1, left] + across * grid[lower + 1, left + 1]
+        height: FloatArray = np.where(inside, (1.0 - along) * near + along * far, np.nan)
+        return height
+
+    def predicted_m(self, origin_e: FloatArray, direction_e: FloatArray) -> FloatArray:
+        """(n,) ranges at which beams meet the terrain, to a metre or so; nan where they do not, or leave the grid.
+
+        A step goes on to where the beam would be down if the ground ahead were level. Once that has led below the
+        ground, as on slopes that face the beam, steps stay between the two, where a line through both heights is zero.
+
+        Args:
+            origin_e: (n, 3) metres; direction_e: (n, 3) unit vectors.
+        """
+        lat, lon, height_m = geodetic_from_e(origin_e)
+        fall = np.einsum("ni,ni->n", direction_e, rot_e_from_l(lat, lon)[..., 2])
+        above_m = height_m - self.height_at(lat, lon)
+        falling = (fall > STEEPEST_COS) & (above_m > 0.0)
+        slope = np.where(falling, fall, 1.0)
+        range_m = np.where(falling, above_m / slope, np.nan)
+        near_m, near_above_m = np.zeros_like(range_m), above_m
+        far_m, far_above_m = np.full_like(range_m, np.nan), np.full_like(range_m, np.nan)
+        for _ in range(STEPS):
+            lat, lon, height_m = geodetic_from_e(origin_e + range_m[:, np.newaxis] * direction_e)
+            above_m = height_m - self.height_at(lat, lon)
+            arrived = np.abs(above_m) < NEAR_M
+            if (arrived | np.isnan(above_m)).all():
+                break
+            below = above_m < 0.0
+            near_m, near_above_m = np.where(below, near_m, range_m), np.where(below, near_above_m, above_m)
+            far_m, far_above_m = np.where(below, range_m, far_m), np.where(below, above_m, far_above_m)
+            share = np.clip(near_above_m / (near_above_m - far_above_m), 0.1, 0.9)
+            step_m = np.where(np.isnan(far_m), range_m + above_m / slope, near_m + share * (far_m - near_m))
+            range_m = np.where(arrived, range_m, step_m)
+        return np.where(np.abs(above_m) < NEAR_M, range_m, np.nan)
