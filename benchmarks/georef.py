@@ -1,0 +1,201 @@
+"""What georeferencing costs on one core: returns to ECEF, to a mapping frame, with covariances.
+
+python -m benchmarks.georef [--repeats 7] [--json FILE]
+
+Figures are medians over the repeats, returns a second of this process's own CPU time. Four million returns of a mirror
+scanner (400 000 a second, ±30°, 1000 m above ground) along a trajectory of 200 Hz that rolls, handed over in batches as
+a chunk of a log gives them, with every parameter of the model set. Beside each rate stands what it costs to read as
+many rows and to write as many results once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.memory import keep_freed_memory
+from georef.atmosphere import Air
+from georef.beams import LineGeometry
+from georef.calibration import PARAMETERS, Calibration, nominal
+from georef.georeference import Georeferencer
+from georef.mapping import Mapping
+from georef.records import RETURN_DTYPE, StructArray
+from georef.sensor_model import SensorModel
+from georef.trajectory import Trajectory
+from georef.uncertainty import Noise, Uncertainty
+
+FloatArray = NDArray[np.float64]
+
+RETURNS = 4_000_000
+BATCH = 40_000  # a chunk of 1 MiB holds some 50 000 returns
+RATE_HZ = 400_000
+START_NS = 1_479_297_618_000_000_000
+VALUES = {
+    "omega_rad": 0.0044,
+    "phi_rad": -0.007,
+    "kappa_rad": 0.0106,
+    "range_offset_m": 0.35,
+    "range_scale": 4e-5,
+    "scan_angle_offset_rad": 9e-4,
+    "scan_angle_scale": 3e-4,
+    "scan_plane_tilt_rad": 3.5e-4,
+    "lever_arm_x_m": 0.15,
+    "lever_arm_y_m": -0.08,
+    "lever_arm_z_m": 0.42,
+    "time_offset_s": 1.5e-4,
+    "imu_latency_s": 2e-4,
+    "encoder_latency_s": 1e-6,
+    "torsion_s2": 2e-9,
+    "pitch_slope": 2e-4,
+}
+BASIC = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m", "lever_arm_x_m", "lever_arm_y_m", "lever_arm_z_m")
+SIGMAS = {"omega_rad": 2e-5, "phi_rad": 2e-5, "kappa_rad": 5e-5} | dict.fromkeys(BASIC[3:], 0.01)
+CRS = "EPSG:32632"
+
+
+@dataclass
+class Figure:
+    """One line of the table; rates are returns a second of CPU."""
+
+    name: str
+    rate: float
+    target: float | None
+    limit: float
+
+
+def rate(work: Callable[[], object], repeats: int) -> float:
+    """Median of returns a second of CPU time."""
+    work()
+    spent = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        spent.append(time.process_time() - start)
+    return RETURNS / statistics.median(spent)
+
+
+def trajectory() -> Trajectory:
+    """A line east at 60 m/s, 200 Hz: roll 2° in 7 s and 0.3° in 0.9 s, pitch and heading less."""
+    time_s = np.arange(0.0, RETURNS / RATE_HZ + 1.0, 0.005) - 0.5
+    roll = np.radians(2.0 * np.sin(2 * np.pi * time_s / 7.0) + 0.3 * np.sin(2 * np.pi * time_s / 0.9))
+    pitch = np.radians(1.0 + 0.5 * np.sin(2 * np.pi * time_s / 5.0))
+    heading = np.radians(90.0 + np.sin(2 * np.pi * time_s / 11.0))
+    lat, lon = np.full_like(time_s, np.radians(47.5)), np.radians(9.0) + time_s * 60.0 / 4.32e6
+    height = 1500.0 + np.sin(time_s)
+    velocity = np.stack([np.zeros_like(time_s), np.full_like(time_s, 60.0), -np.cos(time_s)], axis=1)
+    of_position = np.tile([0.02, 0.02, 0.03], (len(time_s), 1))
+    of_attitude = np.tile([5e-5, 5e-5, 1e-4], (len(time_s), 1))
+    time_ns = START_NS + np.rint(time_s * 1e9).astype(np.int64)
+    return Trajectory.from_geodetic(
+        time_ns,
+        lat,
+        lon,
+        height,
+        velocity,
+        roll,
+        pitch,
+        heading,
+        position_sigma_l=of_position,
+        attitude_sigma_rad=of_attitude,
+    )
+
+
+def returns() -> tuple[StructArray, NDArray[np.int64], FloatArray, FloatArray]:
+    """Rows, their GPS times, and the encoder's rate and acceleration: a sine of 50 Hz over flat ground."""
+    time_s = np.arange(RETURNS) / RATE_HZ
+    phase = 2 * np.pi * 50.0 * time_s
+    rows = np.zeros(RETURNS, RETURN_DTYPE)
+    rows["encoder_rad"] = np.radians(30.0) * np.sin(phase)
+    rows["range_m"] = 1000.0 / np.cos(rows["encoder_rad"])
+    rows["intensity"] = 800.0
+    rows["return_number"] = rows["number_of_returns"] = 1
+    rows["pulse_id"] = np.arange(RETURNS)
+    omega = 2 * np.pi * 50.0
+    first, second = omega * np.radians(30.0) * np.cos(phase), -(omega**2) * np.radians(30.0) * np.sin(phase)
+    return rows, START_NS + np.rint(time_s * 1e9).astype(np.int64), first, second
+
+
+def calibration(names: tuple[str, ...]) -> Calibration:
+    """With these parameters set and the sigmas of a usual adjustment."""
+    sigmas = np.array([SIGMAS.get(parameter.name, 0.0) for parameter in PARAMETERS])
+    changed = nominal("left", np.zeros(3), np.eye(3)).changed(**{name: VALUES[name] for name in names})
+    return replace(changed, sigmas=sigmas)
+
+
+class KnownMotion:
+    """The encoder's motion as the flight has it; what it costs to find it from readings is not of these figures."""
+
+    def __init__(self, rate: FloatArray, acceleration: FloatArray) -> None:
+        self._rate, self._acceleration = rate, acceleration
+
+    def motion(self, rows: StructArray, time_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+        """Of consecutive pulses."""
+        del time_ns
+        first = int(rows["pulse_id"][0])
+        return self._rate[first : first + len(rows)], self._acceleration[first : first + len(rows)]
+
+
+def measure(repeats: int) -> list[Figure]:
+    """All lines of the table."""
+    rows, time_ns, first, second = returns()
+    path = trajectory()
+    full, basic = calibration(tuple(VALUES)), calibration(BASIC)
+    air = Air(ranges="vacuum", refraction="ardc")
+
+    known = KnownMotion(first, second)
+
+    def in_batches(georeferencer: Georeferencer) -> None:
+        for at in range(0, RETURNS, BATCH):
+            georeferencer.georeference(rows[at : at + BATCH], time_ns[at : at + BATCH], path)
+
+    def model(of: Calibration, through: Air | None = None) -> SensorModel:
+        return SensorModel(of, LineGeometry(), (20.0, 3000.0), air=through)
+
+    limit = rate(partial(least, rows), repeats)
+    mapping, sigmas = Mapping(CRS), Uncertainty(full, Noise())
+    cases = [
+        ("ECEF, every parameter", Georeferencer(model(full), None, None, known), 12e6),
+        ("ECEF, boresight, range offset, lever arm", Georeferencer(model(basic)), None),
+        ("mapping frame, every parameter", Georeferencer(model(full), mapping, None, known), 10e6),
+        ("mapping frame, basic", Georeferencer(model(basic), mapping), None),
+        ("mapping frame, every parameter, air", Georeferencer(model(full, air), mapping, None, known), None),
+        ("mapping frame, every parameter, covariance", Georeferencer(model(full), mapping, sigmas, known), 6e6),
+    ]
+    return [Figure(name, rate(partial(in_batches, one), repeats), target, limit) for name, one, target in cases]
+
+
+def least(rows: StructArray) -> None:
+    """Read every row, write a point of 24 bytes and a time of 8 for each."""
+    for at in range(0, RETURNS, BATCH):
+        part = rows[at : at + BATCH]
+        part.copy()
+        np.zeros((len(part), 4))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=7, help="measurements a figure, of which the median counts")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    arguments = parser.parse_args()
+    keep_freed_memory()  # as every command of ours does
+    figures = measure(arguments.repeats)
+    print(f"{'georeferencing, one core':<46} {'rate':>9} {'asked':>8} {'limit':>9}")
+    for one in figures:
+        asked = f"{one.target / 1e6:>4.0f} M/s" if one.target else ""
+        print(f"{one.name:<46} {one.rate / 1e6:>5.2f} M/s {asked:>8} {one.limit / 1e6:>5.0f} M/s")
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(figure) for figure in figures], indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,372 @@
+"""What is known of a scanner's mounting and errors: the parameters of the model, their sigmas, and its tables.
+
+Read from a calibration file (CONVENTIONS, "Calibration file"), or nominal where there is none.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+CONVENTIONS_VERSION = 1
+METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
+RANGES = ("corrected", "vacuum")
+REFRACTIONS = ("none", "ardc", "spherical")
+ROTATION_TOLERANCE = 1e-6
+ONE_TABLE = "want it once"
+
+
+class CalibrationError(ValueError):
+    """A calibration file that cannot be used; its text has one line a mistake: file, key, what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter of the model: its key in files, its name here, and SI units a unit of the file."""
+
+    key: str
+    name: str
+    factor: float
+    needed: bool = False
+
+
+_DEG, _PPM, _US = math.pi / 180.0, 1e-6, 1e-6
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter("omega_deg", "omega_rad", _DEG, needed=True),
+    Parameter("phi_deg", "phi_rad", _DEG, needed=True),
+    Parameter("kappa_deg", "kappa_rad", _DEG, needed=True),
+    Parameter("range_offset_m", "range_offset_m", 1.0, needed=True),
+    Parameter("range_scale_ppm", "range_scale", _PPM),
+    Parameter("scan_angle_offset_deg", "scan_angle_offset_rad", _DEG),
+    Parameter("scan_angle_scale_ppm", "scan_angle_scale", _PPM),
+    Parameter("scan_plane_tilt_deg", "scan_plane_tilt_rad", _DEG),
+    Parameter("lever_arm_x_m", "lever_arm_x_m", 1.0, needed=True),
+    Parameter("lever_arm_y_m", "lever_arm_y_m", 1.0, needed=True),
+    Parameter("lever_arm_z_m", "lever_arm_z_m", 1.0, needed=True),
+    Parameter("time_offset_us", "time_offset_s", _US),
+    Parameter("imu_latency_us", "imu_latency_s", _US),
+    Parameter("encoder_latency_us", "encoder_latency_s", _US),
+    Parameter("torsion_us2", "torsion_s2", _US * _US),
+    Parameter("pitch_slope_ppm", "pitch_slope", _PPM),
+)
+INDEX = {parameter.name: index for index, parameter in enumerate(PARAMETERS)}  # of SI names in arrays (16,)
+_INDEX_OF_KEY = {parameter.key: index for index, parameter in enumerate(PARAMETERS)}
+
+
+@dataclass(frozen=True, slots=True)
+class RangeOffset:
+    """Metres added to ``range_offset_m`` where all that is not None matches."""
+
+    offset_m: float
+    return_slot: int | None = None
+    mta_zone: int | None = None
+    prf_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BeamCorrection:
+    """Added to a beam of a multi-beam head."""
+
+    azimuth_rad: float = 0.0
+    elevation_rad: float = 0.0
+    range_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A scanner's calibration, SI units.
+
+    Attributes:
+        id, scanner, method: of the file.
+        parameters: (16,) in the order of `PARAMETERS`.
+        sigmas: (16,) one sigma; 0: held fixed.
+        correlation: (16, 16).
+        installation_matrix: (3, 3) T, b from s (inside a gimbal: its innermost stage from s).
+        mirror_factor: of the encoder's angles it was estimated with; None: unsaid.
+        ranges, refraction: the [atmosphere] settings it was estimated with; None: unsaid.
+        ibrc: intensities, rising, and metres subtracted from the range; None: no table.
+        range_offsets: each added to the range offset where it matches.
+        facet_tilt_rad: tilt of facets by index.
+        beams: corrections of beams by channel.
+        header: all of the file's table [calibration].
+    """
+
+    id: str
+    scanner: str
+    method: str
+    parameters: FloatArray
+    sigmas: FloatArray = field(default_factory=lambda: np.zeros(len(PARAMETERS)))
+    correlation: FloatArray = field(default_factory=lambda: np.eye(len(PARAMETERS)))
+    installation_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    mirror_factor: float | None = None
+    ranges: str | None = None
+    refraction: str | None = None
+    ibrc: tuple[FloatArray, FloatArray] | None = None
+    range_offsets: tuple[RangeOffset, ...] = ()
+    facet_tilt_rad: Mapping[int, float] = field(default_factory=dict)
+    beams: Mapping[int, BeamCorrection] = field(default_factory=dict)
+    header: Mapping[str, Any] = field(default_factory=dict)
+
+    def value(self, name: str) -> float:
+        """A parameter by its name in SI units, as ``omega_rad``."""
+        return float(self.parameters[INDEX[name]])
+
+    @property
+    def lever_arm_b(self) -> FloatArray:
+        """(3,) from the body's origin to the scanner's (to the first stage of its gimbal), metres."""
+        return np.array([self.value(f"lever_arm_{axis}_m") for axis in "xyz"])
+
+    def covariance(self) -> FloatArray:
+        """(16, 16) of the parameters, SI units; zero where held fixed."""
+        scaled: FloatArray = self.correlation * np.outer(self.sigmas, self.sigmas)
+        return scaled
+
+    def changed(self, **values: float) -> Calibration:
+        """The same with some parameters by their names in SI units."""
+        parameters = self.parameters.copy()
+        for name, value in values.items():
+            parameters[INDEX[name]] = value
+        return replace(self, parameters=parameters)
+
+
+def nominal(
+    scanner: str, lever_arm_b: Sequence[float] | FloatArray, installation: Sequence[Sequence[float]] | FloatArray
+) -> Calibration:
+    """Where there is no file: every parameter zero but the lever arm (3,), and the installation matrix T (3, 3)."""
+    parameters = np.zeros(len(PARAMETERS))
+    first = INDEX["lever_arm_x_m"]
+    parameters[first : first + 3] = lever_arm_b
+    matrix = np.array(installation, dtype=np.float64)
+    return Calibration("nominal", scanner, "nominal", parameters, installation_matrix=matrix)
+
+
+def read_calibration(text: str, name: str) -> Calibration:
+    """A calibration file.
+
+    Args:
+        text: of the file.
+        name: of the file, for messages.
+
+    Raises:
+        CalibrationError: one line a mistake.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CalibrationError(f"{name}: not TOML: {str(error).splitlines()[0]}") from error
+    reader = _Reader(document)
+    calibration = reader.calibration()
+    if reader.mistakes:
+        raise CalibrationError("\n".join(f"{name}: {mistake}" for mistake in reader.mistakes))
+    return calibration
+
+
+class _Reader:
+    """Takes a document apart; what is wrong is noted, and stands in for itself by something harmless."""
+
+    def __init__(self, document: Mapping[str, Any]) -> None:
+        self._document = document
+        self.mistakes: list[str] = []
+
+    def calibration(self) -> Calibration:
+        header = self._table("calibration", needed=True)
+        parameters, _ = self._values("parameters")
+        sigmas, estimated = self._values("sigma")
+        for index in np.flatnonzero(sigmas < 0.0).tolist():
+            self._wrong(f"sigma.{PARAMETERS[index].key}", f"got {sigmas[index]:g}, want at least 0")
+        return Calibration(
+            id=self._text(header, "id"),
+            scanner=self._text(header, "scanner"),
+            method=self._choice(header, "method", METHODS) or "nominal",
+            parameters=parameters,
+            sigmas=sigmas,
+            correlation=self._correlation(estimated),
+            installation_matrix=self._rotation(header),
+            mirror_factor=self._mirror_factor(header),
+            ranges=self._choice(header, "ranges", RANGES),
+            refraction=self._choice(header, "refraction", REFRACTIONS),
+            ibrc=self._ibrc(),
+            range_offsets=tuple(self._range_offsets()),
+            facet_tilt_rad=self._facets(),
+            beams=self._beams(),
+            header=header,
+        )
+
+    def _wrong(self, key: str, text: str) -> None:
+        self.mistakes.append(f"{key}: {text}")
+
+    def _table(self, key: str, *, needed: bool = False) -> Mapping[str, Any]:
+        table = self._document.get(key)
+        if isinstance(table, dict):
+            return table
+        if table is not None or needed:
+            self._wrong(key, f"{'missing' if table is None else 'not a table'}; want [{key}]")
+        return {}
+
+    def _text(self, header: Mapping[str, Any], key: str) -> str:
+        value = header.get(key)
+        if isinstance(value, str) and value:
+            return value
+        if header:
+            self._wrong(f"calibration.{key}", f"{'missing' if value is None else 'not text'}; want text in quotes")
+        return ""
+
+    def _choice(self, header: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> str | None:
+        value = header.get(key)
+        if value is None and (key != "method" or not header):
+            return None
+        if value not in choices:
+            got = "missing" if value is None else f"got {value!r}"
+            self._wrong(f"calibration.{key}", f"{got}, want one of {', '.join(choices)}")
+            return None
+        return str(value)
+
+    def _number(self, table: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+        value = table.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            got = "missing" if value is None else f"got {value!r}"
+            self._wrong(f"{where}.{key}", f"{got}, want a number")
+            return 0.0
+        return float(value)
+
+    def _whole(self, table: Mapping[str, Any], key: str, where: str) -> int:
+        value = table.get(key)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            got = "missing" if value is None else f"got {value!r}"
+            self._wrong(f"{where}.{key}", f"{got}, want a whole number from 0")
+            return 0
+        return value
+
+    def _values(self, section: str) -> tuple[FloatArray, set[int]]:
+        """(16,) in SI units, and which of them were said."""
+        table = self._table(section, needed=section == "parameters")
+        values, said = np.zeros(len(PARAMETERS)), set()
+        for key in table.keys() - _INDEX_OF_KEY.keys():
+            self._wrong(f"{section}.{key}", "no parameter of the model; want the keys of CONVENTIONS")
+        for index, parameter in enumerate(PARAMETERS):
+            needed = parameter.needed and section == "parameters" and bool(table)
+            if parameter.key in table or needed:
+                values[index] = self._number(table, parameter.key, section) * parameter.factor
+                said.add(index)
+        return values, said
+
+    def _correlation(self, estimated: set[int]) -> FloatArray:
+        """(16, 16) from the names and the matrix of those that were estimated."""
+        whole = np.eye(len(PARAMETERS))
+        table = self._table("correlation")
+        if not table:
+            return whole
+        names = table.get("names")
+        if not isinstance(names, list) or any(_INDEX_OF_KEY.get(name) not in estimated for name in names):
+            self._wrong("correlation.names", "want a list of keys of [sigma]")
+            return whole
+        matrix = _array(table.get("matrix"), (len(names), len(names)))
+        if matrix is None or len(set(names)) < len(names) or not _is_correlation(matrix):
+            size = f"{len(names)} × {len(names)}"
+            self._wrong("correlation.matrix", f"want {size} numbers: symmetric, 1 on its diagonal, none below −1")
+            return whole
+        at = [_INDEX_OF_KEY[name] for name in names]
+        whole[np.ix_(at, at)] = matrix
+        return whole
+
+    def _rotation(self, header: Mapping[str, Any]) -> FloatArray:
+        key = "installation_matrix"
+        if header.get(key) is None:
+            return np.eye(3)
+        matrix = _array(header[key], (3, 3))
+        if matrix is None or not is_rotation(matrix):
+            self._wrong(f"calibration.{key}", "no rotation; want 3 × 3 numbers, perpendicular rows of length 1")
+            return np.eye(3)
+        return matrix
+
+    def _mirror_factor(self, header: Mapping[str, Any]) -> float | None:
+        if header.get("mirror_factor") is None:
+            return None
+        return self._number(header, "mirror_factor", "calibration")
+
+    def _ibrc(self) -> tuple[FloatArray, FloatArray] | None:
+        table = self._table("ibrc")
+        if not table:
+            return None
+        intensity, correction = _array(table.get("intensity"), None), _array(table.get("correction_m"), None)
+        if intensity is None or correction is None or len(intensity) != len(correction) or not len(intensity):
+            self._wrong("ibrc", "want intensity and correction_m, lists of as many numbers, at least one")
+            return None
+        if any(after <= before for before, after in pairwise(intensity.tolist())):
+            self._wrong("ibrc.intensity", "want rising values")
+            return None
+        return intensity, correction
+
+    def _rows(self, key: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Rows of an array of tables, with where each stands."""
+        rows = self._document.get(key, [])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            self._wrong(key, f"want tables [[{key}]]")
+            return
+        for place, row in enumerate(rows):
+            yield f"{key}[{place}]", row
+
+    def _range_offsets(self) -> Iterator[RangeOffset]:
+        for where, row in self._rows("range_offset"):
+            if not row.keys() & {"return_slot", "mta_zone", "prf_hz"}:
+                self._wrong(where, "matches everything; want return_slot, mta_zone or prf_hz")
+            yield RangeOffset(
+                self._number(row, "offset_m", where),
+                self._whole(row, "return_slot", where) if "return_slot" in row else None,
+                self._whole(row, "mta_zone", where) if "mta_zone" in row else None,
+                self._number(row, "prf_hz", where) if "prf_hz" in row else None,
+            )
+
+    def _facets(self) -> dict[int, float]:
+        tilts: dict[int, float] = {}
+        for where, row in self._rows("facet"):
+            index = self._whole(row, "index", where)
+            if index in tilts:
+                self._wrong(f"{where}.index", f"facet {index} stands there twice; {ONE_TABLE}")
+            tilts[index] = math.radians(self._number(row, "tilt_deg", where))
+        return tilts
+
+    def _beams(self) -> dict[int, BeamCorrection]:
+        beams: dict[int, BeamCorrection] = {}
+        for where, row in self._rows("beam"):
+            channel = self._whole(row, "channel", where)
+            if channel in beams:
+                self._wrong(f"{where}.channel", f"beam {channel} stands there twice; {ONE_TABLE}")
+            azimuth_deg, elevation_deg, range_m = (
+                self._number(row, key, where, default=0.0) for key in ("azimuth_deg", "elevation_deg", "range_m")
+            )
+            beams[channel] = BeamCorrection(math.radians(azimuth_deg), math.radians(elevation_deg), range_m)
+        return beams
+
+
+def is_rotation(matrix: FloatArray) -> bool:
+    """Are the rows of (3, 3) perpendicular, of length 1 and right-handed?"""
+    error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    return error < ROTATION_TOLERANCE and float(np.linalg.det(matrix)) > 0.0
+
+
+def _is_correlation(matrix: FloatArray) -> bool:
+    symmetric = np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-9) and np.allclose(np.diag(matrix), 1.0, atol=1e-9)
+    return bool(symmetric) and float(np.linalg.eigvalsh(matrix).min(initial=1.0)) > -1e-6
+
+
+def _array(value: object, shape: tuple[int, ...] | None) -> FloatArray | None:
+    """Finite numbers of this shape (None: a list of any length), or None."""
+    try:
+        array = np.array(value)
+    except ValueError:
+        return None
+    if array.dtype.kind not in "if" or not np.isfinite(array).all():
+        return None
+    if array.ndim != 1 if shape is None else array.shape != shape:
+        return None
+    return array.astype(np.float64)

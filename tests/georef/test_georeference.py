@@ -1,0 +1,179 @@
+"""The whole way from returns to the map: the steps in their order, in blocks, and what becomes of every row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from georef import georeference
+from georef.atmosphere import Air
+from georef.beams import LineGeometry
+from georef.calibration import nominal
+from georef.georeference import Georeferencer
+from georef.mapping import Mapping
+from georef.points import Fate, Points
+from georef.records import Int64Array, StructArray
+from georef.sensor_model import SensorModel
+from georef.trajectory import Trajectory
+from georef.uncertainty import Noise, Uncertainty
+from tests.georef.scanner_cases import rows_of
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+MS = 1_000_000
+COUNT = 500
+
+
+def flight() -> Trajectory:
+    """Two seconds of a flight over the Alps with sigmas; the second half is missing a quarter of a second."""
+    seconds = np.concatenate([np.arange(0, 1.25, 0.01), np.arange(1.5, 2.0, 0.01)])
+    same = np.ones_like(seconds)
+    return Trajectory.from_geodetic(
+        np.rint(1e9 * seconds).astype(np.int64),
+        0.82 + 1e-5 * seconds,
+        0.15 + 2e-6 * seconds,
+        1500.0 + seconds,
+        np.outer(same, [60.0, 10.0, 0.0]),
+        0.02 * np.sin(seconds),
+        0.03 * same,
+        0.4 + 0.1 * seconds,
+        position_sigma_l=np.outer(same, [0.02, 0.02, 0.04]),
+        attitude_sigma_rad=np.outer(same, [5e-5, 5e-5, 1e-4]),
+    )
+
+
+def returns() -> tuple[StructArray, Int64Array]:
+    """All over the flight, a few beyond its ends, some too near."""
+    rng = np.random.default_rng(1)
+    rows = rows_of(rng.uniform(-0.5, 0.5, COUNT), rng.uniform(900.0, 1500.0, COUNT), intensity=np.arange(COUNT))
+    rows["range_m"][::50] = 3.0
+    rows["number_of_returns"], rows["mta_zone"], rows["channel"] = 3, 1, 2
+    return rows, np.sort(rng.integers(-10 * MS, 2000 * MS, COUNT))
+
+
+def model(air: Air | None = None, **errors: float) -> SensorModel:
+    """An oscillating mirror."""
+    calibration = nominal("left", [0.1, 0.2, 0.3], np.eye(3)).changed(omega_rad=0.01, **errors)
+    return SensorModel(calibration, LineGeometry(), (10.0, 5000.0), air=air)
+
+
+def same_points(a: Points, b: Points) -> None:
+    """Bit by bit."""
+    for name in Points.__slots__:
+        one, other = getattr(a, name), getattr(b, name)
+        assert (one is None) == (other is None)
+        assert one is None or np.array_equal(one, other), name
+
+
+def test_every_row_has_its_fate_and_every_good_one_its_point() -> None:
+    rows, time_ns = returns()
+    points, fates = Georeferencer(model(time_offset_s=1e-3)).georeference(rows, time_ns, flight())
+    good = fates == Fate.GEOREFERENCED
+    assert set(fates.tolist()) == {
+        Fate.GEOREFERENCED,
+        Fate.NO_TIME,
+        Fate.OUTSIDE_TRAJECTORY,
+        Fate.TRAJECTORY_GAP,
+        Fate.BELOW_RANGE_GATE,
+    }
+    assert len(points) == good.sum() > 300
+    assert np.array_equal(points.time_ns, time_ns[good] + MS)
+    for name in ("intensity", "return_number", "number_of_returns", "mta_zone", "channel"):
+        assert np.array_equal(getattr(points, name), rows[name][good]), name
+    assert np.array_equal(points.range_m, rows["range_m"][good].astype(np.float32))
+    assert np.array_equal(points.scan_angle_rad, rows["encoder_rad"][good].astype(np.float32))
+    rays = model(time_offset_s=1e-3).rays(rows, time_ns, flight())
+    assert np.array_equal(points.points_map, rays.points_e[good])
+    assert points.sigma_map is None
+
+
+def test_onto_the_map() -> None:
+    rows, time_ns = returns()
+    in_e, _ = Georeferencer(model()).georeference(rows, time_ns, flight())
+    mapped, _ = Georeferencer(model(), Mapping("EPSG:32632", datum=None, epoch=None)).georeference(
+        rows, time_ns, flight()
+    )
+    to_map = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
+    to_geodetic = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    x, y, z = in_e.points_map.T
+    east, north, _ = to_map.transform(x, y, z)
+    _, _, height = to_geodetic.transform(x, y, z)
+    assert np.abs(mapped.points_map - np.stack([east, north, height], axis=1)).max() < 1e-4
+
+
+def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, time_ns = returns()
+    calibration = replace(model().calibration, sigmas=np.full(16, 1e-4))
+    mapping, air = Mapping("EPSG:32632", datum=None, epoch=None), Air("vacuum", refraction="ardc")
+    maker = Georeferencer(model(air), mapping, Uncertainty(calibration, Noise()))
+    whole, fates = maker.georeference(rows, time_ns, flight())
+    monkeypatch.setattr(georeference, "BLOCK_ROWS", 37)
+    cut, cut_fates = maker.georeference(rows, time_ns, flight())
+    assert np.array_equal(fates, cut_fates)
+    same_points(whole, cut)
+    assert whole.sigma_map is not None
+    assert (whole.sigma_map > 0.02).all()
+
+
+def test_air_slows_what_was_measured_and_not_the_offset() -> None:
+    rows, time_ns = rows_of(0.0, [1000.0]), np.array([500 * MS])
+    air = Air("vacuum")
+    straight = model(range_offset_m=50.0, range_scale=1e-3)
+    rays = straight.rays(rows, time_ns, flight())
+    points, _ = Georeferencer(model(air, range_offset_m=50.0, range_scale=1e-3)).georeference(rows, time_ns, flight())
+    shorter = np.linalg.norm(points.points_map - rays.points_e, axis=1)[0]
+    kelvin = 288.15 - 0.0065 * 950.0  # half way down, in the standard atmosphere (ISO 2533)
+    hpa = 1013.25 * (kelvin / 288.15) ** 5.25588
+    ppm = 273.15 / 1013.25 * 291.985 * hpa / kelvin  # FORMULAS 3.2 at 1064 nm
+    assert shorter == pytest.approx(1001.0 * 1e-6 * ppm, rel=2e-3)
+    with_less_offset = model(air, range_offset_m=0.0, range_scale=1e-3)
+    less, _ = Georeferencer(with_less_offset).georeference(rows, time_ns, flight())
+    between = np.linalg.norm(points.points_map - less.points_map, axis=1)[0]
+    assert between == pytest.approx(50.0, abs=3e-3)  # the path is 50 m lower and its air denser by 1.4 ppm
+    assert abs(between - 50.0 * (1 - 1e-6 * ppm)) > 5e-3
+
+
+def test_sigmas_in_e_where_there_is_no_map() -> None:
+    rows, time_ns = returns()
+    uncertainty = Uncertainty(model().calibration, Noise())
+    points, fates = Georeferencer(model(), uncertainty=uncertainty).georeference(rows, time_ns, flight())
+    good = fates == Fate.GEOREFERENCED
+    rays = model().rays(rows[good], time_ns[good], flight(), with_axes=True)
+    covariance = uncertainty.covariance_e(rays, flight())
+    assert points.sigma_map is not None
+    assert points.sigma_map**2 == pytest.approx(covariance[:, [0, 3, 5]], rel=1e-6)
+
+
+class Steady:
+    """An encoder that turns evenly."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
+        self.asked += 1
+        return np.full(len(rows), 40.0), np.zeros(len(rows))
+
+
+def test_motion_of_the_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, time_ns = returns()
+    monkeypatch.setattr(georeference, "BLOCK_ROWS", 100)
+    late, motion = model(encoder_latency_s=1e-6), Steady()
+    points, _ = Georeferencer(late, encoder_motion=motion).georeference(rows, time_ns, flight())
+    ahead, _ = Georeferencer(model(scan_angle_offset_rad=-4e-5)).georeference(rows, time_ns, flight())
+    assert np.abs(points.points_map - ahead.points_map).max() < 1e-8
+    assert motion.asked == 1
+    Georeferencer(model(), encoder_motion=motion).georeference(rows, time_ns, flight())
+    assert motion.asked == 1  # nobody needs it
+
+
+def test_no_rows_no_points() -> None:
+    rows, time_ns = returns()
+    for mapping in (None, Mapping("EPSG:32632", datum=None, epoch=None)):
+        points, fates = Georeferencer(model(), mapping).georeference(rows[:0], time_ns[:0], flight())
+        assert len(points) == len(fates) == 0
