@@ -31,7 +31,7 @@ class FlightTable(Section):
         default=dt.datetime(2026, 6, 15, 9, 0, 0, tzinfo=dt.UTC), description="when recording begins, with its offset"
     )
     origin_deg: Point = Field(default_factory=lambda: [47.5, 8.9], description="latitude, longitude of the site")
-    crs: str = Field("EPSG:25832", min_length=1, description="of the products, for the configuration that is written")
+    crs: str = Field("EPSG:32632", min_length=1, description="of the products, for the configuration that is written")
     speed_mps: float = Field(60.0, ge=10.0, le=150.0, description="over the ground, where a line says none")
     bank_max_deg: float = Field(25.0, ge=5.0, le=60.0, description="in turns")
     turn_radius_m: float | None = Field(None, gt=0.0, description="of turns; absent: what the bank allows")

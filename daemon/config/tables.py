@@ -246,6 +246,12 @@ class ScannerConfig(Section):
     lever_arm_m: Vector = Field(default_factory=_zero_vector, description="x_s^b, when no calibration file gives it")
     range_min_m: float = Field(0.0, ge=0.0, le=100_000.0, description="nearer returns are left out of products")
     range_max_m: float = Field(10_000.0, gt=0.0, le=100_000.0, description="farther returns are left out of products")
+    range_sigma_m: float = Field(0.02, ge=0.0, le=100.0, description="of one range, one sigma")
+    angle_sigma_deg: float = Field(0.001, ge=0.0, le=10.0, description="of the beam along the scan, one sigma")
+    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="of the beam, full")
+    wavelength_nm: float | None = Field(
+        None, ge=300.0, le=2000.0, description="of the light; absent: the maker's, 1064 where that is not known"
+    )
     geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
     gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
 
@@ -293,6 +299,9 @@ class MtaConfig(Section):
     """``[mta]``: pulses in air."""
 
     terrain: str = Field("", description="coarse DEM, relative to this file; empty: continuity")
+    height_above_ground_m: float | None = Field(
+        None, gt=0.0, le=12_000.0, description="usual flying height, for the first zone where there is no DEM"
+    )
 
 
 class ProfileConfig(Section):
@@ -307,6 +316,19 @@ class OutputConfig(Section):
 
     crs: str | None = Field(None, min_length=1, description="any PROJ CRS; two-dimensional: ellipsoidal heights")
     epoch: float | None = Field(None, ge=1900.0, le=2200.0, description="coordinate epoch (year), for dynamic datums")
+    datum_accuracy_m: float = Field(
+        0.05, gt=0.0, le=10.0, description="a change of datum that is less accurate than this is refused"
+    )
+
+
+class LiveConfig(Section):
+    """``[live]``: what `swath live` writes beside the log."""
+
+    live_quota_mb: float = Field(
+        4096.0, ge=1.0, le=10_000_000.0, description="of the disk for live.mcap, the one before it included"
+    )
+    points_per_s: int = Field(100_000, ge=1, le=100_000, description="in live.mcap, for the eye; grids take all")
+    cell_m: float = Field(1.0, ge=0.05, le=1000.0, description="of the density grid; doubled where the area wants it")
 
 
 class Tables(Section):
@@ -322,3 +344,4 @@ class Tables(Section):
     mta: MtaConfig = Field(default_factory=MtaConfig)
     profile: ProfileConfig = Field(default_factory=ProfileConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
+    live: LiveConfig = Field(default_factory=LiveConfig)

@@ -11,6 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from daemon.log.scan import (
     OP_HEADER,
     OP_METADATA,
     OP_SCHEMA,
+    ChannelFilter,
     Damage,
     Record,
     parse_record,
@@ -86,9 +88,12 @@ class Session:
         there = {part.number for part in self.parts}
         return list(islice((number for number in range(max(there) + 1) if number not in there), MAX_MISSING))
 
-    def batches(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
-        """All messages in the order in which they stand in the files."""
-        for chunk in self._chunks(topics):
+    def batches(self, topics: TopicFilter | None = None, *, skim: bool = False) -> Iterator[LogBatch]:
+        """All messages in the order in which they stand in the files.
+
+        ``skim``: a chunk that holds nothing wanted, by its index, is not read; damage in it is not found then.
+        """
+        for chunk in self._chunks(topics, skim=skim):
             yield from chunk
 
     def batches_by_time(self, topics: TopicFilter | None = None) -> Iterator[LogBatch]:
@@ -132,11 +137,12 @@ class Session:
                 found[attachment.name] = attachment.data
         return found
 
-    def _chunks(self, topics: TopicFilter | None) -> Iterator[list[LogBatch]]:
+    def _chunks(self, topics: TopicFilter | None, *, skim: bool = False) -> Iterator[list[LogBatch]]:
         for part in self.parts:
             channels: dict[int, ChannelSpec] = {}
             schemas: dict[int, records.Schema] = {}
-            for record in self._records(part):
+            wanted = partial(_is_wanted, channels, topics) if skim and topics is not None else None
+            for record in self._records(part, wanted=wanted):
                 if record.opcode == OP_CHUNK:
                     lost: Counter[str] = Counter()
                     try:
@@ -151,11 +157,11 @@ class Session:
                     except LogError as error:
                         self._note(part, Damage(record.offset, record.length, str(error)))
 
-    def _records(self, part: Part, *, chunks: bool = True) -> Iterator[Record]:
+    def _records(self, part: Part, *, chunks: bool = True, wanted: ChannelFilter | None = None) -> Iterator[Record]:
         growing = is_being_written(part.path)
         with part.path.open("rb") as file:
             size = part.path.stat().st_size
-            for found in scan(file, size, chunks=chunks):
+            for found in scan(file, size, chunks=chunks, wanted=wanted):
                 if isinstance(found, Record):
                     yield found
                 elif growing and found.offset + found.length == size:
@@ -171,6 +177,11 @@ class Session:
             entry = PartDamage(part.path, Damage(damage.offset, 0, "there is more damage, which is not listed"))
         self._noted.add(entry)
         self.damage.append(entry)
+
+
+def _is_wanted(channels: dict[int, ChannelSpec], topics: TopicFilter, channel: int) -> bool:
+    """Whether a channel's messages are; those of one that is not known yet may be."""
+    return channel not in channels or topics(channels[channel].topic)
 
 
 def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None) -> list[Session]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, TypeVar
 
@@ -46,6 +46,7 @@ _CONTENT: dict[int, type[records.McapRecord]] = {
     OP_METADATA: records.Metadata,
 }
 RecordT = TypeVar("RecordT", bound=records.McapRecord)
+ChannelFilter = Callable[[int], bool]  # by a channel's id
 _RESYNC_STEP = 1 << 20
 
 
@@ -82,19 +83,23 @@ class Damage:
     messages: int | None = None
 
 
-def scan(file: BinaryIO, size: int, *, chunks: bool = True) -> Iterator[Record | Damage]:
+def scan(
+    file: BinaryIO, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
+) -> Iterator[Record | Damage]:
     """All records of the data section, in order, and every damage; ends at the data's end or the cut.
 
     Args:
         file: seekable.
         size: read no further.
         chunks: False passes over chunks without reading them.
+        wanted: asked of every channel that the index behind a chunk names; where none is, the chunk is given with an
+            empty body, unread.
 
     Raises:
         LogError: it is no MCAP file.
     """
     held: Damage | None = None
-    for found in _scan(file, size, chunks=chunks):
+    for found in _scan(file, size, chunks=chunks, wanted=wanted):
         if isinstance(found, Damage):
             if held is not None and (held.offset + held.length, held.what) == (found.offset, found.what):
                 found = _joined(held, found)
@@ -110,13 +115,13 @@ def scan(file: BinaryIO, size: int, *, chunks: bool = True) -> Iterator[Record |
         yield held
 
 
-def _scan(file: BinaryIO, size: int, *, chunks: bool) -> Iterator[Record | Damage]:
+def _scan(file: BinaryIO, size: int, *, chunks: bool, wanted: ChannelFilter | None) -> Iterator[Record | Damage]:
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         raise LogError("is no MCAP file")
     offset = len(MAGIC)
     while offset < size:
-        found = _read_record(file, offset, size, chunks=chunks)
+        found = _read_record(file, offset, size, chunks=chunks, wanted=wanted)
         if isinstance(found, Damage) and not found.length:
             resumed = next_chunk(file, offset + 1, size)
             if resumed is None:
@@ -189,7 +194,9 @@ def _is_cut(file: BinaryIO, offset: int, size: int) -> bool:
     return opcode in OPCODES and length <= MAX_RECORD_BYTES and beyond
 
 
-def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True) -> Record | Damage:
+def _read_record(
+    file: BinaryIO, offset: int, size: int, *, chunks: bool = True, wanted: ChannelFilter | None = None
+) -> Record | Damage:
     """The record at an offset; `Damage` of length 0 where none can begin there."""
     file.seek(offset)
     head = file.read(_HEAD.size)
@@ -212,6 +219,10 @@ def _read_record(file: BinaryIO, offset: int, size: int, *, chunks: bool = True)
         return nothing
     if not chunks and _may_begin(file, offset + total, size):
         return Record(opcode, offset, total, b"")
+    if wanted is not None:
+        indexed = [channel for channel, _ in _indexed(file, offset + total, size)]
+        if indexed and not any(wanted(channel) for channel in indexed):
+            return Record(opcode, offset, total, b"")
     file.seek(offset + _HEAD.size)
     try:
         _refuse_large_chunk(_CHUNK_HEAD.unpack_from(start)[2], length)
@@ -336,19 +347,22 @@ def _attachment_is_whole(body: bytes) -> bool:
 
 def _indexed_messages(file: BinaryIO, offset: int, size: int) -> int | None:
     """Messages that the index records right behind a chunk speak of."""
-    total: int | None = None
+    counts = [entries // 16 for _, entries in _indexed(file, offset, size)]
+    return sum(counts) if counts else None
+
+
+def _indexed(file: BinaryIO, offset: int, size: int) -> Iterator[tuple[int, int]]:
+    """Channel, and bytes of entries, of the index records right behind a chunk."""
     while offset + _HEAD.size <= size:
         file.seek(offset)
         opcode, length = _HEAD.unpack(file.read(_HEAD.size))
         if opcode != OP_MESSAGE_INDEX or not 6 <= length <= MAX_RECORD_BYTES:
-            break
-        file.seek(2, 1)
-        entries = int.from_bytes(file.read(4), "little")
+            return
+        channel, entries = struct.unpack("<HI", file.read(6).ljust(6, b"\0"))
         if entries != length - 6:
-            break
-        total = (total or 0) + entries // 16
+            return
+        yield channel, entries
         offset += _HEAD.size + length
-    return total
 
 
 def next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:

@@ -19,7 +19,7 @@ from sim.site import Site, geodetic_from_e
 from tests.sim.scenes import plan_of
 
 FloatArray = NDArray[np.float64]
-CRS = "EPSG:25832"
+CRS = "EPSG:32632"
 CENTER = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(8.9, 47.5)
 SQUARE = 200.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -112,15 +112,15 @@ def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
 
 
 def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> None:
-    write(tmp_path, crs="EPSG:32632")
-    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:32632; want flight.crs, EPSG:25832"
+    write(tmp_path, crs="EPSG:25832")
+    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:25832; want flight.crs, EPSG:32632"
     write(tmp_path, crs=None)
-    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} has no CRS; want flight.crs, EPSG:25832"
+    assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} has no CRS; want flight.crs, EPSG:32632"
 
 
 def test_a_compound_crs_is_asked_for_its_horizontal_part(tmp_path: Path) -> None:
     write(tmp_path)
-    plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:25832+7837"}})
+    plan = plan_of("raster = 'dem.tif'", tmp_path).changed({"flight": {"crs": "EPSG:32632+7837"}})
     scene = build_scene(plan, Site.at(47.5, 8.9), SQUARE)
     assert scene.ground_m(np.zeros(1), np.zeros(1))[0] == pytest.approx(500.0, abs=0.01)
 

@@ -1,0 +1,291 @@
+"""From a log's messages to a stream of points: parsers are fed in the order of the file, the stream decides at ticks.
+
+A tick is where the newest log time so far passes a multiple of 100 ms, or where 32 MiB have come since the last one.
+Both depend on the order of the messages alone, so it is the same for a log that is read whole, one that is followed
+while it is written, and one that comes message by message.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from daemon.log.chunks import LogBatch, json_objects
+from daemon.log.reader import Session
+from daemon.processing.setup import Setup
+from daemon.replay import source_of_topic
+from drivers.core.parser import Parser
+from georef.points import Points
+from georef.records import (
+    IMU_DTYPE,
+    INS_DTYPE,
+    ChunkBatch,
+    DeviceClockSamples,
+    ImuSamples,
+    InsSolution,
+    PpsEdge,
+    Record,
+    ScannerReturns,
+    StructArray,
+    TimeMessage,
+)
+from georef.stream import CONTEXT_FLAG, Stream
+from georef.stream_clocks import FrozenClocks, HostClocks
+
+TICK_NS = 100_000_000
+TICK_BYTES = 32 << 20
+MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
+Placed = list[tuple[str, Points]]
+
+
+class LogFeed:
+    """Feeds one session's log into a stream.
+
+    Args:
+        setup: makes the sources' parsers.
+        stream: made by `Setup.stream`; its clocks are the session's.
+
+    Attributes:
+        counts: by source, of records taken and of what was left out.
+    """
+
+    def __init__(self, setup: Setup, stream: Stream) -> None:
+        self.stream = stream
+        self.counts: dict[str, Counter[str]] = {}
+        self._setup = setup
+        self._parsers = setup.parsers(("gnss", "scanner")) | setup.ins_parser()
+        self._newest_ns: int | None = None
+        self._bytes = 0
+        self._context = False
+        self._takers: dict[str, Callable[[LogBatch], None] | None] = {}
+
+    def take(self, batch: LogBatch, *, context: bool = False) -> Placed:
+        """The next messages; the points that have become final.
+
+        Args:
+            batch: in the order of the file.
+            context: they stand around the piece of the log that is wanted: they feed clocks, trajectory and parsers,
+                and their returns give no points.
+        """
+        self._context = context
+        placed: Placed = []
+        for first, last, tick_ns in self._pieces(batch):
+            if first < last:
+                self._feed(batch.between(first, last))
+            if tick_ns is not None:
+                placed += self.stream.advance(tick_ns)
+        return placed
+
+    def close(self) -> Placed:
+        """The log is over."""
+        for source, parser in self._parsers.items():
+            self._take_records(source, parser.close())
+        return self.stream.close()
+
+    def parser(self, source: str) -> Parser:
+        """The parser of a source (``scanner/left``), for its counters."""
+        return self._parsers[source]
+
+    def _pieces(self, batch: LogBatch) -> Iterator[tuple[int, int, int | None]]:
+        """Runs of messages, and the tick that comes after each; the last run has none unless it fills the bytes."""
+        times, size = batch.log_time_ns, batch.rows.shape[1]
+        if self._newest_ns is None:
+            self._newest_ns = int(times[0])
+        newest = np.maximum.accumulate(np.maximum(times, self._newest_ns))
+        before = np.concatenate([[self._newest_ns], newest[:-1]])
+        crossing = np.flatnonzero(newest // TICK_NS > before // TICK_NS).tolist()
+        first = 0
+        for place in [*crossing, len(times)]:
+            while (place - first) * size + self._bytes >= TICK_BYTES:
+                full = first + max(1, -(-(TICK_BYTES - self._bytes) // size))
+                self._bytes = 0
+                yield first, full, int(newest[full - 1]) // TICK_NS * TICK_NS
+                first = full
+            if place < len(times):
+                self._bytes = 0
+                yield first, place, int(newest[place]) // TICK_NS * TICK_NS
+                first = place
+        self._bytes += (len(times) - first) * size
+        self._newest_ns = int(newest[-1])
+        yield first, len(times), None
+
+    def _feed(self, batch: LogBatch) -> None:
+        topic = batch.channel.topic
+        if topic not in self._takers:
+            self._takers[topic] = self._taker(topic)
+        taker = self._takers[topic]
+        if taker is not None:
+            taker(batch)
+
+    def _taker(self, topic: str) -> Callable[[LogBatch], None] | None:
+        """What takes the messages of a topic; None: nobody wants them."""
+        if topic == "/clock":
+            return self._take_readings
+        source = source_of_topic(topic)
+        if source is None:
+            return None
+        if source.startswith("pps/"):
+            edge = self._setup.edge_of(source)
+            return None if edge is None else lambda batch: self._take_edges(source, edge, batch)
+        inside = [name for name in self._setup.inside(source.removesuffix("/aux")) if name in self._parsers]
+        if not inside:
+            return None
+
+        def parse(batch: LogBatch) -> None:
+            units = ChunkBatch(source, batch.log_time_ns, batch.units)
+            for name in inside:
+                self._take_records(name, self._parsers[name].feed_batch(units))
+
+        return parse
+
+    def _take_readings(self, batch: LogBatch) -> None:
+        for reading in readings_of(batch):
+            self.stream.clocks.add_reading(*reading)
+
+    def _take_edges(self, source: str, edge: str, batch: LogBatch) -> None:
+        counts = self.counts.setdefault(source, Counter())
+        for found in edges_of(batch, edge):
+            if found is None:
+                counts["refused"] += 1
+                continue
+            counts["edges"] += 1
+            self.stream.clocks.add_edge(source, found)
+
+    def _take_records(self, source: str, records: list[Record]) -> None:
+        if not records:
+            return
+        counts = self.counts.setdefault(source, Counter())
+        clocks = self.stream.clocks
+        for record in records:
+            rows = getattr(record, "rows", None)
+            counts[type(record).__name__] += 1 if rows is None else len(rows)
+            if isinstance(record, ScannerReturns):
+                self._take_returns(source, record.rows)
+            elif isinstance(record, TimeMessage) and source in clocks.host.plan.gnss:
+                clocks.add_message(source, record)
+            elif isinstance(record, DeviceClockSamples) and source in clocks.host.plan.devices:
+                clocks.add_samples(source, record.rows)
+            elif isinstance(record, InsSolution) and source == self._setup.ins_source:
+                self.stream.path.add(self._setup.ins_rows(record.rows))
+
+    def _take_returns(self, source: str, rows: StructArray) -> None:
+        name = source.removeprefix("scanner/")
+        if self._context:
+            rows = rows.copy()
+            rows["flags"] |= CONTEXT_FLAG
+        self.stream.add_returns(name, rows)
+
+
+def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int]]:
+    """realtime_ns, monotonic_ns and monotonic_raw_ns of ``/clock``; what is none is left out."""
+    for _, value in json_objects(batch):
+        reading = (value.get("realtime_ns"), value.get("monotonic_ns"), value.get("monotonic_raw_ns"))
+        if all(_is_time(one) for one in reading):
+            yield reading  # type: ignore[misc]
+
+
+def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
+    """Edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
+    for _, value in json_objects(batch):
+        time_ns, sequence = value.get("edge_time_ns"), value.get("sequence", 0)
+        fits = _is_time(time_ns) and _is_time(sequence) and value.get("edge", edge) == edge
+        yield PpsEdge(time_ns, sequence) if fits else None  # type: ignore[arg-type]
+
+
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS
+
+
+# ---------------------------------------------------------------------- all of a log's clocks, before its returns
+
+
+@dataclass(slots=True)
+class LogClocks:
+    """What all of a log says of time and motion, but for its scanners; pickles.
+
+    Attributes:
+        clocks: the host's clock by source, complete.
+        ins_rows: solutions of the device's INS, `INS_DTYPE`, attitude of b.
+        imu_gps_ns: (n,) GPS time of the samples' arrival; imu_rate_b: (n, 3) rad/s, axes of b. To check that a
+            trajectory's motion is this flight's.
+        counts: records by source.
+    """
+
+    clocks: FrozenClocks
+    ins_rows: StructArray
+    imu_gps_ns: np.ndarray[Any, np.dtype[np.int64]]
+    imu_rate_b: np.ndarray[Any, np.dtype[np.float64]]
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+
+
+class _ClockReader:
+    """Collects what all but the scanners say."""
+
+    def __init__(self, setup: Setup, session: Session) -> None:
+        self.host = HostClocks(setup.clock_plan(session.info), keep_history=True)
+        self.ins: list[StructArray] = []
+        self.imu: list[StructArray] = []
+        self.counts: dict[str, Counter[str]] = {}
+        self._setup = setup
+        self._parsers = setup.parsers(("gnss", "imu"))
+
+    def take(self, batch: LogBatch) -> None:
+        """The next messages."""
+        topic = batch.channel.topic
+        source = source_of_topic(topic)
+        if topic == "/clock":
+            for reading in readings_of(batch):
+                self.host.add_reading(*reading)
+        elif source is not None and source.startswith("pps/"):
+            edge = self._setup.edge_of(source)
+            for found in edges_of(batch, edge) if edge is not None else ():
+                if found is not None:
+                    self.host.add_edge(source, found)
+        elif source is not None:
+            units = ChunkBatch(source, batch.log_time_ns, batch.units)
+            for name in self._setup.inside(source):
+                if name in self._parsers:
+                    self.take_records(name, self._parsers[name].feed_batch(units))
+
+    def close(self) -> None:
+        """Tails of the streams, and all times at once."""
+        for name, parser in self._parsers.items():
+            self.take_records(name, parser.close())
+        self.host.update()
+
+    def take_records(self, source: str, records: list[Record]) -> None:
+        """Of a parser."""
+        counts = self.counts.setdefault(source, Counter())
+        for record in records:
+            rows = getattr(record, "rows", None)
+            counts[type(record).__name__] += 1 if rows is None else len(rows)
+            if isinstance(record, TimeMessage) and source in self.host.plan.gnss:
+                self.host.add_message(source, record)
+            elif isinstance(record, InsSolution) and source == self._setup.ins_source:
+                self.ins.append(self._setup.ins_rows(record.rows))
+            elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
+                self.imu.append(record.rows)
+
+
+def read_clocks(session: Session, setup: Setup) -> LogClocks:
+    """Read all but the scanners' messages of a session, a first pass before its returns are georeferenced.
+
+    What belongs to scanners is passed over chunk by chunk: a chunk holds one class of channels.
+    """
+    reader = _ClockReader(setup, session)
+    for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
+        reader.take(batch)
+    reader.close()
+    ins = np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE)
+    imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
+    gps_ns, rate_b = np.empty(0, np.int64), np.empty((0, 3))
+    clock = setup.clock_of_imu
+    if len(imu) and clock is not None:
+        gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
+        known = np.isfinite(sigma_ns)
+        gps_ns, rate_b = gps_ns[known], setup.imu_rates_b(imu["angular_rate_b"][known])
+    return LogClocks(FrozenClocks(reader.host), ins, gps_ns, rate_b, reader.counts)

@@ -1,0 +1,241 @@
+"""The clocks of a stream of records: the host's, those of its pulses per second, and one of each device.
+
+A clock's answer depends on what it was fed before the question. So records are only collected as they come, and taken
+by `StreamClocks.update` at the stream's ticks, in one order: readings of the host's clocks, then edges and time
+messages by host time, then what the devices said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.compiled import kept
+from georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
+from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline, PpsClock
+
+CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
+MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
+MAX_RATE_OFF = 1e-3  # of device time against GPS time
+
+
+@kept
+def _place(
+    device_ns: Int64Array, first_cell: int, gps_ns: Int64Array, rate: NDArray[np.float64], out: Int64Array
+) -> None:
+    for i in range(len(device_ns)):
+        cell = (device_ns[i] >> CELL_BITS) - first_cell
+        into = device_ns[i] - ((cell + first_cell) << CELL_BITS)
+        out[i] = gps_ns[cell] + round(into * rate[cell])
+
+
+@kept
+def _bounds(values: Int64Array) -> tuple[int, int]:
+    least = most = values[0]
+    for value in values:
+        least, most = min(least, value), max(most, value)
+    return least, most
+
+
+@dataclass(frozen=True, slots=True)
+class PpsPlan:
+    """A source of edges: leap seconds until a receiver says, and the delay that is subtracted from its stamps."""
+
+    leap_seconds: int | None = None
+    delay_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GnssPlan:
+    """A receiver that names seconds: of which pulse (``pps/main``; None: of none), and an override of which edge."""
+
+    pps: str | None = None
+    names_edge: NamesEdge | None = None
+    leap_seconds: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DevicePlan:
+    """A device with a clock of its own: the source that shows the host's time (``pps/main``), how its stamps count."""
+
+    clock: str
+    past_utc_hour: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPlan:
+    """Which clocks there are, by source (``pps/main``, ``gnss/rover``, ``scanner/left``).
+
+    Attributes:
+        host_minus_monotonic_ns: realtime_ns − monotonic_ns of the session.
+    """
+
+    host_minus_monotonic_ns: int
+    pps: Mapping[str, PpsPlan] = field(default_factory=dict)
+    gnss: Mapping[str, GnssPlan] = field(default_factory=dict)
+    devices: Mapping[str, DevicePlan] = field(default_factory=dict)
+
+
+class HostClocks:
+    """The host's clock in GPS time: one `PpsClock` a pulse per second, and one a receiver that is wired to none."""
+
+    def __init__(self, plan: ClockPlan, *, keep_history: bool = False) -> None:
+        self.plan = plan
+        self.timeline = HostTimeline(plan.host_minus_monotonic_ns, keep_history=keep_history)
+        self.by_source: dict[str, PpsClock] = {}
+        for source, pps in plan.pps.items():
+            self.by_source[source] = PpsClock(
+                assumed_leap_seconds=pps.leap_seconds, delay_ns=pps.delay_ns, keep_history=keep_history
+            )
+        for source, gnss in plan.gnss.items():
+            shared = None if gnss.pps is None else self.by_source[gnss.pps]
+            self.by_source[source] = shared or PpsClock(
+                assumed_leap_seconds=gnss.leap_seconds, keep_history=keep_history
+            )
+        self._readings: list[tuple[int, int, int]] = []
+        self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
+
+    def add_reading(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
+        """The host's clocks side by side."""
+        self._readings.append((realtime_ns, monotonic_ns, monotonic_raw_ns))
+
+    def add_edge(self, source: str, edge: PpsEdge) -> None:
+        """An edge of ``pps/name``."""
+        self._spoken.append((edge.host_time_ns, False, source, edge))
+
+    def add_message(self, source: str, message: TimeMessage) -> None:
+        """A time message of ``gnss/name``."""
+        self._spoken.append((message.host_time_ns, True, source, message))
+
+    def update(self) -> None:
+        """Take what has come since the last call."""
+        for reading in self._readings:
+            self.timeline.add(*reading)
+        self._spoken.sort(key=lambda said: said[:2])
+        for host_ns, _, source, said in self._spoken:
+            raw_ns = self.timeline.raw_at(host_ns)
+            if isinstance(said, PpsEdge):
+                self.by_source[source].add_edge(raw_ns, said.sequence)
+                continue
+            names = self.plan.gnss[source].names_edge or said.names_edge
+            self.by_source[source].add_message(source, replace(said, host_time_ns=raw_ns, names_edge=names))
+        self._readings.clear()
+        self._spoken.clear()
+
+    def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
+        """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""
+        return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
+
+    def status(self, source: str, host_ns: int) -> ClockStatus:
+        """Of the clock that a source shows, at a host time."""
+        return self.by_source[source].status(self.timeline.raw_at(host_ns))
+
+    def drain_events(self) -> list[tuple[str, ClockEvent]]:
+        """What the clocks had to say since the last call, with the source that shows each."""
+        return [(source, event) for source, clock in self.by_source.items() for event in clock.drain_events()]
+
+
+class StreamClocks:
+    """The host's clocks and the devices' own; with ``frozen`` the host's are complete and take nothing more."""
+
+    def __init__(self, host: HostClocks, *, frozen: bool = False) -> None:
+        self.host = host
+        self.frozen = frozen
+        self._devices = {
+            source: DeviceClock(host.by_source[device.clock], past_utc_hour=device.past_utc_hour, keep_history=frozen)
+            for source, device in host.plan.devices.items()
+        }
+        self._samples: dict[str, list[StructArray]] = {source: [] for source in self._devices}
+
+    @classmethod
+    def growing(cls, plan: ClockPlan) -> StreamClocks:
+        """Clocks that know what has been fed so far, and of that the last quarter of an hour."""
+        return cls(HostClocks(plan))
+
+    def add_reading(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
+        """See `HostClocks.add_reading`."""
+        if not self.frozen:
+            self.host.add_reading(realtime_ns, monotonic_ns, monotonic_raw_ns)
+
+    def add_edge(self, source: str, edge: PpsEdge) -> None:
+        """See `HostClocks.add_edge`."""
+        if not self.frozen:
+            self.host.add_edge(source, edge)
+
+    def add_message(self, source: str, message: TimeMessage) -> None:
+        """See `HostClocks.add_message`."""
+        if not self.frozen:
+            self.host.add_message(source, message)
+
+    def add_samples(self, source: str, rows: StructArray) -> None:
+        """What a device's clock said: `DEVICE_CLOCK_DTYPE` rows in order of arrival."""
+        self._samples[source].append(rows)
+
+    def update(self) -> None:
+        """Take what has come since the last call."""
+        if not self.frozen:
+            self.host.update()
+        for source, pieces in self._samples.items():
+            if pieces:
+                rows = np.concatenate(pieces)
+                self._devices[source].add(rows, self.host.timeline.raw_from_host(rows["host_time_ns"]))
+                pieces.clear()
+
+    def place(self, source: str, rows: StructArray, max_sigma_ns: float) -> tuple[NDArray[np.bool_], Int64Array]:
+        """Which rows (n,) have a time that is good enough, and GPS ns (n,), by device time and host time."""
+        if source not in self._devices or not len(rows):
+            return np.zeros(len(rows), np.bool_), np.zeros(len(rows), np.int64)
+        quick = self._by_cells(source, rows, max_sigma_ns)
+        if quick is not None:
+            return np.ones(len(rows), np.bool_), quick
+        gps_ns, sigma_ns = self.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])
+        return sigma_ns <= max_sigma_ns, gps_ns
+
+    def gps_from_device(
+        self, source: str, device_ns: Int64Array, host_ns: Int64Array
+    ) -> tuple[Int64Array, NDArray[np.float64]]:
+        """GPS ns (n,) and sigma ns (n,; inf: not known) of device times (n,) that came at host times (n,)."""
+        return self._devices[source].gps_from_device(device_ns, self.host.timeline.raw_from_host(host_ns))
+
+    def _by_cells(self, source: str, rows: StructArray, max_sigma_ns: float) -> Int64Array | None:
+        """GPS ns (n,) between the edges of cells of device time; None where rows must be asked one by one.
+
+        The edges are asked as if they had come first, and as if last: where the answers differ, or are not all good,
+        something happened between.
+        """
+        device_ns, host_ns = rows["device_time_ns"], rows["host_time_ns"]
+        first, last = (value >> CELL_BITS for value in _bounds(device_ns))
+        if last - first >= MAX_CELLS:
+            return None
+        edges = np.arange(first, last + 2, dtype=np.int64) << CELL_BITS
+        at_ns = np.repeat(np.array(_bounds(host_ns), dtype=np.int64), len(edges))
+        asked_ns, sigma_ns = self.gps_from_device(source, np.tile(edges, 2), at_ns)
+        gps_ns, again_ns = np.split(asked_ns, 2)
+        rate = np.diff(gps_ns) / float(1 << CELL_BITS)
+        if (sigma_ns > max_sigma_ns).any() or (gps_ns != again_ns).any() or (np.abs(rate - 1.0) > MAX_RATE_OFF).any():
+            return None
+        placed = np.empty(len(rows), np.int64)
+        _place(device_ns, first, gps_ns, rate, placed)
+        return placed
+
+    def refused(self, source: str) -> dict[str, int]:
+        """What a device's clock refused, by reason."""
+        return self._devices[source].status().refused
+
+
+@dataclass(frozen=True)
+class FrozenClocks:
+    """The host's clocks after all of a log has been fed to them; each stream gets its own devices' clocks beside.
+
+    Pickles. A device's clock lies in the same packets as its returns, so it is not complete before those are read; a
+    stream that reads a piece of a log is given the packets around the piece too.
+    """
+
+    host: HostClocks
+
+    def for_stream(self) -> StreamClocks:
+        """Clocks for one stream over any piece of the log."""
+        return StreamClocks(self.host, frozen=True)

@@ -1,0 +1,195 @@
+"""From a configuration to models, clocks and parsers; and every mistake in one line."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from daemon.config import Config
+from daemon.errors import ConfigError, UserError
+from daemon.log.format import SessionInfo
+from daemon.processing.setup import Options, Setup
+from georef.beams import LineGeometry, SpinningGeometry
+from georef.records import INS_DTYPE, NamesEdge
+from georef.stream_clocks import DevicePlan, GnssPlan, PpsPlan
+from tests.daemon.standin import AIRCRAFT, aircraft_config
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+INFO = SessionInfo("one", "swath", "host", "boot", 5_000, 2_000)
+VLP = """
+[scanner.top]
+transport = "udp:0.0.0.0:2370"
+protocol = "velodyne-vlp16"
+installation = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+lever_arm_m = [1, 2, 3]
+
+[attitude]
+"""
+
+
+def config(folder: Path, **changes: str) -> Config:
+    return aircraft_config(folder, {"[attitude]\n": VLP, **changes})
+
+
+def inside_the_receiver() -> dict[str, str]:
+    """Its INS, with axes of its own, instead of the IMU on CAN."""
+    text = AIRCRAFT.read_text()
+    imu = text[text.index("[imu.main]") : text.index("[imu.main.noise]")]
+    rows = "[[0, 1, 0], [-1, 0, 0], [0, 0, 1]]"
+    return {imu: f'[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\nrotation_b_imu = {rows}\n\n'}
+
+
+def setup_of(config: Config, **options: Any) -> Setup:
+    words: dict[str, Any] = {"datum": "same", "uncertainty": False, **options}
+    return Setup.of_config(config, Options(**words))
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Setup:
+    return setup_of(config(tmp_path))
+
+
+def test_each_scanner_has_its_geometry_calibration_and_gate(setup: Setup) -> None:
+    assert setup.scanners == ["left", "top"]
+    left, top = (setup.georeferencer(name).model for name in setup.scanners)
+    assert isinstance(left.geometry, LineGeometry)
+    assert isinstance(top.geometry, SpinningGeometry)
+    assert top.geometry.elevation_deg[:3] == pytest.approx([-15, 1, -13])
+    assert left.range_gate == (20.0, 3000.0)
+    assert setup.calibrations["left"].id != "nominal"
+    assert setup.calibrations["top"].id == "nominal"
+    assert setup.calibrations["top"].lever_arm_b == pytest.approx([1, 2, 3])
+    assert setup.calibrations["top"].installation_matrix[0] == pytest.approx([0, 0, 1])
+
+
+def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
+    plan = setup.clock_plan(INFO)
+    assert plan.host_minus_monotonic_ns == 3_000
+    assert plan.pps == {"pps/main": PpsPlan(18, 0)}
+    assert plan.gnss == {"gnss/rover": GnssPlan("pps/main", None, 18)}
+    # a head without a pulse of its own is on the host's clock; Velodyne's stamps count from the hour
+    assert plan.devices == {"scanner/left": DevicePlan("pps/main"), "scanner/top": DevicePlan("pps/main", True)}
+
+
+def test_an_edge_named_by_hand_and_a_delay_reach_the_clocks(tmp_path: Path) -> None:
+    changed = config(tmp_path, **{'names_edge = "auto"': 'names_edge = "next"', "delay_ns = 0": "delay_ns = 70"})
+    plan = setup_of(changed).clock_plan(INFO)
+    assert plan.gnss["gnss/rover"].names_edge is NamesEdge.NEXT
+    assert plan.pps["pps/main"].delay_ns == 70
+
+
+def test_sources_and_what_stands_inside_them(tmp_path: Path, setup: Setup) -> None:
+    assert setup.ins_source == "gnss/rover"
+    assert setup.ins_protocol == "novatel"
+    assert setup.inside("gnss/rover") == ["gnss/rover"]
+    assert setup.edge_of("pps/main") == "assert"
+    assert setup.edge_of("pps/other") is None
+    text = AIRCRAFT.read_text()
+    imu = text[text.index("[imu.main]") : text.index("[imu.main.noise]")]
+    within = (
+        '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\nrotation_b_imu = [[0,1,0],[-1,0,0],[0,0,1]]\n\n'
+    )
+    span = setup_of(config(tmp_path / "span", **{imu: within}))
+    assert span.ins_source == "imu/main"
+    assert span.inside("gnss/rover") == ["gnss/rover", "imu/main"]
+    assert list(span.ins_parser()) == ["imu/main"]
+
+
+def test_the_attitude_of_an_ins_is_that_of_the_body(tmp_path: Path) -> None:
+    setup = setup_of(config(tmp_path, **inside_the_receiver()))
+    row = np.zeros(1, INS_DTYPE)
+    row["roll_rad"], row["pitch_rad"], row["heading_rad"] = 0.1, -0.2, 1.0
+    turned = setup.ins_rows(row)[0]
+    told = Rotation.from_euler("ZYX", [1.0, -0.2, 0.1])
+    got = Rotation.from_euler("ZYX", [turned["heading_rad"], turned["pitch_rad"], turned["roll_rad"]])
+    rot_b_from_imu = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert (got.inv() * told * rot_b_from_imu.inv()).magnitude() < 1e-12
+    # the same turn of the aircraft, seen by gyroscopes along the IMU's axes
+    assert setup.imu_rates_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
+    assert row["roll_rad"][0] == 0.1
+
+
+def test_deflection_of_the_vertical_is_in_radians(tmp_path: Path, setup: Setup) -> None:
+    assert setup.deflection_rad is None
+    plumb = 'vertical = "plumb"\nxi_arcsec = 10.0\neta_arcsec = -5.0'
+    turned = setup_of(config(tmp_path / "plumb", **{'vertical = "ellipsoid"': plumb}))
+    assert turned.deflection_rad == pytest.approx((math.radians(10 / 3600), math.radians(-5 / 3600)))
+
+
+def test_a_setup_pickles(setup: Setup) -> None:
+    again = pickle.loads(pickle.dumps(setup))
+    assert again.mapping is not None
+    assert setup.mapping is not None
+    assert again.mapping.wkt == setup.mapping.wkt
+    assert again.live_stream(INFO).scanners == ["left", "top"]
+
+
+def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
+    setup = setup_of(config(tmp_path), scanners=("top",))
+    assert setup.scanners == ["top"]
+    assert list(setup.parsers(("scanner",))) == ["scanner/top"]
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ('scanner = "right"', 'calibration.scanner: is of scanner "right", want "left"'),
+        ('scanner_serial = "77"', 'calibration.scanner_serial: of another head: "77", the configuration says "1234"'),
+        ('ranges = "vacuum"', 'was estimated with ranges = "vacuum", [atmosphere] says "corrected"'),
+        ('refraction = "ardc"', 'was estimated with refraction = "ardc", [atmosphere] says "none"'),
+        ("mirror_factor = 2.0", "was estimated with 2, the configuration says 1"),
+        ("installation_matrix = [[0,1,0],[-1,0,0],[0,0,1]]", "is not the configuration's installation"),
+        ('method = "guessed"', "guessed"),
+    ],
+)
+def test_a_calibration_that_is_none_of_this_flights_is_refused(tmp_path: Path, header: str, said: str) -> None:
+    key = header.split(" = ")[0]
+    lines = (AIRCRAFT.parent / "left.toml").read_text().splitlines()
+    lines = [line for line in lines if not line.startswith(f"{key} =")]
+    lines.insert(lines.index("[calibration]") + 1, header)
+    with pytest.raises(ConfigError) as caught:
+        setup_of(config(tmp_path), calibrations={"left": ("\n".join(lines), "mine.toml")})
+    assert len(caught.value.lines) == 1
+    assert caught.value.lines[0].startswith("mine.toml: ")
+    assert said in caught.value.lines[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "said"),
+    [
+        ({}, {"scanners": ("front",)}, "scanner front: is not in the configuration; there are: left, top"),
+        ({}, {"crs": "EPSG:99999"}, "EPSG:99999"),
+        (
+            {"angles_deg = [0, 0, 0]": 'source = "imu/main", angles_deg = [0, 0, 0]'},
+            {},
+            'scanner.left: gimbal.stages[0].source: "imu/main" tells no angles of a gimbal',
+        ),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(
+    tmp_path: Path, changes: dict[str, str], options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        setup_of(config(tmp_path, **changes), **options)
+    assert len(caught.value.lines) == 1
+    assert said in caught.value.lines[0]
+
+
+def test_a_log_without_configuration_is_told_what_to_do() -> None:
+    with pytest.raises(UserError, match="--config"):
+        Setup.of_log({})
+
+
+def test_a_log_that_lacks_the_calibration_its_configuration_names_says_so(tmp_path: Path) -> None:
+    files = {name: data for name, _, data in config(tmp_path).attachments()}
+    assert Setup.of_log(files, Options(datum="same")).calibrations["left"].id
+    del files["calibration/left.toml"]
+    with pytest.raises(ConfigError, match=r"left\.toml is not in the log"):
+        Setup.of_log(files, Options(datum="same"))

@@ -1,0 +1,69 @@
+"""A coarse terrain model from a GeoTIFF."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+from rasterio.transform import Affine
+
+from daemon.errors import ConfigError
+from daemon.processing.terrain import read_terrain
+from georef.earth import e_from_geodetic, rot_e_from_l
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+EAST_M, NORTH_M = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform(8.9, 47.5)
+LAT, LON = np.radians(47.5), np.radians(8.9)
+
+
+def write(path: Path, **others: Any) -> None:
+    """A plane that falls to the south by 0.05, pixels of 30 m, 3 km wide, 480 m high in the middle."""
+    transform = Affine(30.0, 0.0, EAST_M - 1500.0, 0.0, -30.0, NORTH_M + 1500.0)
+    north = NORTH_M + 1500.0 - 30.0 * (np.arange(100) + 0.5)
+    values = np.repeat(480.0 + 0.05 * (north - NORTH_M)[:, np.newaxis], 100, axis=1)
+    profile = {"crs": "EPSG:32632", "transform": transform} | others
+    with rasterio.open(path, "w", driver="GTiff", width=100, height=100, count=1, dtype="float64", **profile) as file:
+        file.write(values, 1)
+
+
+def test_heights_and_ranges_are_the_planes_own(tmp_path: Path) -> None:
+    write(tmp_path / "dem.tif")
+    terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
+    to_geodetic = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    lon, lat = np.radians(to_geodetic.transform([EAST_M, EAST_M + 700.0], [NORTH_M, NORTH_M + 400.0]))
+    np.testing.assert_allclose(terrain.height_at(lat, lon), [480.0, 500.0], atol=1e-6)
+    origin_e = e_from_geodetic(LAT, LON, 1480.0)[np.newaxis]
+    straight_down = rot_e_from_l(LAT, LON)[np.newaxis, :, 2]
+    np.testing.assert_allclose(terrain.predicted_m(origin_e, straight_down), 1000.0, atol=1.0)
+
+
+def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> None:
+    write(tmp_path / "dem.tif", nodata=480.0 + 0.05 * 15.0)
+    terrain = read_terrain(tmp_path / "dem.tif")
+    assert np.isnan(terrain.height_at(np.array([LAT, np.radians(48.5)]), np.array([LON, LON]))).all()
+
+
+@pytest.mark.parametrize(
+    ("others", "words"),
+    [
+        ({"crs": None}, "has no CRS; want a GeoTIFF that says its own"),
+        ({"transform": Affine(20.0, 10.0, 0.0, 10.0, -20.0, 0.0)}, "is turned against its axes"),
+    ],
+)
+def test_what_is_no_terrain_is_refused(tmp_path: Path, others: dict[str, Any], words: str) -> None:
+    write(tmp_path / "dem.tif", **others)
+    with pytest.raises(ConfigError, match=words):
+        read_terrain(tmp_path / "dem.tif")
+
+
+def test_what_is_no_raster_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "dem.tif").write_text("no raster")
+    with pytest.raises(ConfigError, match=r"^mta\.terrain: .*dem\.tif cannot be read: ") as refused:
+        read_terrain(tmp_path / "dem.tif")
+    assert "\n" not in str(refused.value)
