@@ -4,11 +4,14 @@
 #   PREFIX   where the program goes, /opt/swath by default; the unit's paths follow
 #   DESTDIR  a root to install into, for packagers: nothing is then started, created or loaded
 #   PYTHON   the system's Python 3.11 or newer; not one in a home directory, which the service cannot see
+#   EXTRAS   what goes with it beside recording, process,live by default (swath live, swath georef); empty: nothing
 set -eu
 
 DESTDIR=${DESTDIR-}
 PREFIX=${PREFIX:-/opt/swath}
 PYTHON=${PYTHON:-/usr/bin/python3}
+EXTRAS=${EXTRAS-process,live}
+cache=/var/cache/swath-live
 source=$(cd "$(dirname "$0")/.." && pwd)
 
 fail() { echo "swath: $*" >&2; exit 1; }
@@ -17,6 +20,7 @@ fail() { echo "swath: $*" >&2; exit 1; }
 placed() {
     cat <<LIST
 swathd.service /usr/lib/systemd/system/swathd.service
+swath-live.service /usr/lib/systemd/system/swath-live.service
 sysctl/90-swath.conf /usr/lib/sysctl.d/90-swath.conf
 network/80-swath-can.network /usr/lib/systemd/network/80-swath-can.network
 udev/90-swath.rules /usr/lib/udev/rules.d/90-swath.rules
@@ -56,7 +60,7 @@ install_program() {
     {
         "$PYTHON" -m venv "$DESTDIR$PREFIX" &&
             PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore \
-                "$DESTDIR$PREFIX/bin/python" -m pip install -q "$work/swath"
+                "$DESTDIR$PREFIX/bin/python" -m pip install -q "$work/swath${EXTRAS:+[$EXTRAS]}"
     } >"$work/log" 2>&1 </dev/null || { cat "$work/log" >&2; fail "the program could not be installed; pip's words are above"; }
     if [ -n "$DESTDIR" ]; then # its scripts must name the place where they will be
         grep -rlIF "$DESTDIR$PREFIX" "$DESTDIR$PREFIX/bin" "$DESTDIR$PREFIX/pyvenv.cfg" | while read -r file; do
@@ -93,13 +97,26 @@ activate() {
     echo "edit /etc/swath/swath.toml, then: swath check /etc/swath/swath.toml && systemctl enable --now swathd"
 }
 
+# What swath-live.service needs compiled, into the cache that it uses; without, it does this when it first starts.
+warm_up() {
+    [ -z "$DESTDIR" ] && [ -n "$EXTRAS" ] || return 0
+    echo "compiling, a minute or two the first time"
+    mkdir -p -m 0750 "$cache"
+    NUMBA_CACHE_DIR="$cache" "$PREFIX/bin/swath" warm-up ||
+        echo "swath warm-up failed, its words are above; nothing that records needs it"
+    ! id swath >/dev/null 2>&1 || chown -R swath:swath "$cache"
+}
+
 install_all() {
     check_python
     install_program
     install_files
     if on_this_computer; then
         activate /usr/lib/tmpfiles.d/swath.conf /usr/lib/sysctl.d/90-swath.conf
+        warm_up
+        echo "points while you record: systemctl enable --now swath-live"
     else
+        warm_up
         echo "installed; users, directories and kernel settings come with the next start of systemd"
     fi
 }
@@ -107,13 +124,14 @@ install_all() {
 uninstall_all() {
     [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make uninstall needs root: sudo make uninstall"
     if on_this_computer; then
-        systemctl disable --now swathd.service 2>/dev/null || true
+        systemctl disable --now swath-live.service swathd.service 2>/dev/null || true
     fi
     placed | while read -r _ to; do
         rm -f "$DESTDIR$to"
     done
     [ "$(readlink "$DESTDIR/usr/local/bin/swath" || true)" != "$PREFIX/bin/swath" ] || rm -f "$DESTDIR/usr/local/bin/swath"
     [ ! -e "$DESTDIR$PREFIX/pyvenv.cfg" ] || rm -rf "$DESTDIR$PREFIX"
+    rm -rf "$DESTDIR$cache"
     if on_this_computer; then
         systemctl daemon-reload
     fi

@@ -17,6 +17,7 @@ PLACED = {
     "etc/swath/swath.toml",
     "usr/lib/sysctl.d/90-swath.conf",
     "usr/lib/systemd/network/80-swath-can.network",
+    "usr/lib/systemd/system/swath-live.service",
     "usr/lib/systemd/system/swathd.service",
     "usr/lib/sysusers.d/swath.conf",
     "usr/lib/tmpfiles.d/swath.conf",
@@ -49,7 +50,7 @@ def files_below(folder: Path) -> set[str]:
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A root with the program installed into it, by any Python that a service could see."""
     root = tmp_path_factory.mktemp("root")
-    done = make("install", f"DESTDIR={root}", *python_for_services())
+    done = make("install", f"DESTDIR={root}", "EXTRAS=", *python_for_services())
     assert done.returncode == 0, done.stderr
     return root
 

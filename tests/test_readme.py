@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -136,6 +137,32 @@ def point_to_the_page(_: Path) -> None:
     assert {"import", "export"} <= set(getattr(get_command(app), "commands", {}))
 
 
+def run_points(folder: Path) -> None:
+    """A flight into a log, points of it, and the page that shows them."""
+    swath("sim", "fly", "small", "--seconds", "24", "-o", folder / "small")
+    said = swath("georef", folder / "small", "-o", folder / "points", "--crs", "EPSG:32632")
+    assert "complete: " in said
+    assert "points" in swath("view", folder / "points")
+    assert (folder / "points/view/index.html").stat().st_size > 100_000
+
+
+def runs_with_georef(_: Path) -> None:
+    """`run_points` flies, and looks at what it made."""
+    assert {"sim", "view"} <= set(getattr(get_command(app), "commands", {}))
+
+
+def extra_is_there(_: Path) -> None:
+    """pip would fetch it; that it brings all that a command wants is what the tests of processing run on."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    wanted = {"numba", "scipy", "pyproj", "laspy", "matplotlib"}
+    assert {re.split(r"[\[><=]", line)[0] for line in extras["process"]} == wanted
+
+
+def live_unit_is_there(_: Path) -> None:
+    """That the unit is right is proven in test_systemd.py, what it runs in test_live.py."""
+    assert "WantedBy=swathd.service" in (ROOT / "systemd/swath-live.service").read_text()
+
+
 def unit_is_there(_: Path) -> None:
     """systemctl would act on a service of this computer; that the unit is right is proven in test_systemd.py."""
     assert (ROOT / "systemd/swathd.service").read_text().count("[Install]\nWantedBy=multi-user.target") == 1
@@ -159,6 +186,11 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "swath offload /var/lib/swath /mnt/usb": run_offload,
     "swath info /var/lib/swath": run_info,
     "swath recover /var/lib/swath": run_recover,
+    "pip install 'swath[process]'": extra_is_there,
+    "swath georef /mnt/usb -o thurgau-north --crs EPSG:32632": run_points,
+    "swath view thurgau-north": runs_with_georef,
+    "swath sim fly small -o small": runs_with_georef,
+    "sudo systemctl enable --now swath-live": live_unit_is_there,
     "sudo systemctl enable --now swathd": unit_is_there,
     "systemctl status swathd": unit_is_there,
 }
@@ -187,7 +219,7 @@ def test_configuration_of_the_readme_is_a_whole_aircraft(tmp_path: Path) -> None
 def test_commands_named_in_the_pages_exist() -> None:
     known = set(getattr(get_command(app), "commands", {}))
     for page in sorted((ROOT / "docs").glob("*.md")):
-        for name in re.findall(r"(?:`|\$ )swath ([a-z]+)\b", page.read_text()):
+        for name in re.findall(r"(?:`|\$ )swath ([a-z-]+)\b", page.read_text()):
             assert name in known, f"{page.name}: there is no `swath {name}`"
 
 

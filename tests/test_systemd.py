@@ -12,6 +12,7 @@ import pytest
 
 SYSTEMD = Path(__file__).resolve().parent.parent / "systemd"
 UNIT = SYSTEMD / "swathd.service"
+LIVE = SYSTEMD / "swath-live.service"
 
 
 def run_tool(*command: str | Path) -> subprocess.CompletedProcess[str]:
@@ -21,21 +22,21 @@ def run_tool(*command: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=60, check=False)
 
 
-def unit_values(key: str) -> list[str]:
+def unit_values(key: str, unit: Path = UNIT) -> list[str]:
     """All values of a key of the unit, in order."""
-    return re.findall(rf"^{key}=(.*)$", UNIT.read_text(), flags=re.MULTILINE)
+    return re.findall(rf"^{key}=(.*)$", unit.read_text(), flags=re.MULTILINE)
 
 
 @pytest.fixture
 def unit_with_program(tmp_path: Path) -> Path:
-    """The unit with a program that exists, because the checker looks for it."""
+    """The unit with a program that exists, because the checker looks for it; the live one stands beside it."""
     program = tmp_path / "opt/swath/bin/swath"
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
-    unit = tmp_path / "swathd.service"
-    unit.write_text(UNIT.read_text().replace("/opt/swath", str(tmp_path / "opt/swath")))
-    return unit
+    for unit in (UNIT, LIVE):
+        (tmp_path / unit.name).write_text(unit.read_text().replace("/opt/swath", str(tmp_path / "opt/swath")))
+    return tmp_path / UNIT.name
 
 
 def test_unit_is_without_fault(unit_with_program: Path) -> None:
@@ -54,6 +55,60 @@ def test_exposure_is_at_most_two() -> None:
     assert level is not None, found.stderr
     assert float(level.group(1)) <= 2.0
     assert found.returncode == 0
+
+
+class TestLive:
+    """The live georeferencer's unit, beside the recorder's."""
+
+    def test_is_without_fault(self, unit_with_program: Path) -> None:
+        found = run_tool("systemd-analyze", "verify", "--man=no", unit_with_program.with_name(LIVE.name))
+        assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
+
+    def test_exposure_is_at_most_one(self) -> None:
+        found = run_tool("systemd-analyze", "security", "--offline=true", "--threshold=10", "--no-pager", LIVE)
+        assert "Overall exposure level for swath-live.service" in found.stdout, found.stderr
+        assert found.returncode == 0, found.stdout
+
+    def test_depends_on_the_recorder_and_never_the_other_way(self) -> None:
+        for key in ("BindsTo", "PartOf", "After"):
+            assert unit_values(key, LIVE) == ["swathd.service"], key
+        assert "swath-live" not in UNIT.read_text()
+        assert unit_values("WantedBy", LIVE) == ["swathd.service"]
+
+    def test_gives_way_in_everything(self) -> None:
+        assert unit_values("Nice", LIVE) == ["10"]
+        assert unit_values("IOSchedulingClass", LIVE) == ["idle"]
+        assert unit_values("CPUSchedulingPolicy", LIVE) == ["other"]
+        assert int(unit_values("OOMScoreAdjust", LIVE)[0]) > int(unit_values("OOMScoreAdjust")[0])
+
+    def test_may_write_beside_the_logs_and_into_its_own_cache_only(self) -> None:
+        assert unit_values("ProtectSystem", LIVE) == ["strict"]
+        assert unit_values("StateDirectory", LIVE) == ["swath/live"]
+        assert unit_values("ReadWritePaths", LIVE) == []
+        [cache] = unit_values("CacheDirectory", LIVE)
+        assert f"NUMBA_CACHE_DIR=/var/cache/{cache}" in unit_values("Environment", LIVE)
+        assert f"cache=/var/cache/{cache}" in (SYSTEMD / "install.sh").read_text().splitlines()
+
+    def test_compiles_before_it_starts_and_may(self) -> None:
+        [before] = unit_values("ExecStartPre", LIVE)
+        assert before == "-/opt/swath/bin/swath warm-up /etc/swath/swath.toml"
+        assert unit_values("MemoryDenyWriteExecute", LIVE) == ["no"]
+        assert unit_values("RestartPreventExitStatus", LIVE) == ["2"]
+
+    def test_hardened_like_the_recorder_but_for_what_it_does_not_need(self) -> None:
+        """Every restriction of the recorder's unit is one of this unit too, as strict or stricter."""
+        names = [
+            "CapabilityBoundingSet", "AmbientCapabilities", "NoNewPrivileges", "ProtectSystem", "ProtectHome",
+            "PrivateTmp", "PrivateMounts", "ProtectKernelTunables", "ProtectKernelModules", "ProtectKernelLogs",
+            "ProtectControlGroups", "ProtectHostname", "ProtectProc", "ProcSubset", "PrivateUsers",
+            "RestrictNamespaces", "RestrictSUIDSGID", "LockPersonality", "RemoveIPC", "KeyringMode", "DevicePolicy",
+            "SystemCallArchitectures", "SystemCallErrorNumber", "RestrictRealtime", "UMask", "User", "Group",
+        ]  # fmt: skip
+        for name in names:
+            assert unit_values(name, LIVE) == unit_values(name) != [], name
+        assert unit_values("DeviceAllow", LIVE) == []
+        assert unit_values("PrivateNetwork", LIVE) == ["yes"]
+        assert unit_values("SystemCallFilter", LIVE) == unit_values("SystemCallFilter")[:2]
 
 
 def test_no_capability_and_no_root() -> None:

@@ -1,7 +1,8 @@
 """The loop that writes rows, compiled by numba: what `ReturnSlots.fill` does column by column, in one go.
 
 numba comes with ``swath[process]``. The recorder does without: this module is imported where `DeviceSettings.compiled`
-asks for it, and nowhere else. To compile takes about a second for each kind of slots a process meets.
+asks for it, and nowhere else. To compile takes about a second for each kind of slots, once where numba may keep it on
+disk (beside this file, in the user's cache or in ``NUMBA_CACHE_DIR``), else in every process.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def fill(slots: ReturnSlots, table: StructArray) -> int:
         name: np.broadcast_to(made_of(lambda values: values), slots.shape) for name, made_of in slots.per_pulse.items()
     }
     intensity = content["intensity"]
-    return _write_rows(
+    return _written(
         table,
         table.view(np.uint64).reshape(-1, _WORDS),
         content["range"],
@@ -111,4 +112,37 @@ def _rows_written(
     return int(filled)
 
 
-_write_rows: Callable[..., int] = numba.njit(nogil=True)(_rows_written)
+_njit: Any = numba.njit
+_typeof: Any = numba.typeof
+_writers: dict[tuple[Any, ...], Callable[..., int]] = {}
+
+
+def _written(*arguments: Any) -> int:
+    """`_rows_written`, compiled once for each kind of slots, whatever the shapes and strides of its arrays."""
+    kind = tuple(getattr(argument, "dtype", type(argument)) for argument in arguments)
+    writer = _writers.get(kind)
+    if writer is None:
+        writer = _writers[kind] = _compiled(arguments)
+    return writer(*arguments)
+
+
+def _compiled(arguments: tuple[Any, ...]) -> Callable[..., int]:
+    """For arguments of these types, kept on disk where there is a place for it.
+
+    Left alone, numba would compile anew for each combination of contiguous, strided and aligned arrays, and a batch of
+    one packet is another than one of two.
+    """
+    table, words, *others = (_typeof(argument) for argument in arguments)
+    signature = numba.types.int64(table, words, *(_any_strides(kind) for kind in others))
+    compiled: Callable[..., int]
+    try:
+        compiled = _njit(signature, nogil=True, cache=True)(_rows_written)
+    except RuntimeError:  # no folder may be written to
+        compiled = _njit(signature, nogil=True)(_rows_written)
+    return compiled
+
+
+def _any_strides(kind: Any) -> Any:
+    if not isinstance(kind, numba.types.Array):
+        return kind
+    return numba.types.Array(kind.dtype, kind.ndim, "A", readonly=True, aligned=False)

@@ -1,0 +1,133 @@
+"""``swath georef``: from logs and a trajectory to points."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+
+if TYPE_CHECKING:
+    pass
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="A folder for the products.")],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="SBET, Waypoint text, RTKLIB .pos or CSV; without it the log's own INS."),
+    ] = None,
+    at: Annotated[
+        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+    ] = "body",
+    datum: Annotated[
+        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+    ] = None,
+    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
+    calibration: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[SCANNER=]FILE", help="Instead of the log's own; once a scanner."),
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help="Coordinate system, as EPSG:25832+7837; over output.crs.")] = None,
+    epoch: Annotated[float | None, typer.Option(help="Of the positions, as 2026.9; over output.epoch.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
+    strips: Annotated[str, typer.Option(help="auto: by turns and laser; whole: by laser; or a CSV of times.")] = "auto",
+    min_strip: Annotated[float, typer.Option(metavar="SECONDS", help="Shorter is no strip.", min=0.0)] = 5.0,
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster (tcp://…) that shall do the work.")
+    ] = None,
+    no_sigma: Annotated[bool, typer.Option("--no-sigma", help="Leave the three sigmas out.")] = False,
+    copc: Annotated[bool, typer.Option("--copc", help="Cloud optimised files (.copc.laz).")] = False,
+    scale: Annotated[float, typer.Option(help="Of the coordinates in the files, in their unit.", min=1e-9)] = 0.001,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
+) -> None:
+    """Georeference logs: one LAZ file a strip, the trajectory, and a JSON file that says what they are made of.
+
+    Every return that was read is in a file or counted with the reason why not. Exit code 1 when the products are
+    partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
+    """
+    try:
+        from daemon.processing.flights import Wish
+        from daemon.processing.flown import TrajectoryWish
+        from daemon.processing.products import georeference
+        from daemon.processing.progress import progress_bar
+        from daemon.processing.setup import Options
+    except ModuleNotFoundError as error:
+        raise UserError(f"georeferencing wants the extra swath[process]: {error}", ExitCode.USAGE) from error
+    from georef.strips import StripRules
+
+    stored = None
+    if config is not None:
+        from daemon.config.loading import load_config
+
+        stored = load_config(config)
+    wish = Wish(
+        logs=logs,
+        output=output,
+        trajectory=TrajectoryWish(trajectory, week, at),
+        options=Options(
+            crs=crs, datum=datum, epoch=epoch, calibrations=_calibrations(calibration or []), uncertainty=not no_sigma
+        ),
+        config=stored,
+        strips=strips,
+        rules=StripRules(min_strip_s=min_strip),
+        workers=workers or os.cpu_count() or 1,
+        scheduler=scheduler,
+        sigmas=not no_sigma,
+        copc=copc,
+        scale=scale,
+        overwrite=overwrite,
+    )
+    with progress_bar() as tell:
+        report = georeference(wish, tell)
+    if as_json:
+        print(json.dumps(report.record, indent=2))
+    else:
+        _print(report.record, report.sidecar)
+    if not report.record["complete"]:
+        raise UserError(f"{report.sidecar}: partial: " + "; ".join(map(one_line, report.record["holes"][:5])))
+
+
+def _calibrations(given: list[str]) -> dict[str, tuple[str, str]]:
+    """Text and name of each file, by the scanner that is named, or else the one that the file names."""
+    found: dict[str, tuple[str, str]] = {}
+    for entry in given:
+        named, equals, rest = entry.partition("=")
+        file = Path(rest if equals else entry)
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"{file}: cannot be read: {error}", ExitCode.IO) from error
+        scanner = named if equals else _scanner_of(text, file)
+        if scanner in found:
+            raise UserError(f"{file}: is the second calibration of scanner {scanner}", ExitCode.USAGE)
+        found[scanner] = (text, str(file))
+    return found
+
+
+def _scanner_of(text: str, file: Path) -> str:
+    from georef.calibration import CalibrationError, read_calibration
+
+    try:
+        return read_calibration(text, str(file)).scanner
+    except CalibrationError as error:
+        raise UserError(str(error), ExitCode.USAGE) from error
+
+
+def _print(record: dict[str, Any], sidecar: Path) -> None:
+    for strip in record["strips"]:
+        seconds = ((strip["last_gps_ns"] or 0) - (strip["first_gps_ns"] or 0)) / 1e9
+        print(f"strip {strip['number']}: {strip['points']:,} points, {seconds:.1f} s, {strip['file'] or 'no file'}")
+    for scanner, counts in record["counts"].items():
+        reasons = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in counts["dropped"].items())
+        print(f"{one_line(scanner)}: {counts['read']:,} returns, {counts['written']:,} in files; {reasons or 'all'}")
+    for line in record["warnings"]:
+        print(f"warning: {one_line(line)}")
+    print(f"{'complete' if record['complete'] else 'partial'}: {one_line(str(sidecar))}")

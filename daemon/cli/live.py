@@ -1,0 +1,204 @@
+"""``swath live``: points while it is recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.places import DEFAULT_CONFIG, log_directory
+
+if TYPE_CHECKING:
+    from rich.console import Console, Group
+
+    from daemon.config import Config
+    from daemon.config.tables import LiveConfig
+
+JOURNAL_S = 60.0  # between two lines for the journal, which has the status beside
+
+
+def command(
+    where: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[CONFIG|DIR]",
+            help="Which recorder: its configuration or log directory. --replay: logs, and a configuration.",
+            readable=False,
+        ),
+    ] = None,
+    from_start: Annotated[
+        bool, typer.Option("--from-start", help="From the recording's beginning; reads what lies cold on the disk.")
+    ] = False,
+    replay: Annotated[bool, typer.Option("--replay", help="The same over finished logs, as fast as it goes.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="--replay: where its files go.")
+    ] = None,
+    points: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="All points as one array (.npy), for comparisons.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The status as JSON, one object a line.")] = False,
+) -> None:
+    """Georeference what is being recorded, and show it.
+
+    Follows the growing log until the recording ends. Writes live.mcap (opens in Foxglove), coverage.png, coverage.json
+    and live.json under live/ in the log directory. Positions are the device's own INS solution. The recorder does not
+    notice: not even when this is killed.
+    """
+    from daemon.processing.installed import require_installed
+
+    require_installed("swath live", "foxglove")
+    _check(where, output, replay=replay)
+    paths = where or [DEFAULT_CONFIG]
+    with _stop_signals() as stop:
+        if replay:
+            _replay(paths, output or Path(), points, as_json=as_json)
+            return
+        found = _follow(paths[0], points, lambda: bool(stop), from_start=from_start, as_json=as_json)
+    if "no end" in found["state"]:
+        raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _check(where: list[Path] | None, output: Path | None, *, replay: bool) -> None:
+    if replay and (not where or output is None):
+        raise UserError("say which logs, and where to: swath live --replay LOG… -o DIR [CONFIG]", ExitCode.USAGE)
+    if not replay and output is not None:
+        raise UserError("-o belongs to --replay; a recording's files go under live/ in its directory", ExitCode.USAGE)
+    if not replay and len(where or []) > 1:
+        raise UserError("one recorder at a time: give one CONFIG or DIR", ExitCode.USAGE)
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """Signals that came; the first one ends things in order."""
+    stop: list[int] = []
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+    for signum in before:
+        signal.signal(signum, lambda number, frame: stop.append(number))
+    try:
+        yield stop
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+
+
+# ---------------------------------------------------------------------------------------------- a recording
+
+
+def _follow(
+    where: Path, points: Path | None, stopped: Callable[[], bool], *, from_start: bool, as_json: bool
+) -> dict[str, Any]:
+    from rich.console import Console
+
+    from daemon.config import load_config
+    from daemon.config.tables import LiveConfig
+    from daemon.processing.live import Live, be_humble
+    from daemon.processing.setup import Options, Setup
+    from daemon.processing.warm_up import warm_setup, warm_up
+    from daemon.sd_notify import ServiceManager
+
+    directory = log_directory(where)
+    config = None if where.is_dir() else load_config(where)
+    be_humble()
+    manager = ServiceManager()
+    manager.notify(STATUS="compiling")
+    warmed = warm_up([] if config is None else [Setup.of_config(config, Options(uncertainty=False))])
+    with _teller(Console(), manager, as_json=as_json) as tell:
+        if warmed.cache is None or warmed.compiled:
+            _log(warmed.text())
+        manager.notify(READY="1", STATUS="waiting for a recording to begin")
+        live = LiveConfig() if config is None else config.tables.live
+        return Live(directory, live, tell, from_start=from_start, points=points, prepare=warm_setup).run(stopped)
+
+
+def _log(text: str) -> None:
+    logging.getLogger("swath").info(one_line(text))
+
+
+@contextlib.contextmanager
+def _teller(console: Console, manager: Any, *, as_json: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """What tells people a status: a page on a terminal, else a line a second, for a service now and then."""
+    from rich.live import Live as Screen
+
+    said_s = -JOURNAL_S
+
+    def tell_line(found: dict[str, Any]) -> None:
+        nonlocal said_s
+        manager.notify(STATUS=found["sentence"], WATCHDOG="1")
+        ends = found["state"].startswith("ended")
+        if manager.watchdog_s is None or ends or time.monotonic() - said_s >= JOURNAL_S:
+            said_s = time.monotonic()
+            print(json.dumps(found) if as_json else found["sentence"], flush=True)
+
+    if as_json or not console.is_terminal:
+        yield tell_line
+        return
+    last: dict[str, Any] = {"sentence": ""}
+    with Screen(console=console, auto_refresh=False, screen=True) as screen:
+
+        def tell_page(found: dict[str, Any]) -> None:
+            last.update(found)
+            screen.update(page(found), refresh=True)
+
+        yield tell_page
+    print(last["sentence"])
+
+
+def page(found: dict[str, Any]) -> Group:
+    """What stands on the terminal."""
+    from rich.console import Group, RenderableType
+    from rich.table import Table
+    from rich.text import Text
+
+    good = found.get("trouble") == "" and not found.get("live_skipped_s")
+    parts: list[RenderableType] = [Text(found["sentence"], style="bold green" if good else "bold yellow"), Text("")]
+    if "points" not in found:
+        return Group(*parts)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("scanner", "points", "a second", "waiting", "behind the pulse: p50", "p95", "max"):
+        table.add_column(column, justify="left" if column == "scanner" else "right")
+    for name, count in found["points"].items():
+        latency = (found["latency_s"].get(f"scanner/{name}") or {}).get("pulse") or {}
+        seconds = [f"{latency[key]:.2f} s" if latency else "" for key in ("p50", "p95", "max")]
+        rate, waiting = found["points_per_s"][name], found["waiting"][name]
+        table.add_row(one_line(name), f"{count:,}", f"{rate:,}", f"{waiting:,}", *seconds)
+    parts.append(table)
+    for name, fates in found["fates"].items():
+        told = ", ".join(f"{count:,} {fate.replace('_', ' ')}" for fate, count in fates.items())
+        parts.append(Text(one_line(f"{name}: {told}"), style="dim"))
+    clocks = ", ".join(f"{source} {one['state']}" for source, one in found["time"].items())
+    parts.append(Text(f"\n{one_line(clocks)}; {found['free_bytes'] / 1e9:,.1f} GB free"))
+    return Group(*parts)
+
+
+# ---------------------------------------------------------------------------------------------- finished logs
+
+
+def _replay(paths: list[Path], output: Path, points: Path | None, *, as_json: bool) -> None:
+    from daemon.config import load_config
+    from daemon.log.format import LogError
+    from daemon.log.reader import open_logs
+    from daemon.processing.live import replay
+    from daemon.processing.setup import Options, Setup
+
+    configs = [path for path in paths if path.suffix == ".toml"]
+    try:
+        sessions = open_logs([path for path in paths if path not in configs])
+    except LogError as error:
+        raise UserError(one_line(str(error)), ExitCode.IO) from error
+    if len(sessions) != 1 or len(configs) > 1:
+        names = ", ".join(session.session_id for session in sessions)
+        raise UserError(f"one session and one configuration at a time; these are {names}", ExitCode.USAGE)
+    config: Config | None = load_config(configs[0]) if configs else None
+    options = Options(uncertainty=False)
+    setup = Setup.of_log(sessions[0].attachments(), options) if config is None else Setup.of_config(config, options)
+    live: LiveConfig = setup.config.tables.live
+    found = replay(sessions[0], setup, output, live, points)
+    print(json.dumps(found, indent=2) if as_json else found["sentence"])

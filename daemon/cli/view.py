@@ -1,0 +1,97 @@
+"""``swath view``: a quick look at products."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+
+NEEDS = ("numba", "laspy", "lazrs", "pyproj", "scipy", "matplotlib")
+
+
+def command(
+    paths: Annotated[list[Path], typer.Argument(help="LAS, LAZ or COPC files, or folders of them.", metavar="PATH…")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Where to; else the folder `view` beside the files."),
+    ] = None,
+    cell: Annotated[
+        float | None, typer.Option(metavar="M", help="Side of a cell; else from the density of points.")
+    ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(metavar="X1,Y1,X2,Y2", help="The profile's ends; else across an overlap, or along a strip."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Make maps of height, intensity, density, sigma and strip differences, a profile, and a page with all of it.
+
+    Exit code 4 when a file could be read in part only.
+    """
+    missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
+    if missing:
+        text = f"swath view needs {', '.join(missing)}, not installed here: pip install 'swath[process]'"
+        raise UserError(text, ExitCode.USAGE)
+    if cell is not None and not (math.isfinite(cell) and cell > 0.0):
+        raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
+    ends = _ends(profile)
+    damaged = _make(paths, output, cell, ends, as_json=as_json)
+    if damaged:
+        raise typer.Exit(int(ExitCode.DAMAGE))
+
+
+def _ends(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        ends = [float(part) for part in text.split(",")]
+    except ValueError:
+        ends = []
+    if len(ends) != 4 or not all(math.isfinite(end) for end in ends):
+        raise UserError(f"--profile: got {one_line(text)}, want x1,y1,x2,y2 in the files' coordinates", ExitCode.USAGE)
+    return ends
+
+
+def _make(
+    paths: list[Path], output: Path | None, cell: float | None, ends: list[float] | None, *, as_json: bool
+) -> bool:
+    """Read, draw, write, tell; gives whether a file could be read in part only."""
+    from rich.console import Console
+
+    from daemon.processing.quicklook import look_at, numbers_of
+    from daemon.processing.quicklook_page import make_page
+    from daemon.processing.quicklook_read import QuickLookError
+
+    console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
+    first = paths[0]
+    folder = output or (first if first.is_dir() else first.parent) / "view"
+    title = (first.resolve() if len(paths) == 1 else first.resolve().parent).name
+    with console.status("reading") as status:
+        try:
+            look = look_at(
+                paths, cell, ends, lambda done, of: status.update(f"reading {100 * done / max(of, 1):.0f} %")
+            )
+        except QuickLookError as error:
+            raise UserError(one_line(str(error)), ExitCode.IO) from error
+        status.update("drawing")
+        try:
+            page = make_page(look, folder, title)
+        except OSError as error:
+            text = f"{folder}: cannot be written to ({error.strerror or error})"
+            raise UserError(one_line(text), ExitCode.IO) from error
+    damaged = False
+    for source in look.sources:
+        if source.damage:
+            console.print(one_line(f"swath: {source.path}: {source.damage}; the page is of that part"))
+            damaged = True
+    if as_json:
+        print(json.dumps(numbers_of(look) | {"page": str(page)}, indent=2))
+    else:
+        print(f"{len(look.strips)} strip{'s' * (len(look.strips) != 1)}, {look.surface.points:,} points: {page}")
+    return damaged

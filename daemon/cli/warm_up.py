@@ -1,0 +1,29 @@
+"""``swath warm-up``: compile before there is anything to compute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    config: Annotated[
+        Path | None, typer.Argument(metavar="[CONFIG]", help="Also what this configuration needs.", readable=False)
+    ] = None,
+) -> None:
+    """Compile what swath live and swath georef run, and keep it for later processes; says where.
+
+    It is kept in NUMBA_CACHE_DIR, else beside the program or in the user's cache. Once is enough, for as long as the
+    program and the computer stay the same.
+    """
+    from daemon.processing.installed import require_installed
+
+    require_installed("swath warm-up")
+    from daemon.config import load_config
+    from daemon.processing.setup import Options, Setup
+    from daemon.processing.warm_up import warm_up
+
+    setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
+    print(warm_up(setups).text(), flush=True)

@@ -1,0 +1,227 @@
+"""The first pass over logs: all but the returns is read; of these it is noted where they stand; strips are cut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daemon.errors import ExitCode, UserError
+from daemon.log.reader import Session, open_logs
+from daemon.processing import refusals
+from daemon.processing.feed import LogClocks, read_clocks
+from daemon.processing.flown import TrajectoryWish, choose_trajectory
+from daemon.processing.log_index import Listening, LogIndex, index_log
+from daemon.processing.setup import Options, Setup
+from georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
+from georef.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daemon.config.config import Config
+    from georef.timescales import ClockStatus
+
+    Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+EIGHT_BIT = ("velodyne", "hesai")
+INTENSITY_FACTOR = 257.0  # theirs, 0 … 255, fill the field of 16 bits
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the command line asks for.
+
+    Attributes:
+        logs, output: where from, where to.
+        trajectory: see `TrajectoryWish`.
+        options: over the logs' configuration.
+        config: instead of the logs' own; None: theirs.
+        strips: ``auto``, ``whole``, or a CSV file's name.
+        rules: what a strip is.
+        workers, scheduler: where the work is done.
+        sigmas: three sigmas with each point.
+        copc: COPC files.
+        scale: of the coordinates, in the coordinate system's units.
+        overwrite: products of an earlier run are replaced.
+    """
+
+    logs: Sequence[Path]
+    output: Path
+    trajectory: TrajectoryWish = field(default_factory=TrajectoryWish)
+    options: Options = field(default_factory=Options)
+    config: Config | None = None
+    strips: str = "auto"
+    rules: StripRules = field(default_factory=StripRules)
+    workers: int = 1
+    scheduler: str | None = None
+    sigmas: bool = True
+    copc: bool = False
+    scale: float = 0.001
+    overwrite: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """For the sidecar: what it was, but for what does not matter to the points."""
+        return {
+            "trajectory": None if self.trajectory.file is None else str(self.trajectory.file),
+            "trajectory_at": self.trajectory.at,
+            "week": self.trajectory.week,
+            "crs": self.options.crs,
+            "datum": self.options.datum,
+            "epoch": self.options.epoch,
+            "calibrations": {name: file for name, (_, file) in self.options.calibrations.items()},
+            "strips": self.strips,
+            "sigmas": self.sigmas,
+            "copc": self.copc,
+            "scale": self.scale,
+            "intensity_factors": dict.fromkeys(EIGHT_BIT, INTENSITY_FACTOR),
+        }
+
+
+@dataclass
+class Flight:
+    """A session on its way.
+
+    Attributes:
+        span: GPS time of its first and last return; host_span likewise in log time.
+        trajectory: the body's.
+        strips: spans of log time, and the number of the first.
+        lost: units that the recorder lost, by source.
+        troubles: with the time of returns, a line each.
+    """
+
+    session: Session
+    setup: Setup
+    clocks: LogClocks
+    index: LogIndex
+    span: tuple[int, int]
+    host_span: tuple[int, int]
+    trajectory: Trajectory | None = None
+    strips: list[Span] = field(default_factory=list)
+    first_number: int = 1
+    lost: dict[str, int] = field(default_factory=dict)
+    troubles: list[str] = field(default_factory=list)
+
+    @property
+    def log(self) -> Path:
+        """The session's first part, which stands for it in messages."""
+        return self.session.parts[0].path
+
+    @property
+    def clock(self) -> str | None:
+        """The source that shows the host's time."""
+        devices = self.clocks.clocks.host.plan.devices
+        return next((plan.clock for plan in devices.values()), None)
+
+    def status(self, host_ns: int) -> ClockStatus | None:
+        """Of that clock."""
+        return None if self.clock is None else self.clocks.clocks.host.status(self.clock, host_ns)
+
+    def gps_from_host(self, host_ns: Any) -> Any:
+        """GPS ns (n,) of log times."""
+        assert self.clock is not None
+        gps_ns, _ = self.clocks.clocks.host.gps_from_host(self.clock, np.asarray(host_ns, np.int64))
+        return gps_ns
+
+    def host_from_gps(self, gps_ns: Sequence[int]) -> list[int]:
+        """Log times of GPS times, to the nanosecond or so: the clocks differ by parts in a million."""
+        wanted = np.asarray(gps_ns, np.int64)
+        host_ns = wanted - self.span[0] + self.host_span[0]
+        for _ in range(3):
+            host_ns = host_ns + wanted - self.gps_from_host(host_ns)
+        found: list[int] = host_ns.tolist()
+        return found
+
+
+def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
+    """The flights of a wish, with trajectories and strips.
+
+    Raises:
+        UserError: they cannot be georeferenced, or not together.
+        LogError, OSError: a log cannot be read.
+        StripError, MappingError: in one line.
+    """
+    sessions = open_logs(wish.logs)
+    setups = [_setup(wish, session) for session in sessions]
+    logs = [session.parts[0].path for session in sessions]
+    configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
+    refusals.refuse_different_settings(configs, wish.options.crs)
+    flights: list[Flight] = []
+    for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
+        tell("clocks and trajectory", number, len(sessions))
+        flights.append(_read(session, setup))
+    refusals.refuse_overlap({flight.log: flight.span for flight in flights})
+    for flight in flights:
+        _choose(wish, flight)
+    _number_strips(wish, flights)
+    return flights
+
+
+def _setup(wish: Wish, session: Session) -> Setup:
+    setup = (
+        Setup.of_log(session.attachments(), wish.options)
+        if wish.config is None
+        else Setup.of_config(wish.config, wish.options)
+    )
+    if setup.mapping is None:
+        raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
+    return setup
+
+
+def _read(session: Session, setup: Setup) -> Flight:
+    log = session.parts[0].path
+    listening = Listening(session)
+    clocks = read_clocks(listening, setup)
+    session.growing = listening.growing
+    index = index_log(session)
+    first, last = index.spans()
+    if not len(first):
+        raise UserError(f"{log}: no scanner's data in the log")
+    flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
+    flight.lost = listening.lost()
+    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]))
+    begin, end = flight.gps_from_host(flight.host_span).tolist()
+    flight.span = (begin, end)
+    return flight
+
+
+def _choose(wish: Wish, flight: Flight) -> None:
+    """The flight's trajectory; the mapping's operation for where it was."""
+    flight.trajectory = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, flight.log)
+    assert flight.setup.mapping is not None
+    within = flight.trajectory.between(*flight.span)
+    flight.setup.mapping.settle(within.position_e[:: max(1, len(within) // 100)])
+
+
+def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
+    """Each flight's strips in log time, numbered through."""
+    number = 1
+    for flight in flights:
+        flight.strips, flight.first_number = _strips(wish, flight), number
+        number += len(flight.strips)
+    if number == 1:
+        raise UserError(
+            f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
+            "want --strips whole, or --strips FILE with their times"
+        )
+
+
+def _strips(wish: Wish, flight: Flight) -> list[Span]:
+    laser = laser_spans(*flight.index.spans(), wish.rules)
+    if wish.strips == "whole":
+        return laser
+    trajectory = flight.trajectory
+    assert trajectory is not None
+    if wish.strips == "auto":
+        roll, _, heading = trajectory.attitude()
+        spans = straight_spans(trajectory.time_ns, heading, roll, wish.rules)
+    else:
+        spans = read_strips(Path(wish.strips).read_text(encoding="utf-8-sig"), wish.strips)
+    host = flight.host_from_gps([time_ns for span in spans for time_ns in span])
+    given = list(zip(host[::2], host[1::2], strict=True))
+    if wish.strips == "auto":
+        return cut(given, laser, wish.rules)
+    return [(start, end) for start, end in given if start < flight.host_span[1] and end > flight.host_span[0]]

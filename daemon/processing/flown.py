@@ -1,0 +1,127 @@
+"""Which trajectory a session is georeferenced with: a file's, or the device's own INS solution in the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.errors import ExitCode, UserError
+from daemon.processing.refusals import refuse_no_overlap, refuse_other_motion
+from georef.formats.trajectory_file import read_trajectory
+from georef.trajectory import Trajectory, TrajectoryError
+from georef.trajectory_buffer import TrajectoryBuffer
+
+if TYPE_CHECKING:
+    from daemon.config.config import Config
+    from daemon.processing.feed import LogClocks
+    from daemon.processing.setup import Setup
+
+Vector = tuple[float, float, float]
+FROM_LOG = "INS solution in the log"
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryWish:
+    """What the command line says of the trajectory.
+
+    Attributes:
+        file: None: the device's own.
+        week: GPS week of a file that says none; None: the one that fits the log.
+        at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
+    """
+
+    file: Path | None = None
+    week: int | None = None
+    at: str = "body"
+
+
+def choose_trajectory(
+    wish: TrajectoryWish, setup: Setup, clocks: LogClocks, span: tuple[int, int], log: Path
+) -> Trajectory:
+    """The body's trajectory of a session, whose returns lie in a span of GPS time.
+
+    Raises:
+        UserError: there is none, it cannot be read, or it is of another time.
+    """
+    try:
+        if wish.file is None:
+            trajectory = _from_log(setup, clocks, log)
+        else:
+            trajectory = _from_file(wish, wish.file, span)
+            refuse_other_motion(clocks, trajectory, str(wish.file), log)
+        refuse_no_overlap(trajectory, str(wish.file or FROM_LOG), span, log)
+        trajectory.require_attitude()
+        offset = offset_of(wish.at, setup.config)
+        if offset is not None:
+            trajectory = trajectory.at_body(offset)
+    except TrajectoryError as error:
+        raise UserError(str(error)) from error
+    return trajectory
+
+
+def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int]) -> Trajectory:
+    smrmsg = _smrmsg_beside(file)
+    return read_trajectory(
+        file.read_bytes(),
+        str(file),
+        span_ns=span,
+        week=wish.week,
+        smrmsg=None if smrmsg is None else smrmsg.read_bytes(),
+    )
+
+
+def _smrmsg_beside(file: Path) -> Path | None:
+    """The sigmas that came with an SBET: sbet_X.out and smrmsg_X.out, or X.sbet and X.smrmsg."""
+    names = [file.with_suffix(".smrmsg")] if file.suffix == ".sbet" else []
+    if file.name.startswith("sbet"):
+        names.append(file.with_name("smrmsg" + file.name.removeprefix("sbet")))
+    return next((name for name in names if name.exists()), None)
+
+
+def _from_log(setup: Setup, clocks: LogClocks, log: Path) -> Trajectory:
+    source = setup.ins_source
+    if source is None or not len(clocks.ins_rows):
+        raise UserError(f"{log}: no INS solution in the log; want --trajectory FILE", ExitCode.USAGE)
+    kind, _, name = source.partition("/")
+    protocol = (setup.config.imu if kind == "imu" else setup.config.gnss)[name].protocol
+    buffer = TrajectoryBuffer(protocol, name=FROM_LOG)
+    buffer.append(clocks.ins_rows)
+    trajectory = buffer.snapshot()
+    if len(trajectory) < 2:
+        raise UserError(f"{log}: {source}: its INS had no solution; want --trajectory FILE")
+    return trajectory
+
+
+def offset_of(at: str, config: Config) -> Vector | None:
+    """Where a trajectory's point is, from the body's origin in b; None: there.
+
+    Raises:
+        UserError: it is no such point.
+    """
+    if at == "body":
+        return None
+    if at == "antenna":
+        arms = [gnss.lever_arm_m for gnss in config.gnss.values()]
+        if not arms:
+            raise UserError("--trajectory-at antenna: the configuration has no [gnss.…]", ExitCode.USAGE)
+        return _vector(arms[0])
+    if at == "scanner":
+        heads = [scanner.lever_arm_m for scanner in config.scanner.values()]
+        if len(heads) != 1:
+            raise UserError(
+                f"--trajectory-at scanner: the configuration has {len(heads)} scanners; want x,y,z", ExitCode.USAGE
+            )
+        return _vector(heads[0])
+    try:
+        x, y, z = (float(part) for part in at.split(","))
+    except ValueError:
+        raise UserError(
+            f'--trajectory-at: got "{at}", want body, antenna, scanner or x,y,z in metres', ExitCode.USAGE
+        ) from None
+    return (x, y, z)
+
+
+def _vector(values: Sequence[float]) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

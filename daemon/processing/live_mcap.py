@@ -1,0 +1,166 @@
+"""``live.mcap``: points, position and pose in Foxglove's own schemas, so that its viewer opens the file as it is.
+
+The fixed frame is ``local``: east, north, up, in metres from an origin near the first position, which the file's
+metadata record ``swath.live`` and ``live.json`` say in the output's coordinates. ``body`` moves in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove import messages as fox
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+FRAME, BODY = "local", "body"
+NAME, PREVIOUS = "live.mcap", "live.previous.mcap"
+CLOUD_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+CHUNK_BYTES = 256 << 10
+END_BYTES = 64 << 10  # of the file's index and schemas, and for each chunk some more
+END_BYTES_PER_CHUNK = 512
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LivePose:
+    """Where the body is.
+
+    Attributes:
+        time_ns: UTC as POSIX nanoseconds.
+        lat_deg, lon_deg, height_m: ellipsoidal.
+        position: (3,) in the frame ``local``.
+        q_local_from_b: (4,) scalar first.
+        sigma_l: (3,) m, north, east, down; nan: unsaid.
+    """
+
+    time_ns: int
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    position: NDArray[np.float64]
+    q_local_from_b: NDArray[np.float64]
+    sigma_l: NDArray[np.float64]
+
+
+class LiveMcap:
+    """Writes ``live.mcap`` in a folder; the file of the run before stays as ``live.previous.mcap`` while there is room.
+
+    Attributes:
+        is_full: the quota is used up; nothing more is written.
+    """
+
+    def __init__(self, folder: Path, quota_bytes: int, metadata: dict[str, str]) -> None:
+        """Raises OSError: the file cannot be made."""
+        self.is_full = False
+        self._quota_bytes = quota_bytes
+        self._previous = folder / PREVIOUS
+        path = folder / NAME
+        with contextlib.suppress(FileNotFoundError):
+            path.rename(self._previous)
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self._writer.start(profile="", library="swath")
+        self._writer.add_metadata("swath.live", metadata)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._cloud_fields = [
+            fox.PackedElementField(name=str(name), offset=4 * i, type=fox.PackedElementFieldNumericType.Float32)
+            for i, name in enumerate(CLOUD_DTYPE.names or ())
+        ]
+        self._since_flush = 0
+        self._last_size = 0
+        self._chunks = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes that the file will have when it is closed now, at most."""
+        written = self._file.tell()
+        if written != self._last_size:  # a chunk was closed: at most the last message is in the next one
+            self._chunks += 1
+            self._last_size, self._since_flush = written, 0
+        return written + self._since_flush + END_BYTES + END_BYTES_PER_CHUNK * self._chunks
+
+    def add_cloud(self, topic: str, points: NDArray[Any], time_ns: int, log_time_ns: int) -> bool:
+        """Points (n,) of `CLOUD_DTYPE` in the frame ``local``; whether they were written."""
+        cloud = fox.PointCloud(
+            timestamp=_stamp(time_ns),
+            frame_id=FRAME,
+            pose=fox.Pose(position=fox.Vector3(x=0, y=0, z=0), orientation=fox.Quaternion(x=0, y=0, z=0, w=1)),
+            point_stride=CLOUD_DTYPE.itemsize,
+            fields=self._cloud_fields,
+            data=points.tobytes(),
+        )
+        return self._add(topic, cloud, log_time_ns)
+
+    def add_pose(self, pose: LivePose, log_time_ns: int) -> bool:
+        """Position, pose and the transform to the body; whether they were written."""
+        stamp = _stamp(pose.time_ns)
+        w, *xyz = pose.q_local_from_b.tolist()
+        turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
+        place = fox.Vector3(**dict(zip("xyz", pose.position.tolist(), strict=True)))
+        known = bool(np.isfinite(pose.sigma_l).all())
+        kinds = fox.LocationFixPositionCovarianceType
+        north, east, down = (np.nan_to_num(pose.sigma_l) ** 2).tolist()
+        fix = fox.LocationFix(
+            timestamp=stamp,
+            frame_id=BODY,
+            latitude=pose.lat_deg,
+            longitude=pose.lon_deg,
+            altitude=pose.height_m,
+            position_covariance=[east, 0, 0, 0, north, 0, 0, 0, down],
+            position_covariance_type=kinds.DiagonalKnown if known else kinds.Unknown,
+        )
+        transform = fox.FrameTransform(
+            timestamp=stamp, parent_frame_id=FRAME, child_frame_id=BODY, translation=place, rotation=turned
+        )
+        in_frame = fox.PoseInFrame(timestamp=stamp, frame_id=FRAME, pose=fox.Pose(position=place, orientation=turned))
+        written = True
+        for topic, message in {"/position": fix, "/pose": in_frame, "/tf": transform}.items():
+            written &= self._add(topic, message, log_time_ns)
+        return written
+
+    def _add(self, topic: str, message: Any, log_time_ns: int) -> bool:
+        data = message.encode()
+        if self._is_beyond(len(data)):
+            return False
+        if topic not in self._channels:
+            schema = message.get_schema()
+            if schema.name not in self._schemas:
+                self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[schema.name])
+        self._writer.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
+        self._since_flush += len(data) + 64
+        return True
+
+    def _is_beyond(self, length: int) -> bool:
+        """Whether so much more is more than the quota; the run before gives way first."""
+        if self.is_full:
+            return True
+        size = self.size + length + 64
+        if size + _size_of(self._previous) > self._quota_bytes:
+            self._previous.unlink(missing_ok=True)
+        self.is_full = size > self._quota_bytes
+        return self.is_full
+
+    def close(self) -> None:
+        """Index and footer; raises OSError where the disk refuses them."""
+        try:
+            self._writer.finish()
+        finally:
+            self._file.close()
+
+
+def _stamp(time_ns: int) -> Any:
+    return fox.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS)
+
+
+def _size_of(path: Path) -> int:
+    try:
+        return os.stat(path).st_size
+    except OSError:
+        return 0

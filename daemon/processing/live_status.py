@@ -1,0 +1,161 @@
+"""How the live georeferencer does: rates, fates, latencies, time, coverage; as plain values and as a sentence."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter, deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.log.chunks import LogBatch
+from daemon.processing.live_follow import BEHIND_NS, LiveFollower
+from daemon.processing.live_products import LiveProducts, replace_file
+from daemon.processing.setup import Setup
+from daemon.replay import source_of_topic
+from georef.points import FATE_NAMES
+from georef.stream import Stream
+
+STATUS = "live.json"
+WINDOW_S = 10.0  # of which latencies are told
+EVERY = 97  # of a block's points, whose latency is looked at
+LATE_S = 1.0
+LATENCIES = ("p50", "p95", "max")
+
+
+class Latencies:
+    """Seconds between two things, those of the last moments."""
+
+    def __init__(self) -> None:
+        self._blocks: deque[tuple[float, NDArray[np.float64]]] = deque()
+
+    def add(self, seconds: NDArray[np.float64]) -> None:
+        """Some more, now."""
+        now_s = time.monotonic()
+        self._blocks.append((now_s, seconds))
+        while self._blocks and now_s - self._blocks[0][0] > WINDOW_S:
+            self._blocks.popleft()
+
+    def plain(self) -> dict[str, float] | None:
+        """p50, p95 and max; None: there are none."""
+        now_s = time.monotonic()
+        latest = [seconds for at_s, seconds in self._blocks if now_s - at_s <= WINDOW_S and len(seconds)]
+        if not latest:
+            return None
+        values = np.quantile(np.concatenate(latest), [0.5, 0.95, 1.0])
+        return dict(zip(LATENCIES, np.round(values, 4).tolist(), strict=True))
+
+
+class LiveStatus:
+    """Collects over one recording; `plain` says how things are."""
+
+    def __init__(self, setup: Setup, stream: Stream, products: LiveProducts) -> None:
+        self._setup, self._stream, self._products = setup, stream, products
+        self._pulse: dict[str, Latencies] = {}
+        self._log: dict[str, Latencies] = {}
+        self._newest_ns: dict[str, int] = {}  # log time of a source's newest unit
+        self._points_before: Counter[str] = Counter()
+        self._told_s = time.monotonic()
+
+    def note_batch(self, batch: LogBatch, now_ns: int) -> None:
+        """Messages have been read, at a host time."""
+        source = source_of_topic(batch.channel.topic)
+        if source is not None:
+            newest_ns = int(batch.log_time_ns[-1])
+            self._newest_ns[source] = max(self._newest_ns.get(source, 0), newest_ns)
+            self._log.setdefault(source, Latencies()).add(np.array([(now_ns - newest_ns) * 1e-9]))
+
+    def note_points(self, name: str, time_ns: NDArray[np.int64], now_ns: int) -> None:
+        """Points have come out, at a host time; time_ns (n,) is their pulses'."""
+        gps_now_ns = self._gps_from_host(name, now_ns)
+        if gps_now_ns is not None:
+            latest: NDArray[np.float64] = (gps_now_ns - time_ns[::EVERY]) / 1e9
+            self._pulse.setdefault(f"scanner/{name}", Latencies()).add(latest)
+
+    def _gps_from_host(self, name: str, host_ns: int) -> int | None:
+        host = self._stream.clocks.host
+        device = host.plan.devices.get(f"scanner/{name}")
+        if device is None:
+            return None
+        gps_ns, sigma_ns = host.gps_from_host(device.clock, np.array([host_ns]))
+        return int(gps_ns[0]) if np.isfinite(sigma_ns[0]) else None
+
+    def plain(self, follower: LiveFollower | None, now_ns: int) -> dict[str, Any]:
+        """How things are, at a host time; without a follower finished logs are read."""
+        stream, products = self._stream, self._products
+        now_s = time.monotonic()
+        passed_s = max(1e-3, now_s - self._told_s)
+        rates = {
+            name: round((products.points[name] - self._points_before[name]) / passed_s) for name in stream.scanners
+        }
+        self._told_s, self._points_before = now_s, products.points.copy()
+        found: dict[str, Any] = {
+            "points": {name: products.points[name] for name in stream.scanners},
+            "points_per_s": rates,
+            "waiting": {name: stream.waiting(name) for name in stream.scanners},
+            "fates": {
+                name: {FATE_NAMES[fate]: count for fate, count in stream.fates(name).items()}
+                for name in stream.scanners
+            },
+            "latency_s": {
+                source: {
+                    "pulse": self._pulse[source].plain() if source in self._pulse else None,
+                    "log": latencies.plain(),
+                    "newest_age": round((now_ns - self._newest_ns[source]) * 1e-9, 3),
+                }
+                for source, latencies in sorted(self._log.items())
+            },
+            "time": self._clock_states(now_ns),
+            "trajectory": {"source": self._setup.ins_source, "covered_until_gps_ns": stream.path.covered_until_ns},
+            "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
+            "free_bytes": products.room.free_bytes,
+            "stops_writing_at_bytes": products.room.least_bytes,
+            "trouble": products.trouble,
+        } | products.origin()
+        if follower is not None:
+            found |= {
+                "behind_s": round(max(0, follower.newest_ns - follower.read_ns) * 1e-9, 3),
+                "live_skipped_s": round(follower.skipped_ns * 1e-9, 3),
+                "damaged_chunks": follower.damaged + (follower.part.damaged if follower.part else 0),
+            }
+        return found
+
+    def _clock_states(self, now_ns: int) -> dict[str, Any]:
+        host = self._stream.clocks.host
+        told = {}
+        for source in host.by_source:
+            status = host.status(source, now_ns)
+            sigma_ns = round(status.sigma_ns, 1) if np.isfinite(status.sigma_ns) else None
+            told[source] = {"state": status.state.name, "sigma_ns": sigma_ns}
+        return told
+
+
+def sentence(found: dict[str, Any]) -> str:
+    """A line for people."""
+    if "points" not in found:
+        return str(found["state"])
+    rate = sum(found["points_per_s"].values())
+    parts = [f"{found['state']} {found['session_id']}", f"{sum(found['points'].values()):,} points, {rate:,} a second"]
+    worst = [value["pulse"]["p95"] for value in found["latency_s"].values() if value["pulse"]]
+    if worst:
+        late = "LATE: " if max(worst) > LATE_S else ""
+        parts.append(f"{late}{max(worst):.2f} s behind the pulse")
+    left_out = Counter[str]()
+    for fates in found["fates"].values():
+        left_out.update({fate: count for fate, count in fates.items() if fate != "georeferenced"})
+    parts += [f"{count:,} {fate.replace('_', ' ')}" for fate, count in left_out.most_common(3)]
+    if found.get("live_skipped_s"):
+        parts.append(f"{found['live_skipped_s']:.1f} s SKIPPED, more than {BEHIND_NS / 1e9:.0f} s behind")
+    not_locked = [f"{source} {one['state']}" for source, one in found["time"].items() if one["state"] != "LOCKED"]
+    parts += not_locked[:3]
+    if found["trouble"]:
+        parts.append(str(found["trouble"]))
+    return "; ".join(parts)
+
+
+def write_status(folder: Path, found: dict[str, Any]) -> None:
+    """Replace ``live.json``; raises OSError."""
+    replace_file(folder / STATUS, (json.dumps(found, indent=2) + "\n").encode())

@@ -1,0 +1,226 @@
+"""`swath georef`: from logs and a trajectory to one file a strip, the trajectory and the sidecar.
+
+Two passes. The first reads all but the returns: clocks, the INS, turn rates; of the returns it only notes where they
+stand. Then the time is cut into segments, and each is a job (daemon/processing/jobs.py). All is written out of sight
+and put in its place at the end, the sidecar last.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.processing import refusals
+from daemon.processing.flights import EIGHT_BIT, INTENSITY_FACTOR, Flight, Wish, read_flights
+from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
+from daemon.processing.sidecar import run_record, sha256_of, write_sidecar
+from daemon.processing.workers import run_jobs
+from georef.formats.las import LasSettings
+from georef.formats.sbet import sbet_bytes, smrmsg_bytes
+from georef.formats.trajectory_csv import csv_text
+from georef.mapping import MappingError
+from georef.strips import (
+    Segment,
+    StripError,
+    segments,
+)
+
+if TYPE_CHECKING:
+    pass
+
+OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
+TRAJECTORY_MARGIN_NS = 2_000_000_000
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was made: the sidecar's content, and where it is."""
+
+    record: dict[str, Any]
+    sidecar: Path
+
+
+def georeference(wish: Wish, tell: Tell) -> Report:
+    """Make the products.
+
+    Raises:
+        UserError: they cannot be made, one line; nothing that looks like a product is left then.
+    """
+    try:
+        flights = read_flights(wish, tell)
+        name = flights[0].session.session_id
+        with _out_of_sight(wish, name) as (partial, into_place):
+            return _make(wish, flights, name, partial, into_place, tell)
+    except (StripError, JobError, MappingError) as error:
+        raise UserError(str(error)) from error
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    except OSError as error:
+        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
+
+
+# ---------------------------------------------------------------------- jobs
+
+
+def _jobs(flight: Flight, number: int, partial: Path, ending: str) -> list[Job]:
+    tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
+    return [_job(flight, number, tile, partial, ending) for tile in tiles]
+
+
+def _job(flight: Flight, number: int, tile: Segment, partial: Path, ending: str) -> Job:
+    places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
+    if not tile.strip:
+        return Job(number, tile, places)
+    assert flight.trajectory is not None
+    begin, end = flight.gps_from_host([tile.start_ns, tile.end_ns]).tolist()
+    reach = MARGIN_NS + TRAJECTORY_MARGIN_NS
+    trajectory = flight.trajectory.between(begin - reach, end + reach)
+    path = partial / f"{flight.session.session_id}_strip{tile.strip:02d}{ending}"
+    return Job(number, tile, places, trajectory, path)
+
+
+def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> SessionPlan:
+    setup = flight.setup
+    assert setup.mapping is not None
+    protocols = {name: setup.config.scanner[name].protocol for name in setup.scanners}
+    day = np.datetime64(flight.session.info.realtime_ns, "ns").astype("datetime64[D]").item()
+    las = LasSettings(
+        wkt=setup.mapping.wkt,
+        offset=origin,
+        scale=(wish.scale, wish.scale, wish.scale),
+        sigmas=wish.sigmas,
+        creation_date=day,
+        software=f"swath {importlib.metadata.version('swath')}",
+        system_identifier=" ".join(protocols.values()),
+        provenance=json.dumps(
+            {
+                "software": f"swath {importlib.metadata.version('swath')}",
+                "session": flight.session.session_id,
+                "calibrations": {name: calibration.id for name, calibration in setup.calibrations.items()},
+            }
+        ),
+    )
+    factors = {name: INTENSITY_FACTOR for name, protocol in protocols.items() if protocol.startswith(EIGHT_BIT)}
+    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, wish.copc)
+
+
+def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
+    """Offset of all files: the middle of the trajectory, rounded; heights have none."""
+    flight = flights[0]
+    assert flight.trajectory is not None
+    assert flight.setup.mapping is not None
+    within = flight.trajectory.between(*flight.span)
+    middle = within.position_e[len(within) // 2]
+    east, north, _ = np.round(flight.setup.mapping.map_from_e(middle[np.newaxis])[0] / OFFSET_STEP) * OFFSET_STEP
+    return float(east), float(north), 0.0
+
+
+# ---------------------------------------------------------------------- second pass, and what is written
+
+
+@contextmanager
+def _out_of_sight(wish: Wish, name: str) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
+    """A folder for what is not finished, and what puts it in its place; it goes whatever happens."""
+    output = wish.output
+    sidecar = output / f"{name}.json"
+    if sidecar.exists() and not wish.overwrite:
+        raise UserError(f"{sidecar}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE)
+    output.mkdir(parents=True, exist_ok=True)
+    partial = output / f"{name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+
+    def into_place(files: list[Path]) -> None:
+        sidecar.unlink(missing_ok=True)
+        for old in output.glob(f"{name}_strip*.laz"):
+            old.unlink()
+        for file in files:
+            file.replace(output / file.name)
+
+    try:
+        yield partial, into_place
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _make(
+    wish: Wish,
+    flights: Sequence[Flight],
+    name: str,
+    partial: Path,
+    into_place: Callable[[list[Path]], None],
+    tell: Tell,
+) -> Report:
+    origin = _origin(flights)
+    plans = [_plan(wish, flight, origin) for flight in flights]
+    ending = ".copc.laz" if wish.copc else ".laz"
+    jobs = [job for number, flight in enumerate(flights) for job in _jobs(flight, number, partial, ending)]
+    total = sum(job.size for job in jobs)
+    with ThreadPoolExecutor(1) as hasher:
+        paths = [part.path for flight in flights for part in flight.session.parts]
+        hashes = hasher.map(sha256_of, paths)
+        results = run_jobs(
+            plans,
+            jobs,
+            workers=wish.workers,
+            scheduler=wish.scheduler,
+            progress=lambda done: tell("points", done, total),
+        )
+        logs = [{"name": path.name, "sha256": digest} for path, digest in zip(paths, hashes, strict=True)]
+    _note_troubles(flights, results)
+    files = {job.segment.strip: job.path for job in jobs if job.path is not None}
+    done = [path for job, result in zip(jobs, results, strict=True) if (path := job.path) and _is_done(result)]
+    trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
+    record = run_record(flights, results, {strip: path.name for strip, path in files.items()})
+    record |= {"logs": logs, "files": [path.name for path in trajectories], "options": wish.record()}
+    into_place([*done, *trajectories])
+    sidecar = wish.output / f"{name}.json"
+    write_sidecar(sidecar, record)
+    return Report(record, sidecar)
+
+
+def _is_done(result: JobResult) -> bool:
+    return result.points > 0 and not result.failed
+
+
+def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
+    """Why returns have no time; UserError where none has one."""
+    for number, flight in enumerate(flights):
+        own = [result for result in results if result.session == number and result.strip]
+        status = flight.status(flight.host_span[1])
+        for name in flight.setup.scanners:
+            fates: Counter[str] = Counter()
+            refused: Counter[str] = Counter()
+            for result in own:
+                fates.update(result.fates.get(name, {}))
+                refused.update(result.time_refused.get(name, {}))
+            flight.troubles += refusals.time_troubles(flight.log, name, fates, refused, status)
+        refusals.refuse_all_lost(flight.troubles, sum(result.points for result in own))
+
+
+def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
+    """As much of it as the returns needed: CSV, and SBET with smrmsg."""
+    assert flight.trajectory is not None
+    used = flight.trajectory.between(*flight.span)
+    name = flight.session.session_id
+    contents = {
+        f"{name}_trajectory.csv": csv_text(used).encode(),
+        f"{name}_trajectory.sbet": sbet_bytes(used),
+        f"{name}_trajectory.smrmsg": smrmsg_bytes(used),
+    }
+    for file, data in contents.items():
+        (folder / file).write_bytes(data)
+    return [folder / file for file in contents]

@@ -1,0 +1,390 @@
+"""A quick look at files of points: read once into cells, then the numbers a surveyor asks for first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.processing.quicklook_grids import FIRST, Surface, cell_for, frame_of, inner
+from daemon.processing.quicklook_profile import (
+    Line,
+    Profile,
+    axis_of,
+    choose_line,
+    line_through,
+    read_profile,
+)
+from daemon.processing.quicklook_read import (
+    QuickLookError,
+    Source,
+    StripBook,
+    Units,
+    check_one_crs,
+    density_near,
+    find_files,
+    open_source,
+    read_blocks,
+    units_of,
+)
+from daemon.processing.quicklook_strips import MOST_STRIPS, Overlap, StripCells, compare
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+RETURNS_A_CELL = 4  # of the pictures: two point spacings a side
+RETURNS_A_STRIP_CELL = 16  # of one strip: enough for a plane
+FINEST_STRIP_CELL_M, COARSEST_STRIP_CELL_M = 0.5, 20.0
+SAMPLED_FILES = 5
+
+# USGS Lidar Base Specification: level, pulses a m², RMSDz and largest difference of overlapping swaths in metres
+QUALITY_LEVELS = (
+    ("QL0", 8.0, 0.04, 0.08),
+    ("QL1", 8.0, 0.08, 0.16),
+    ("QL2", 2.0, 0.08, 0.16),
+    ("QL3", 0.5, 0.16, 0.32),
+)
+ASPRS_CLASSES_M = (0.01, 0.025, 0.05, 0.10, 0.15, 0.20, 0.333, 0.667, 1.0, 3.333)  # ASPRS 2014, table 7.2
+ASPRS_SWATH_FACTOR = 0.8  # of a class, its limit of RMSDz between swaths
+
+Told = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class StripFacts:
+    """A strip in numbers; lengths in metres, sigmas (3,) of easting, northing and height as root mean squares."""
+
+    name: str
+    points: int
+    pulses: int
+    area_m2: float
+    density: float
+    length_m: float
+    sigma_m: FloatArray | None
+    largest_sigma_m: FloatArray | None
+
+
+@dataclass(slots=True)
+class StripSums:
+    """What is summed a strip while points are read."""
+
+    sums: FloatArray = field(default_factory=lambda: np.zeros((0, 9)))
+
+    def add(self, strip: NDArray[np.int32], first: NDArray[np.bool_], sigma_m: NDArray[np.float32]) -> None:
+        """Count points and pulses; sum squares of sigmas, and keep the largest."""
+        strips = int(strip.max(initial=-1)) + 1
+        if strips > len(self.sums):
+            self.sums = np.concatenate([self.sums, np.zeros((strips - len(self.sums), 9))])
+        self.sums[:strips, 0] += np.bincount(strip, minlength=strips)
+        self.sums[:strips, 1] += np.bincount(strip[first], minlength=strips)
+        if not len(sigma_m):
+            return
+        known = ~np.isnan(sigma_m.sum(axis=1))
+        if not known.any():
+            return
+        if not known.all():
+            strip, sigma_m = strip[known], sigma_m[known]
+        self.sums[:strips, 2] += np.bincount(strip, minlength=strips)
+        for axis in range(3):
+            squares = sigma_m[:, axis].astype(float) ** 2
+            self.sums[:strips, 3 + axis] += np.bincount(strip, squares, minlength=strips)
+        numbers = np.flatnonzero(np.bincount(strip))
+        for number in numbers:
+            chosen = sigma_m if len(numbers) == 1 else sigma_m[strip == number]
+            self.sums[number, 6:] = np.maximum(self.sums[number, 6:], chosen.max(axis=0))
+
+
+@dataclass(slots=True)
+class Look:
+    """All that is known after reading.
+
+    Attributes:
+        sources, units, names: files, their unit, names of strips by number.
+        surface: cells of all strips together.
+        cells, overlap: strips apart, and against each other.
+        strips: their facts by number.
+        profile: None: no points for one.
+        density: mean pulses per m² of wholly covered cells; area_m2: of all covered ones.
+        skipped: noise and withheld points.
+        notes: what the reader of the page is to know.
+    """
+
+    sources: list[Source]
+    units: Units
+    names: list[str]
+    surface: Surface
+    cells: StripCells
+    overlap: Overlap
+    strips: list[StripFacts]
+    profile: Profile | None
+    density: float
+    area_m2: float
+    skipped: int
+    notes: list[str]
+
+
+def look_at(
+    paths: Sequence[Path],
+    cell_m: float | None = None,
+    ends: Sequence[float] | None = None,
+    told: Told = lambda done, of: None,
+) -> Look:
+    """Read files and folders.
+
+    Args:
+        paths: of them.
+        cell_m: side of the pictures' cells; None: from the density of points.
+        ends: x1, y1, x2, y2 of the profile in the files' coordinates; None: chosen.
+        told: called with points read and points there are.
+
+    Raises:
+        QuickLookError: there is nothing to look at, or not on one map.
+    """
+    sources = [open_source(path) for path in find_files(paths)]
+    check_one_crs(sources)
+    total = sum(source.point_count for source in sources)
+    if total == 0:
+        raise QuickLookError(f"{', '.join(str(source.path) for source in sources)}: no points")
+    units = units_of(sources)
+    reading = _read(sources, units, cell_m, told)
+    if reading.surface.points == 0:
+        damage = next((f"{source.path}: {source.damage}" for source in sources if source.damage), "")
+        raise QuickLookError(damage or f"{sources[0].path}: all points are noise or withheld")
+    overlap = compare(reading.cells)
+    strips = [_facts(reading, number) for number in range(len(reading.book.names))]
+    profile = _profile(reading, overlap, strips, ends)
+    density, area_m2 = _density(reading.surface)
+    notes = _notes(reading, overlap, cell_m)
+    return Look(
+        sources,
+        units,
+        reading.book.names,
+        reading.surface,
+        reading.cells,
+        overlap,
+        strips,
+        profile,
+        density,
+        area_m2,
+        reading.skipped,
+        notes,
+    )
+
+
+def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, FloatArray]:
+    """South-western and north-eastern corner (3,) by the headers; those of files without points say nothing."""
+    metres = np.array([units.east_m, units.north_m, units.up_m])
+    corners = np.array([[source.low * metres, source.high * metres] for source in sources if source.point_count])
+    good = np.isfinite(corners).all(axis=(1, 2)) & (corners[:, 1] >= corners[:, 0]).all(axis=1)
+    if not good.any():
+        return np.zeros(3), np.ones(3)
+    return corners[good, 0].min(axis=0), corners[good, 1].max(axis=0)
+
+
+def _sides(
+    sources: Sequence[Source], units: Units, corners: tuple[FloatArray, FloatArray], cell_m: float | None
+) -> tuple[float, float]:
+    """Sides of the cells of the pictures and of the comparison of strips."""
+    full = [source for source in sources if source.point_count]
+    sampled = full[:: -(-len(full) // SAMPLED_FILES)]
+    size_m = np.maximum((corners[1] - corners[0])[:2], 1.0)
+    density = float(np.median([density_near(source, units) for source in sampled]))
+    density = density or sum(source.point_count for source in full) / float(size_m.prod())
+    strip_side_m = cell_for(density, RETURNS_A_STRIP_CELL)
+    side_m = cell_m or cell_for(density, RETURNS_A_CELL)
+    return side_m, float(np.clip(max(strip_side_m, cell_m or 0.0), FINEST_STRIP_CELL_M, COARSEST_STRIP_CELL_M))
+
+
+class _Reading:
+    """Files read into cells."""
+
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        units: Units,
+        corners: tuple[FloatArray, FloatArray],
+        sides_m: tuple[float, float],
+        told: Told,
+    ) -> None:
+        self.sources, self.units, self.told = sources, units, told
+        self.total = sum(source.point_count for source in sources)
+        low_m, high_m = corners
+        self.surface = Surface(frame_of(low_m, high_m, sides_m[0]))
+        self.cells = StripCells(frame_of(low_m, high_m, sides_m[1]), float(low_m[2] + high_m[2]) / 2)
+        self.sums, self.book, self.skipped = StripSums(), StripBook(), 0
+
+    def read(self) -> None:
+        """All of it."""
+        done = 0
+        for source in self.sources:
+            source.boxes_m.clear()
+            source.damage = ""
+            for block in read_blocks(source, self.units, self.book):
+                self.surface.add(block)
+                self.cells.add(block)
+                self.sums.add(block.strip, block.first, block.sigma_m)
+                self.skipped += block.skipped
+                done += len(block) + block.skipped
+                self.told(done, self.total)
+
+
+def _read(sources: Sequence[Source], units: Units, cell_m: float | None, told: Told) -> _Reading:
+    """All files; a second time where a header lies about its extent: the points themselves say it then."""
+    corners = _corners(sources, units)
+    sides_m = _sides(sources, units, corners, cell_m)
+    reading = _Reading(sources, units, corners, sides_m, told)
+    reading.read()
+    if reading.surface.outside:
+        corners = (reading.surface.low_m, reading.surface.high_m)
+        reading = _Reading(sources, units, corners, sides_m, told)
+        reading.read()
+    return reading
+
+
+def _facts(reading: _Reading, number: int) -> StripFacts:
+    points, pulses, with_sigma = (int(value) for value in reading.sums.sums[number, :3])
+    coverage = reading.cells.coverage(number)
+    whole = inner(coverage.there)
+    cell_m = coverage.frame.cell_m
+    sigma_m = largest_m = None
+    if with_sigma:
+        sigma_m = np.sqrt(reading.sums.sums[number, 3:6] / with_sigma)
+        largest_m = reading.sums.sums[number, 6:9]
+    places_m = coverage.centres()
+    length_m = 0.0
+    if len(places_m):
+        centre, ahead = axis_of(places_m)
+        length_m = float(np.ptp((places_m - centre) @ ahead)) + cell_m
+    density = float(coverage.pulses[whole].mean()) / cell_m**2 if whole.any() else math.nan
+    area_m2 = float(coverage.there.sum()) * cell_m**2
+    return StripFacts(reading.book.names[number], points, pulses, area_m2, density, length_m, sigma_m, largest_m)
+
+
+def _density(surface: Surface) -> tuple[float, float]:
+    """Mean pulses per m² where cells are covered wholly, and the area covered."""
+    density, cell_m = surface.density()
+    there = np.isfinite(density)
+    return float(density[inner(there)].mean()) if there.any() else math.nan, float(there.sum()) * cell_m**2
+
+
+def _profile(
+    reading: _Reading, overlap: Overlap, strips: Sequence[StripFacts], ends: Sequence[float] | None
+) -> Profile | None:
+    longest = max(range(len(strips)), key=lambda number: strips[number].length_m)
+    cell_m = max(reading.cells.frame.cell_m, reading.surface.frame.cell_m)
+    half_width_m = float(np.clip(cell_m / 2, 0.5, 50.0))
+    line: Line | None
+    if ends is not None:
+        line = line_through(ends, reading.units, half_width_m)
+        if line.length_m <= 0.0:
+            raise QuickLookError("--profile: both ends are the same point; want x1,y1,x2,y2")
+    else:
+        line = choose_line(reading.cells, overlap, reading.book.names, longest, reading.sources, half_width_m)
+    if line is None:
+        return None
+    profile = read_profile(reading.sources, reading.units, reading.book, line, trim=ends is None)
+    if not len(profile.along_m):
+        if ends is not None:
+            raise QuickLookError(f"--profile: no points within {line.half_width_m:g} m of that line")
+        return None
+    return profile
+
+
+def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None) -> list[str]:
+    """What was taken for granted, left out or changed."""
+    notes = [reading.units.note] if reading.units.note else []
+    notes += [f"{source.path.name}: {source.damage}: partial" for source in reading.sources if source.damage]
+    if any(source.crs is not None for source in reading.sources):
+        without = [source.path.name for source in reading.sources if source.crs is None]
+        notes += [f"{', '.join(without)}: {reading.sources[0].trouble or 'no CRS'}, taken for the others'"] * bool(
+            without
+        )
+    if cell_m and reading.surface.frame.cell_m > cell_m:
+        notes.append(f"cells of {cell_m:g} m would be too many; they are {reading.surface.frame.cell_m:g} m")
+    if reading.skipped:
+        notes.append(f"{reading.skipped:,} points left out: noise (classes 7 and 18) or withheld")
+    if reading.surface.unknown_sigma:
+        notes.append(f"{reading.surface.unknown_sigma:,} points have sigmas that are not known or beyond their field")
+    if len(reading.book.names) > 1 and not overlap.cells:
+        notes.append(f"no two strips share a smooth cell of {reading.cells.frame.cell_m:g} m: they are not compared")
+    if len(reading.book.names) > MOST_STRIPS:
+        notes.append(f"only the first {MOST_STRIPS:,} of {len(reading.book.names):,} strips were compared")
+    return notes
+
+
+def quality_of(look: Look) -> dict[str, Any]:
+    """Which USGS quality levels and which ASPRS 2014 class the numbers keep; None: nothing to judge by."""
+    all_pairs = look.overlap.numbers()
+    levels = []
+    for level, density, rms_m, max_m in QUALITY_LEVELS:
+        within = None
+        if all_pairs:
+            half = round(max_m * 1000)
+            middle = len(look.overlap.signed) // 2
+            within = float(look.overlap.signed[middle - half : middle + half + 1].sum()) / look.overlap.cells
+        levels.append(
+            {
+                "level": level,
+                "density_limit": density,
+                "density_ok": bool(look.density >= density),
+                "rmsdz_limit_m": rms_m,
+                "rmsdz_ok": None if all_pairs is None else bool(all_pairs["rms_m"] <= rms_m),
+                "max_limit_m": max_m,
+                "share_within_max": within,
+            }
+        )
+    best = next((one["level"] for one in levels if one["density_ok"] and one["rmsdz_ok"]), None)
+    kept = None
+    if all_pairs:
+        kept = next((size for size in ASPRS_CLASSES_M if all_pairs["rms_m"] <= ASPRS_SWATH_FACTOR * size), None)
+    return {"levels": levels, "best": best if all_pairs else None, "asprs_class_m": kept}
+
+
+def numbers_of(look: Look) -> dict[str, Any]:
+    """The page's numbers, for scripts."""
+    return {
+        "files": [
+            {
+                "file": str(source.path),
+                "points": source.point_count,
+                "version": source.version,
+                "point_format": source.point_format,
+                "crs": source.crs.name if source.crs is not None else None,
+                "damage": source.damage or None,
+            }
+            for source in look.sources
+        ],
+        "points": look.surface.points,
+        "skipped": look.skipped,
+        "pulses": int(look.surface.sums[:, :, FIRST].sum()),
+        "area_m2": look.area_m2,
+        "density_per_m2": look.density,
+        "cell_m": look.surface.frame.cell_m,
+        "strip_cell_m": look.cells.frame.cell_m,
+        "low_m": look.surface.low_m.tolist(),
+        "high_m": look.surface.high_m.tolist(),
+        "strips": [_strip_numbers(strip) for strip in look.strips],
+        "pairs": [
+            row | {"first": look.names[row["first"]], "second": look.names[row["second"]]} for row in look.overlap.rows
+        ],
+        "overlap": look.overlap.numbers(),
+        "quality": quality_of(look),
+        "notes": look.notes,
+    }
+
+
+def _strip_numbers(strip: StripFacts) -> dict[str, Any]:
+    return {
+        "name": strip.name,
+        "points": strip.points,
+        "pulses": strip.pulses,
+        "area_m2": strip.area_m2,
+        "length_m": strip.length_m,
+        "density_per_m2": None if math.isnan(strip.density) else strip.density,
+        "sigma_m": None if strip.sigma_m is None else strip.sigma_m.tolist(),
+        "largest_sigma_m": None if strip.largest_sigma_m is None else strip.largest_sigma_m.tolist(),
+    }

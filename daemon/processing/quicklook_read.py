@@ -1,0 +1,369 @@
+"""LAS, LAZ and COPC files in blocks of points, in metres, with a number for every strip."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import laspy
+import lazrs
+import numpy as np
+from laspy.errors import LaspyException
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from daemon.processing.quicklook_sidecar import sidecar_of
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+SUFFIXES = (".las", ".laz")
+BLOCK_POINTS = 200_000
+SALVAGED_POINTS = 1000
+SAMPLE_POINTS = 100_000
+SAMPLE_A_CELL = 8.0
+SIGMA_NAMES = ("sigma_easting", "sigma_northing", "sigma_height")
+NOISE_CLASSES = (7, 18)  # LAS 1.4 R15, table 17: low and high noise
+METRES_PER_DEGREE = 111_320.0  # of the equator; good to 0.5 % anywhere, for pictures only
+Selection = laspy.DecompressionSelection
+WANTED = (  # layers of LAZ that are decoded: all others would cost time and show nothing
+    Selection.XY_RETURNS_CHANNEL
+    | Selection.Z
+    | Selection.CLASSIFICATION
+    | Selection.FLAGS
+    | Selection.INTENSITY
+    | Selection.POINT_SOURCE_ID
+    | Selection.ALL_EXTRA_BYTES
+)
+UNREADABLE = (LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error)
+BAD_CRS = (CRSError, LaspyException, ValueError, KeyError, IndexError, TypeError, struct.error)
+
+
+class QuickLookError(ValueError):
+    """The files cannot be looked at: one line that names the file and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Units:
+    """What one unit of a file's coordinates is, and what the user is to know of it.
+
+    Attributes:
+        east_m, north_m, up_m: metres in one unit.
+        name: of the horizontal unit.
+        note: what was taken for granted; empty: nothing.
+    """
+
+    east_m: float = 1.0
+    north_m: float = 1.0
+    up_m: float = 1.0
+    name: str = "m"
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Points of one strip-numbered block; noise and withheld points are gone.
+
+    Attributes:
+        x_m, y_m, z_m: (n,) metres, as in the file.
+        intensity: (n,).
+        strip: (n,) i4 number of the strip.
+        first, single: (n,) bool; of a pulse's returns the first, the only one.
+        sigma_m: (n, 3) f4 of easting, northing and height, nan where not known; (0, 3) where there are none.
+        skipped: noise and withheld points left out.
+    """
+
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+    intensity: NDArray[np.float32]
+    strip: NDArray[np.int32]
+    first: NDArray[np.bool_]
+    single: NDArray[np.bool_]
+    sigma_m: NDArray[np.float32]
+    skipped: int
+
+    def __len__(self) -> int:
+        return len(self.x_m)
+
+
+@dataclass(slots=True)
+class Source:
+    """A file of points.
+
+    Attributes:
+        path: of it.
+        version, point_format, point_count: as its header says.
+        crs: None: it says none, or nothing PROJ knows.
+        trouble: why there is no CRS; empty: there is.
+        low, high: (3,) corners of its header, in its own unit.
+        sigmas: whether every point has three sigmas.
+        sidecar: of the JSON beside it; empty: there is none.
+        damage: why not all of it could be read; empty: it could.
+        boxes_m: (4,) west, south, east, north of each block read.
+    """
+
+    path: Path
+    version: str
+    point_format: int
+    point_count: int
+    crs: CRS | None
+    trouble: str
+    low: FloatArray
+    high: FloatArray
+    sigmas: bool
+    sidecar: dict[str, Any] = field(default_factory=dict)
+    damage: str = ""
+    boxes_m: list[FloatArray] = field(default_factory=list)
+
+
+class StripBook:
+    """Numbers from 0 for strips: of points without a point source id, their file is the strip."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._of_key: dict[int | Path, int] = {}
+        self._tables: dict[Path, NDArray[np.int32]] = {}
+
+    def numbers(self, path: Path, source_ids: NDArray[np.uint16]) -> NDArray[np.int32]:
+        """The strip (n,) of each point of a file."""
+        table = self._tables.setdefault(path, np.full(65536, -1, np.int32))
+        found = table[source_ids]
+        if len(found) and found.min() < 0:
+            for source_id in np.unique(source_ids[found < 0]):
+                table[source_id] = self._number(int(source_id), path)
+            found = table[source_ids]
+        return np.asarray(found, np.int32)
+
+    def _number(self, source_id: int, path: Path) -> int:
+        key: int | Path = source_id or path
+        if key not in self._of_key:
+            self._of_key[key] = len(self.names)
+            self.names.append(str(source_id) if source_id else path.stem)
+        return self._of_key[key]
+
+
+def find_files(paths: Sequence[Path]) -> list[Path]:
+    """The files of points in folders and their folders, each once, by name.
+
+    Raises:
+        QuickLookError: a path is not there, or there is no such file in it.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(one for one in path.rglob("*") if one.suffix.lower() in SUFFIXES and one.is_file())
+            if not inside:
+                raise QuickLookError(f"{path}: holds no LAS or LAZ file")
+        elif path.exists():
+            inside = [path]
+        else:
+            raise QuickLookError(f"{path}: no such file or folder")
+        found.update((one.resolve(), one) for one in inside)
+    return list(found.values())
+
+
+def open_source(path: Path) -> Source:
+    """A file's header and sidecar.
+
+    Raises:
+        QuickLookError: it is no LAS or LAZ file, or its coordinates are geocentric.
+    """
+    try:
+        with laspy.open(path) as reader:
+            header = reader.header
+            names = set(header.point_format.extra_dimension_names)
+    except UNREADABLE as error:
+        raise QuickLookError(f"{path}: not a LAS or LAZ file that can be read ({_line(error)})") from error
+    if not (np.isfinite(header.scales).all() and (np.asarray(header.scales) > 0).all()):
+        raise QuickLookError(f"{path}: the header's scale factors are {list(header.scales)}, want numbers above 0")
+    low, high = np.array(header.mins, float), np.array(header.maxs, float)
+    crs, trouble = _crs_of(header)
+    if crs is not None and crs.is_geocentric:
+        raise QuickLookError(f"{path}: coordinates are geocentric ({crs.name}); a map wants a projected CRS")
+    return Source(
+        path=path,
+        version=str(header.version),
+        point_format=int(header.point_format.id),
+        point_count=int(header.point_count),
+        crs=crs,
+        trouble=trouble,
+        low=low,
+        high=high,
+        sigmas=names.issuperset(SIGMA_NAMES),
+        sidecar=sidecar_of(path),
+    )
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def _crs_of(header: laspy.LasHeader) -> tuple[CRS | None, str]:
+    """The CRS in the header, or why there is none."""
+    try:
+        crs = header.parse_crs()
+    except BAD_CRS:
+        return None, "the CRS in the header cannot be read"
+    return crs, "" if crs is not None else "no CRS in the header"
+
+
+def units_of(sources: Sequence[Source]) -> Units:
+    """Metres in a unit of each axis of files of one CRS; degrees at the first one's latitude, as on a sphere."""
+    known = [source for source in sources if source.crs is not None]
+    crs = known[0].crs if known else None
+    if crs is None:
+        return Units(note=f"{sources[0].trouble}: coordinates taken for metres")
+    plain = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+    axes = plain.axis_info
+    if plain.is_geographic or any("degree" in axis.unit_name for axis in axes):
+        north_m = METRES_PER_DEGREE
+        up_m = axes[2].unit_conversion_factor if len(axes) > 2 else 1.0
+        lat_deg = float(np.clip((sources[0].low[1] + sources[0].high[1]) / 2, -89.9, 89.9))
+        east_m = north_m * math.cos(math.radians(lat_deg))
+        return Units(east_m, north_m, up_m, "°", "coordinates in degrees: lengths and areas are good to 1 % only")
+    if not axes:
+        return Units(note="the CRS names no unit: coordinates taken for metres")
+    across_m = axes[0].unit_conversion_factor
+    if len(axes) > 2:
+        return Units(across_m, across_m, axes[2].unit_conversion_factor, axes[0].unit_name)
+    note = f"no vertical CRS: heights taken for {axes[0].unit_name}" if across_m != 1.0 else ""
+    return Units(across_m, across_m, across_m, axes[0].unit_name.replace("metre", "m"), note)
+
+
+def check_one_crs(sources: Sequence[Source]) -> None:
+    """Refuse files that cannot lie on one map.
+
+    Raises:
+        QuickLookError: two files have different CRS.
+    """
+    known = [source for source in sources if source.crs is not None]
+    for source in known[1:]:
+        if source.crs != known[0].crs:
+            first, other = known[0], source
+            assert first.crs is not None
+            assert other.crs is not None
+            raise QuickLookError(
+                f"{other.path} is in {other.crs.name}, {first.path} in {first.crs.name}: "
+                "one map wants one CRS; view them one by one"
+            )
+
+
+def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[int] | None = None) -> Iterator[Block]:
+    """A file's points block by block; what cannot be read is noted in the source's ``damage``.
+
+    Args:
+        source: the file; the boxes of its blocks are noted while it is read whole.
+        units: of all files of a map.
+        book: which numbers strips have.
+        wanted: numbers of blocks, rising; None: all.
+    """
+    numbers = range(-(-source.point_count // BLOCK_POINTS)) if wanted is None else wanted
+    begin = 0
+    try:
+        with laspy.open(source.path, decompression_selection=WANTED) as reader:
+            for number in numbers:
+                begin = number * BLOCK_POINTS
+                if wanted is not None:
+                    reader.seek(begin)
+                asked = min(BLOCK_POINTS, source.point_count - begin)
+                points = reader.read_points(asked)
+                if len(points) < asked:
+                    raise EOFError("the file ends too early")
+                block = _block(points, source, units, book)
+                if wanted is None:
+                    source.boxes_m.append(_box(block))
+                yield block
+    except UNREADABLE as error:
+        yield from _salvaged(source, units, book, begin, _line(error))
+
+
+def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: str) -> Iterator[Block]:
+    """Behind a block that cannot be read as a whole: as many points as can, in small pieces."""
+    try:
+        with laspy.open(source.path, decompression_selection=WANTED) as reader:
+            reader.seek(begin)
+            while begin < source.point_count:
+                points = reader.read_points(min(SALVAGED_POINTS, source.point_count - begin))
+                if not len(points):
+                    break
+                block = _block(points, source, units, book)
+                begin += len(points)
+                yield block
+    except UNREADABLE:
+        pass
+    source.damage = f"{begin:,} of {source.point_count:,} points could be read ({why})"
+
+
+def density_near(source: Source, units: Units) -> float:
+    """Returns a square metre, roughly, by a piece from a file's middle: its header cannot tell, a strip lies askew.
+
+    Gives 0 where it cannot be read.
+    """
+    size = min(SAMPLE_POINTS, source.point_count)
+    try:
+        with laspy.open(source.path, decompression_selection=Selection.XY_RETURNS_CHANNEL) as reader:
+            reader.seek((source.point_count - size) // 2)
+            points = reader.read_points(size)
+        places_m = np.stack([np.asarray(points.x) * units.east_m, np.asarray(points.y) * units.north_m], axis=1)
+    except UNREADABLE:
+        return 0.0
+    places_m = places_m[np.isfinite(places_m).all(axis=1)]
+    if len(places_m) < 2:
+        return 0.0
+    extent_m = np.maximum(np.ptp(places_m, axis=0), 1.0)
+    side_m = math.sqrt(float(extent_m.prod()) / len(places_m))
+    for _ in range(8):  # cells shrink until they hold as few as are told apart from empty ones
+        cells = np.floor((places_m - places_m.min(axis=0)) / side_m).astype(np.int64)
+        covered = len(np.unique(cells[:, 0] * (int(extent_m[1] / side_m) + 2) + cells[:, 1]))
+        found = len(places_m) / covered
+        if SAMPLE_A_CELL / 2 <= found <= SAMPLE_A_CELL * 2:
+            break
+        side_m *= math.sqrt(SAMPLE_A_CELL / found)
+    whole_m = np.maximum((source.high - source.low)[:2] * [units.east_m, units.north_m], 1.0)
+    shuffled = len(points) and source.point_count / len(points) * float(extent_m.prod() / whole_m.prod())
+    return found / side_m**2 * (shuffled if np.isfinite(shuffled) and shuffled > 2.0 else 1.0)
+
+
+def _box(block: Block) -> FloatArray:
+    if not len(block):
+        return np.array([np.inf, np.inf, -np.inf, -np.inf])
+    return np.array([block.x_m.min(), block.y_m.min(), block.x_m.max(), block.y_m.max()])
+
+
+def _sigma(points: laspy.ScaleAwarePointRecord, name: str) -> NDArray[np.float32]:
+    """(n,) in the file's unit; the largest integer says that a sigma is larger than it, or not known."""
+    kind = points.array.dtype[name]
+    values = np.array(points[name], np.float32)
+    if kind.kind in "iu":
+        values[points.array[name] == np.iinfo(kind).max] = np.nan
+    return values
+
+
+def _block(points: laspy.ScaleAwarePointRecord, source: Source, units: Units, book: StripBook) -> Block:
+    noise = np.isin(np.asarray(points["classification"]), NOISE_CLASSES) | (np.asarray(points["withheld"]) != 0)
+    skipped = int(noise.sum())
+    if skipped:
+        points = points[~noise]
+    number, count = np.asarray(points["return_number"]), np.asarray(points["number_of_returns"])
+    sigma_m = np.empty((0, 3), np.float32)
+    if source.sigmas:
+        scale = (units.east_m, units.north_m, units.up_m)
+        sigma_m = np.stack(
+            [_sigma(points, name) * np.float32(m) for name, m in zip(SIGMA_NAMES, scale, strict=True)], axis=1
+        )
+    return Block(
+        x_m=np.asarray(points.x, np.float64) * units.east_m,
+        y_m=np.asarray(points.y, np.float64) * units.north_m,
+        z_m=np.asarray(points.z, np.float64) * units.up_m,
+        intensity=np.asarray(points["intensity"], np.float32),
+        strip=book.numbers(source.path, np.asarray(points["point_source_id"])),
+        first=number <= 1,
+        single=count <= 1,
+        sigma_m=sigma_m,
+        skipped=skipped,
+    )

@@ -1,0 +1,112 @@
+"""The JSON file beside products, as a page tells it: what made them, with which calibration, what it warns of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+Json = dict[str, Any]
+LARGEST_BYTES = 50_000_000
+MOST_FILES = 50
+CRS_KEYS = ("crs", "name", "heights", "datum", "realisation", "epoch", "operation", "accuracy_m", "grids")
+
+
+def sidecar_of(path: Path) -> Json:
+    """The JSON object that bears a file's name or lists it among its strips; empty: there is none."""
+    named = (path.with_suffix(".json"), path.with_name(f"{path.name}.json"))
+    for beside in named:
+        if found := _read(beside):
+            return found
+    others = sorted(one for one in path.parent.glob("*.json") if one not in named)
+    return next((read for one in others[:MOST_FILES] if path.name in _files_of(read := _read(one))), {})
+
+
+def _read(path: Path) -> Json:
+    try:
+        if not path.is_file() or path.stat().st_size > LARGEST_BYTES:
+            return {}
+        read = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return read if isinstance(read, dict) else {}
+
+
+def _files_of(sidecar: Json) -> set[str]:
+    strips = sidecar.get("strips")
+    entries = strips if isinstance(strips, list) else []
+    return {Path(str(entry.get("file"))).name for entry in entries if isinstance(entry, dict) and entry.get("file")}
+
+
+def find_key(tree: Any, name: str) -> Iterator[Any]:
+    """Every value of such a key anywhere in what JSON gave."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            if key == name:
+                yield value
+            else:
+                yield from find_key(value, name)
+    elif isinstance(tree, list):
+        for value in tree:
+            yield from find_key(value, name)
+
+
+def warnings_in(sidecar: Json) -> list[str]:
+    """What it warns of, and what it says is missing."""
+    values = [value for key in ("warnings", "holes") for value in find_key(sidecar, key)]
+    lines = [one for value in values for one in (value if isinstance(value, list) else [value])]
+    return [_text(line) for line in lines if line]
+
+
+def calibrations_in(sidecar: Json) -> list[str]:
+    """Ids of the calibrations, with the scanners' names where there are such."""
+    told = [_text(value) for value in find_key(sidecar, "calibration_id")]
+    for value in find_key(sidecar, "calibrations"):
+        if isinstance(value, dict):
+            told += [f"{name}: {_text(one.get('id', '?'))}" for name, one in value.items() if isinstance(one, dict)]
+    if not told:
+        values = find_key(sidecar, "calibration")
+        told = [_text(value.get("id", "")) if isinstance(value, dict) else _text(value) for value in values]
+    return list(dict.fromkeys(line for line in told if line))
+
+
+def rows_of(sidecar: Json) -> list[tuple[str, str]]:
+    """What a reader of the page wants of it: labels and texts, as they came."""
+    rows = [("software", _text(sidecar["software"]))] if sidecar.get("software") else []
+    if "complete" in sidecar:
+        rows.append(("complete", "yes" if sidecar["complete"] is True else "no, partial"))
+    rows += [("calibration", line) for line in calibrations_in(sidecar)]
+    for key, label in (("atmosphere", "atmosphere"), ("atmosphere_at_edge", "atmosphere at the swath's edge")):
+        rows += [(label, _text(value)) for value in _distinct(find_key(sidecar, key))]
+    crs = sidecar.get("crs")
+    if isinstance(crs, dict):
+        told = [(key, crs[key]) for key in CRS_KEYS if crs.get(key) not in (None, [], "")]
+        rows += [(f"CRS: {key.replace('_', ' ')}", _text(value)) for key, value in told]
+    counts = sidecar.get("counts")
+    if isinstance(counts, dict):
+        rows += [(f"returns of {name}", _text(value)) for name, value in counts.items()]
+    return rows
+
+
+def _distinct(values: Iterator[Any]) -> list[Any]:
+    found: list[Any] = []
+    for value in values:
+        if value and value not in found:
+            found.append(value)
+    return found
+
+
+def _text(value: Any) -> str:
+    """A value of JSON for people."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "none"}[value]
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{str(key).replace('_', ' ')} {_text(one)}" for key, one in value.items()) or "none"
+    if isinstance(value, list):
+        return ", ".join(_text(one) for one in value) or "none"
+    return str(value)

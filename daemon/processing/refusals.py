@@ -1,0 +1,152 @@
+"""What cannot be georeferenced together, or not with this trajectory: a line each, file and what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.errors import ExitCode, UserError
+from georef.points import Fate
+from georef.timescales import TimeState
+from georef.trajectory import gps_text
+
+if TYPE_CHECKING:
+    from daemon.config.config import Config
+    from daemon.processing.feed import LogClocks
+    from georef.timescales import ClockStatus
+    from georef.trajectory import Trajectory
+
+Span = tuple[int, int]
+NO_TIME = Fate.NO_TIME.name.lower()
+GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
+MUCH = 0.01  # share of returns without time that is worth a warning
+
+
+def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -> None:
+    """Logs of one run share the mapping frame, and the antenna their trajectory came from.
+
+    Raises:
+        UserError: they do not.
+    """
+    for (one, first), (other, second) in pairwise(configs.items()):
+        for key in ("crs", "epoch"):
+            ours, theirs = getattr(first.output, key), getattr(second.output, key)
+            if crs is None and ours != theirs:
+                raise UserError(
+                    f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; "
+                    f"say one with --{key}, or georeference them one by one",
+                    ExitCode.USAGE,
+                )
+        arms = {name: list(gnss.lever_arm_m) for name, gnss in first.gnss.items()}
+        others = {name: list(gnss.lever_arm_m) for name, gnss in second.gnss.items()}
+        if arms != others:
+            name = next(name for name in {**arms, **others} if arms.get(name) != others.get(name))
+            raise UserError(
+                f"{other}: gnss.{name}.lever_arm_m is {_said(others.get(name))}, in {one} {_said(arms.get(name))}: "
+                "another antenna; georeference them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def _said(value: object) -> str:
+    return "not set" if value is None else str(value)
+
+
+def refuse_overlap(spans: Mapping[Path, Span]) -> None:
+    """Logs of one run follow each other; spans in GPS ns.
+
+    Raises:
+        UserError: two overlap.
+    """
+    ordered = sorted(spans.items(), key=lambda item: item[1])
+    for (one, (_, end_ns)), (other, (start_ns, _)) in pairwise(ordered):
+        if start_ns < end_ns:
+            raise UserError(
+                f"{other}: begins at {gps_text(start_ns)}, before {one} ends at {gps_text(end_ns)}: "
+                "two recordings of one time; georeference them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) -> None:
+    """A trajectory and a log have some time in common.
+
+    Raises:
+        UserError: they have none; the line says by how much they are apart where that names the mistake.
+    """
+    first_ns, last_ns = trajectory.span
+    if first_ns <= span[1] and last_ns >= span[0]:
+        return
+    raise UserError(
+        f"{file}: is from {gps_text(first_ns)} to {gps_text(last_ns)}, {log} from {gps_text(span[0])} to "
+        f"{gps_text(span[1])}: they do not overlap; want the trajectory of this flight, or --week"
+    )
+
+
+def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None) -> None:
+    """The log's own clock must be known well enough to say which second a pulse belongs to.
+
+    Raises:
+        UserError: it is not, and why.
+    """
+    if status is None or clock is None:
+        raise UserError(f"{log}: no source of time in its configuration; want [pps.…] or [gnss.…]", ExitCode.USAGE)
+    if status.ambiguous:
+        raise UserError(
+            f"{log}: {clock}: which second an edge is, is not certain: {status.ambiguous}; "
+            "want the time messages of the receiver that gives the pulse (gnss.….pps)"
+        )
+    if status.state is TimeState.NO_TIME:
+        raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
+
+
+def time_troubles(
+    log: Path,
+    scanner: str,
+    fates: Mapping[str, int],
+    refused: Mapping[str, int],
+    status: ClockStatus | None,
+) -> list[str]:
+    """Lines for returns that have no time good enough, and why; empty: few or none."""
+    total = sum(fates.values())
+    lost = fates.get(NO_TIME, 0)
+    if not total or lost <= MUCH * total:
+        return []
+    told = f"{log}: scanner/{scanner}: {lost:,} of {total:,} returns have no time"
+    if refused.get("past_hour"):
+        return [
+            f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to another "
+            "second; want the NMEA sentences and the pulse of one receiver at the head"
+        ]
+    if status is not None and status.state not in GOOD_STATES:
+        return [f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"]
+    if refused.get("spacing"):
+        return [f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"]
+    return [f"{told}: its stamps run free; want a head that is locked to the PPS, or latches it"]
+
+
+def refuse_all_lost(troubles: Sequence[str], points: int) -> None:
+    """Where no return at all could be placed, there is no product.
+
+    Raises:
+        UserError: with what the clocks say.
+    """
+    if not points and troubles:
+        raise UserError("\n".join(troubles))
+
+
+def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> None:
+    """The trajectory turns when the log's IMU does; one in UTC, of another week or of another flight does not.
+
+    Raises:
+        UserError: it turns at other times; the line says by how much.
+    """
+    if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
+        return
+    from georef.trajectory_time import correlate_turn_rates  # scipy.signal, which takes seconds to load
+
+    shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
+    if shift.is_wrong:
+        raise UserError(f"{file}: {shift.what}, by how it turns and how the IMU in {log} does")

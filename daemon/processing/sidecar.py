@@ -1,0 +1,238 @@
+"""The JSON beside the products: what they were made of, with what, and what became of every return."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daemon.processing.models import air_of
+from georef.calibration import PARAMETERS
+from georef.points import Fate
+
+if TYPE_CHECKING:
+    from daemon.processing.flights import Flight
+    from daemon.processing.jobs import JobResult
+    from daemon.processing.setup import Setup
+    from georef.calibration import Calibration
+
+FORMAT = "swath.georef"
+FORMAT_VERSION = 1
+IN_FILES = Fate.GEOREFERENCED.name.lower()
+UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
+_HASH_BLOCK = 1 << 20
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file; raises OSError."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(_HASH_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def calibration_entry(calibration: Calibration) -> dict[str, Any]:
+    """A calibration with all its parameters, in the units of its file."""
+    parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
+    return {"id": calibration.id, "method": calibration.method, "parameters": parameters}
+
+
+def settings_entry(setup: Setup) -> dict[str, Any]:
+    """What the configuration says that the points depend on."""
+    config = setup.config
+    return {
+        "atmosphere": config.atmosphere.model_dump(mode="json"),
+        "attitude": config.attitude.model_dump(mode="json"),
+        "mta": config.mta.model_dump(mode="json"),
+        "scanners": {name: config.scanner[name].model_dump(mode="json", exclude_none=True) for name in setup.scanners},
+        "gnss": {
+            name: {"lever_arm_m": list(gnss.lever_arm_m), "datum": gnss.datum} for name, gnss in config.gnss.items()
+        },
+    }
+
+
+def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
+    """By scanner: returns read, in files, and out of them by reason."""
+    total: dict[str, Counter[str]] = {}
+    for result in results:
+        for scanner, fates in result.fates.items():
+            total.setdefault(scanner, Counter()).update(fates)
+    return {scanner: counts_entry(fates) for scanner, fates in sorted(total.items())}
+
+
+def counts_entry(fates: Counter[str]) -> dict[str, Any]:
+    """Read = written + dropped, and why."""
+    dropped = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
+    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
+
+
+def strip_entry(result: JobResult, file: str) -> dict[str, Any]:
+    """A strip: its file, its times, what is in it."""
+    entry: dict[str, Any] = {
+        "number": result.strip,
+        "file": file if result.points and not result.failed else None,
+        "points": result.points,
+        "first_gps_ns": result.first_gps_ns,
+        "last_gps_ns": result.last_gps_ns,
+        "bounds": result.bounds,
+        "bytes": result.file_bytes,
+        "counts": {scanner: counts_entry(fates) for scanner, fates in sorted(result.fates.items())},
+        "clipped": {
+            "sigma_above_6.5535_m": result.clipped.sigma,
+            "sigma_unknown": result.clipped.sigma_unknown,
+            "intensity": result.clipped.intensity,
+        },
+    }
+    return entry | ({"failed": result.failed} if result.failed else {})
+
+
+def run_record(flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, str]) -> dict[str, Any]:
+    """What the sidecar says of the run, but for the user's wishes.
+
+    Args:
+        flights: of the run.
+        results: of all segments.
+        files: names by strip.
+    """
+    warnings = [line for flight in flights for line in _warnings(flight, _of(results, flight, flights))]
+    holes = [line for flight in flights for line in _holes(flight, _of(results, flight, flights))]
+    strips = [strip_entry(result, files[result.strip]) for result in results if result.strip]
+    mapping = flights[0].setup.mapping
+    assert mapping is not None
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "software": f"swath {importlib.metadata.version('swath')}",
+        "complete": not holes,
+        "holes": holes,
+        "warnings": warnings,
+        "crs": mapping.description(),
+        "counts": count_fates(results),
+        "strips": strips,
+        "flights": [_flight_entry(flight, _of(results, flight, flights)) for flight in flights],
+    }
+
+
+def _of(results: Sequence[JobResult], flight: Flight, flights: Sequence[Flight]) -> list[JobResult]:
+    number = next(number for number, one in enumerate(flights) if one is flight)
+    return [result for result in results if result.session == number]
+
+
+def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
+    setup, trajectory = flight.setup, flight.trajectory
+    assert trajectory is not None
+    first_ns, last_ns = trajectory.span
+    return {
+        "session": flight.session.session_id,
+        "start": utc_text(flight.session.info.realtime_ns),
+        "recorder": flight.session.info.software,
+        "origin": flight.session.info.origin or "recording",
+        "returns_gps_ns": list(flight.span),
+        "trajectory": {
+            "name": trajectory.name,
+            "epochs": len(trajectory),
+            "first_gps_ns": first_ns,
+            "last_gps_ns": last_ns,
+            "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
+        },
+        "calibrations": {name: calibration_entry(value) for name, value in setup.calibrations.items()},
+        "settings": settings_entry(setup),
+        "atmosphere_at_edge": _edges(flight, results),
+        "lost_by_recorder": flight.lost,
+    }
+
+
+def _edges(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
+    """By scanner: what the atmosphere's models amount to at the swath's edge, whether they were applied or not."""
+    config, entries = flight.setup.config, {}
+    for name, (angle_rad, above_m, ground_m) in _widest(results).items():
+        effect = air_of(config, config.scanner[name]).at_edge(above_m, angle_rad, ground_m)
+        entries[name] = {
+            "angle_deg": math.degrees(angle_rad),
+            "height_above_ground_m": above_m,
+            "range_m": effect.range_m,
+            "bending_m": effect.bending_m,
+        }
+    return entries
+
+
+def _widest(results: Sequence[JobResult]) -> dict[str, tuple[float, float, float]]:
+    widest: dict[str, tuple[float, float, float]] = {}
+    for result in results:
+        for name, edge in result.edges.items():
+            widest[name] = max(widest.get(name, edge), edge)
+    return widest
+
+
+def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
+    config = flight.setup.config
+    lines = [
+        line
+        for name, (angle_rad, above_m, ground_m) in _widest(results).items()
+        if (line := air_of(config, config.scanner[name]).warning(above_m, angle_rad, ground_m)) is not None
+    ]
+    lines += [f"{flight.log}: the recorder lost {count:,} units of {source}" for source, count in flight.lost.items()]
+    lines += flight.troubles
+    sigma, unknown, intensity = (
+        sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")
+    )
+    if sigma:
+        lines.append(f"{sigma:,} points have a sigma of 6.5535 m or more, which stands in the file as 6.5535 m")
+    if unknown:
+        lines.append(
+            f"{unknown:,} points have a sigma that is not known, as the trajectory says none; "
+            "6.5535 m stands in the file"
+        )
+    if intensity:
+        lines.append(f"{intensity:,} points have an intensity above 65535, which stands in the file as 65535")
+    return lines
+
+
+def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
+    session = flight.session
+    damages = list(dict.fromkeys([*session.damage, *flight.index.damage, *(d for r in results for d in r.damage)]))
+    lines = [
+        f"{flight.log.parent}: part {number} of {session.session_id} is missing" for number in session.missing_parts
+    ]
+    if session.growing is not None:
+        lines.append(f"{session.growing}: is still being recorded; the products are of what it held so far")
+    for part in damages:
+        damage = part.damage
+        lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")
+    for result in results:
+        if result.failed:
+            lines.append(f"strip {result.strip}: {result.failed}" if result.strip else f"a turn: {result.failed}")
+        elif result.strip and not result.points:
+            lines.append(f"strip {result.strip}: no return of it could be georeferenced; it has no file")
+        elif result.strip:
+            lines += [
+                f"strip {result.strip}: {count:,} returns of {name} {UNCOVERED[reason]}"
+                for name, fates in sorted(result.fates.items())
+                for reason, count in sorted(fates.items())
+                if reason in UNCOVERED and count
+            ]
+    return lines
+
+
+def utc_text(time_ns: int) -> str:
+    """A host time for people."""
+    return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def write_sidecar(path: Path, content: dict[str, Any]) -> None:
+    """Write it whole or not at all; raises OSError."""
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", encoding="utf-8") as file:
+        json.dump(content, file, indent=2, ensure_ascii=False)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)

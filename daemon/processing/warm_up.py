@@ -1,0 +1,313 @@
+"""Compiles what `swath live` and `swath georef` run, before there is anything to run it on, and keeps it on disk.
+
+A moment of made-up returns goes the whole way: parser, model, air, mapping frame, products. What has been kept from
+before is only read. Nothing here knows which loops there are; a loop is warm because it has run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import io
+import math
+import pickle
+import time
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numba.core.event
+import numpy as np
+import pyproj
+
+from daemon.config.config import Config
+from daemon.config.tables import Tables
+from daemon.log.format import SessionInfo
+from daemon.processing.live_grid import CountGrid, count_points
+from daemon.processing.live_products import Thinning
+from daemon.processing.setup import Options, Setup
+from drivers.core.parser import DeviceSettings, Parser
+from drivers.core.registry import find_driver
+from drivers.scanner.hesai import MODE_LAST_STRONGEST, encode_point_packet
+from drivers.scanner.hesai import MODE_STRONGEST as HESAI_STRONGEST
+from drivers.scanner.hesai_heads import XT32
+from drivers.scanner.ouster import OusterParser
+from drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from georef.formats.las import LasSettings, LasWriter
+from georef.points import Points
+from georef.records import (
+    DEVICE_CLOCK_DTYPE,
+    INS_DTYPE,
+    RETURN_DTYPE,
+    ChunkBatch,
+    Int64Array,
+    NamesEdge,
+    PpsEdge,
+    ScannerReturns,
+    StructArray,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+from georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
+
+COMPILE_EVENT = "numba:compile"
+ROWS = 500
+LEAP_SECONDS = 18
+START_NS = (405_555 * 3600 + LEAP_SECONDS) * SECOND_NS  # GPS: a UTC hour of 2026, where stamps past the hour begin
+FLOWN_S = 15  # until clocks have locked, and some
+INS_GOOD = 3  # NovAtel's INS_SOLUTION_GOOD
+EPOCH_NS = 20_000_000
+HEIGHT_M = 800.0
+SOMEWHERE = (47.0, 9.0)  # degrees, for a frame that says no area
+_HEAD_BYTES = 31  # of a message in a log before its data: units of a log are strided so
+
+_PLAN = """
+[session]
+name = "warm-up"
+[pps.main]
+source = "/dev/pps0"
+[gnss.rover]
+transport = "serial:/dev/null"
+protocol = "novatel"
+pps = "main"
+datum = "same"
+[scanner.line]
+transport = "udp:127.0.0.1:2368"
+protocol = "srep"
+pps = "main"
+mirror_factor = 1.0
+[scanner.spinning]
+transport = "udp:127.0.0.1:2369"
+protocol = "velodyne-vlp16"
+pps = "main"
+installation = [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+[output]
+crs = "EPSG:25832"
+"""
+_AIR = '[atmosphere]\nranges = "vacuum"\nrefraction = "{refraction}"\n'
+PLANS = (_PLAN, _PLAN + _AIR.format(refraction="ardc"), _PLAN + _AIR.format(refraction="spherical"))
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUp:
+    """What a warm-up did.
+
+    Attributes:
+        compiled: loops that were not in the cache.
+        seconds: that it took.
+        cache: where loops are kept; None: nowhere, they are compiled in memory by every process.
+    """
+
+    compiled: int
+    seconds: float
+    cache: Path | None
+
+    def text(self) -> str:
+        """A line for people."""
+        what = f"{self.compiled} loops compiled" if self.compiled else "all loops were compiled already"
+        where = (
+            f"kept in {self.cache}"
+            if self.cache is not None
+            else "no folder to keep them in can be written to, so every process compiles in memory: set NUMBA_CACHE_DIR"
+        )
+        return f"{what} in {self.seconds:.1f} s; {where}"
+
+
+@contextlib.contextmanager
+def compilations() -> Iterator[list[str]]:
+    """Names of the loops that are compiled meanwhile; those read from the cache are none."""
+    with numba.core.event.install_recorder(COMPILE_EVENT) as recorder:
+        names: list[str] = []
+        yield names
+        names += [str(event.data["dispatcher"]) for _, event in recorder.buffer if event.is_start]
+
+
+def cache_folder() -> Path | None:
+    """Where loops are kept; None: nowhere."""
+    path = count_points.stats.cache_path  # type: ignore[attr-defined]
+    return None if path is None else Path(path)
+
+
+def warm_up(setups: Iterable[Setup] = ()) -> WarmUp:
+    """Run everything once: for what any configuration is made of, and for those that are given."""
+    began_s = time.monotonic()
+    with compilations() as names:
+        _warm_parsers()
+        for plan, uncertainty in product(PLANS, (False, True)):
+            warm_setup(_setup(plan, uncertainty))
+        for setup in setups:
+            warm_setup(setup)
+    return WarmUp(len(names), time.monotonic() - began_s, cache_folder())
+
+
+def _setup(plan: str, uncertainty: bool) -> Setup:
+    config = Config(Tables.model_validate(tomllib.loads(plan)), Path("warm-up.toml"), plan)
+    return Setup(config, {}, Options(uncertainty=uncertainty))
+
+
+def warm_setup(setup: Setup) -> None:
+    """Run once what one configuration needs; the setup itself is left as it is."""
+    copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
+    parsers = copy.parsers(("scanner",))
+    for name in copy.scanners:
+        parser = parsers[f"scanner/{name}"]
+        for packets in _packets_for(parser, copy.config.scanner[name].protocol):
+            _decoded(parser, packets)
+    with contextlib.suppress(ValueError):  # what such a place or such returns are refused for is no matter here
+        for _, points in _placed(copy):
+            _warm_products(points)
+
+
+def _warm_products(points: Points) -> None:
+    points = Points.concatenate([points, points])
+    Thinning(1000).keep(points.time_ns)
+    grid = CountGrid(1.0)
+    grid.add(points.points_map - points.points_map[:1] if len(points) else np.zeros((1, 3)))
+    grid.add(np.zeros((1, 3)))
+    grid.numbers()
+    sigmas = points.sigma_map is not None
+    middle = points.points_map.mean(axis=0) if len(points) else np.zeros(3)
+    writer = LasWriter(io.BytesIO(), LasSettings("", tuple(np.round(middle).tolist()), sigmas=sigmas), 1)
+    if len(points):
+        writer.write(points)
+    writer.close()
+
+
+# ---------------------------------------------------------------------- made-up flight
+
+
+def _placed(setup: Setup) -> list[tuple[str, Points]]:
+    """Points of a quarter of a minute of level flight, whose clocks have locked by then."""
+    unix_ns = unix_ns_from_gps(START_NS, LEAP_SECONDS)
+    stream = setup.live_stream(SessionInfo("warm-up", "swath", "", "", unix_ns, 0))
+    clocks = stream.clocks
+    placed: list[tuple[str, Points]] = []
+    for second in range(FLOWN_S):
+        passed_ns = second * SECOND_NS
+        host_ns = unix_ns + passed_ns
+        clocks.add_reading(host_ns, passed_ns, passed_ns)
+        for source in clocks.host.plan.pps:
+            clocks.add_edge(source, PpsEdge(host_ns, second))
+        week, of_week_ns = week_from_gps(START_NS + passed_ns)
+        said = TimeTag(TimeScale.GPS, of_week_ns, week=week, leap_seconds=LEAP_SECONDS)
+        for source in clocks.host.plan.gnss:
+            clocks.add_message(source, TimeMessage(host_ns + 50_000_000, said, NamesEdge.PREVIOUS, bound=True))
+        for source in clocks.host.plan.devices:
+            clocks.add_samples(source, _device_clock(host_ns, passed_ns, second))
+        stream.path.add(setup.ins_rows(_solutions(setup, START_NS + passed_ns)))
+        for name in stream.scanners:
+            stream.add_returns(name, _returns(host_ns, passed_ns))
+        placed += stream.advance(host_ns + SECOND_NS)
+    return placed + stream.close()
+
+
+def _device_clock(host_ns: int, passed_ns: int, second: int) -> StructArray:
+    since_ns = np.arange(0, SECOND_NS, 50_000_000)
+    rows = np.zeros(len(since_ns), dtype=DEVICE_CLOCK_DTYPE)
+    rows["host_time_ns"], rows["device_time_ns"] = host_ns + since_ns + 500_000, passed_ns + since_ns
+    rows["pps_time_ns"], rows["pps_count"], rows["locked"] = passed_ns, second, 1
+    return rows
+
+
+def _solutions(setup: Setup, gps_ns: int) -> StructArray:
+    """A second of level flight where the mapping frame is at home, as a device's INS would tell it."""
+    lat_deg, lon_deg = SOMEWHERE
+    crs, area = setup.options.crs or setup.config.output.crs, None
+    with contextlib.suppress(pyproj.exceptions.CRSError):
+        area = None if crs is None else pyproj.CRS.from_user_input(crs).area_of_use
+    if area is not None:
+        lat_deg, lon_deg = (area.south + area.north) / 2, (area.west + area.east) / 2
+    rows = np.zeros(SECOND_NS // EPOCH_NS, dtype=INS_DTYPE)
+    rows["gps_ns"] = gps_ns + EPOCH_NS * np.arange(len(rows))
+    rows["lat_rad"] = math.radians(lat_deg) + 1e-5 * (rows["gps_ns"] - START_NS) / SECOND_NS
+    rows["lon_rad"], rows["height_m"] = math.radians(lon_deg), HEIGHT_M
+    rows["velocity_l"] = (60.0, 0.0, 0.0)
+    rows["position_sigma_l"], rows["attitude_sigma_rad"] = 0.02, 1e-4
+    rows["status"] = INS_GOOD
+    return rows
+
+
+def _returns(host_ns: int, passed_ns: int) -> StructArray:
+    since_ns = np.arange(ROWS) * (SECOND_NS // ROWS)
+    rows = np.zeros(ROWS, dtype=RETURN_DTYPE)
+    rows["host_time_ns"], rows["device_time_ns"] = host_ns + since_ns + 500_000, passed_ns + since_ns
+    rows["range_m"], rows["encoder_rad"] = HEIGHT_M, np.linspace(-0.3, 0.3, ROWS)
+    rows["return_number"] = rows["number_of_returns"] = 1
+    rows["intensity"], rows["pulse_id"] = 100.0, np.arange(ROWS)
+    return rows
+
+
+# ---------------------------------------------------------------------- packets of every maker
+
+
+def _warm_parsers() -> None:
+    """The decoding of protocols that no plan above names; an Ouster's wants its metadata and waits for it."""
+    for protocol, config in (
+        ("srep", {"mirror_factor": 2.0, "geometry": {"type": "polygon", "facets": 4}}),
+        ("hesai-xt32", {}),
+    ):
+        parser = find_driver("scanner", protocol).make_parser(DeviceSettings("scanner/one", config, compiled=True))
+        for packets in _packets_for(parser, protocol):
+            _decoded(parser, packets)
+
+
+def _decoded(parser: Parser, packets: list[bytes]) -> list[StructArray]:
+    """Returns of packets of one length, handed over as a log hands them over."""
+    units = np.zeros((len(packets), _HEAD_BYTES + len(packets[0])), dtype=np.uint8)
+    units[:, _HEAD_BYTES:] = np.frombuffer(b"".join(packets), np.uint8).reshape(len(packets), -1)
+    host_ns: Int64Array = np.arange(len(packets), dtype=np.int64) * 1_000_000
+    records = parser.feed_batch(ChunkBatch("scanner/one", host_ns, units[:, _HEAD_BYTES:]))
+    return [record.rows for record in records if isinstance(record, ScannerReturns)]
+
+
+def _packets_for(parser: Parser, protocol: str) -> list[list[bytes]]:
+    """Batches of two packets in each way a head may send them; none for a protocol whose packets nobody can make."""
+    if isinstance(parser, OusterParser):
+        return [_ouster(parser)]
+    make = _PACKETS.get(protocol.partition("-")[0])
+    return [] if make is None else make()
+
+
+def _srep() -> list[list[bytes]]:
+    encoder = np.arange(20) * 1000
+
+    def datagram(sequence: int, slots: int) -> bytes:
+        header = SrepHeader(flags=1, sequence=sequence, pps_count=3, first_ticks=50_000 * sequence)
+        return encode_datagram(header, np.arange(20) * 50, encoder, np.full((20, slots), 8_000_000), 100, 400)
+
+    return [[datagram(sequence, slots) for sequence in (2 * slots, 2 * slots + 1)] for slots in (1, 2)]
+
+
+def _velodyne() -> list[list[bytes]]:
+    ranges = np.full((12, 32), 20_000)
+    single, pairs = np.arange(12) * 40, np.repeat(np.arange(6) * 40, 2)
+    return [
+        [encode_data_packet(stamp_us, azimuth, ranges, 50, mode) for stamp_us in (1_000, 2_327)]
+        for mode, azimuth in ((MODE_STRONGEST, single), (MODE_DUAL, pairs))
+    ]
+
+
+def _hesai() -> list[list[bytes]]:
+    ranges = np.full((XT32.blocks, XT32.channels), 5_000)
+    single, pairs = np.arange(XT32.blocks) * 18, np.repeat(np.arange(XT32.blocks // 2) * 18, 2)
+    when = dt.datetime(2026, 4, 15, 10, 0, 0, tzinfo=dt.UTC)
+    return [
+        [encode_point_packet(when, azimuth, ranges, 50, mode, sequence=number) for number in (1, 2)]
+        for mode, azimuth in ((HESAI_STRONGEST, single), (MODE_LAST_STRONGEST, pairs))
+    ]
+
+
+def _ouster(parser: OusterParser) -> list[bytes]:
+    per_packet = parser.head.columns_per_packet
+    ranges = {name: 20_000 for name in parser.layout.profile.fields if name.startswith("RANGE")}
+    return [
+        parser.layout.encode(1, first, 1_000_000_000 + 100_000 * np.arange(first, first + per_packet), ranges)
+        for first in (0, per_packet)
+    ]
+
+
+_PACKETS: dict[str, Callable[[], list[list[bytes]]]] = {"srep": _srep, "velodyne": _velodyne, "hesai": _hesai}

@@ -1,0 +1,169 @@
+"""Does jobs: here, in processes of this computer, or on a Dask cluster; the longest first, with the same results."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import pickle
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from typing import Any
+
+from daemon.errors import ExitCode, UserError
+from daemon.processing.jobs import Job, JobError, JobResult, SessionPlan, run_job
+
+TELL_EVERY_S = 0.2
+CONNECT_S = 10
+Progress = Callable[[int], None]  # bytes done so far
+
+_plans: list[SessionPlan] = []  # of a worker process
+_done: Any = None  # its share of the bytes done
+
+
+def run_jobs(
+    plans: Sequence[SessionPlan], jobs: Sequence[Job], *, workers: int, scheduler: str | None, progress: Progress
+) -> list[JobResult]:
+    """Do all jobs.
+
+    Args:
+        plans: of the sessions.
+        jobs: in any order.
+        workers: processes here; 1: in this one.
+        scheduler: address of a Dask scheduler; None: none.
+        progress: is told the bytes done.
+
+    Returns:
+        Results in the order of the jobs. A job whose process died is one that failed.
+
+    Raises:
+        JobError: the points of one cannot stand in a file.
+        OSError: reading or writing failed.
+        UserError: there is no such scheduler.
+    """
+    order = sorted(range(len(jobs)), key=lambda number: (-jobs[number].size, number))
+    if scheduler is not None:
+        results = _on_cluster(plans, jobs, order, scheduler, progress)
+    elif workers <= 1:
+        results = _here(plans, jobs, order, progress)
+    else:
+        results = _in_processes(plans, jobs, order, min(workers, len(jobs)), progress)
+    return [results[number] for number in range(len(jobs))]
+
+
+def _here(
+    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], progress: Progress
+) -> dict[int, JobResult]:
+    done = 0
+
+    def tell(size: int) -> None:
+        nonlocal done
+        done += size
+        progress(done)
+
+    return {number: run_job(plans[jobs[number].session], jobs[number], tell) for number in order}
+
+
+def _failed(job: Job, why: str) -> JobResult:
+    return JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns, failed=why)
+
+
+# ---------------------------------------------------------------------- processes of this computer
+
+
+def _begin(plans: bytes, done: Any) -> None:
+    """What a worker process does first; an interrupt ends it without a word."""
+    global _plans, _done
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    _plans, _done = pickle.loads(plans), done
+
+
+def _do(job: Job) -> JobResult:
+    def tell(size: int) -> None:
+        with _done.get_lock():
+            _done.value += size
+
+    return run_job(_plans[job.session], job, tell)
+
+
+def _in_processes(
+    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress
+) -> dict[int, JobResult]:
+    context = multiprocessing.get_context("spawn")
+    done = context.Value("q", 0)
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done))
+    results: dict[int, JobResult] = {}
+    try:
+        futures = {pool.submit(_do, jobs[number]): number for number in order}
+        pending: set[Future[JobResult]] = set(futures)
+        while pending:
+            finished, pending = wait(pending, TELL_EVERY_S, FIRST_COMPLETED)
+            for future in finished:
+                number = futures[future]
+                try:
+                    results[number] = future.result()
+                except BrokenProcessPool:
+                    results[number] = _failed(jobs[number], "the process died, as it does when memory is short")
+            progress(int(done.value))
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    pool.shutdown()
+    return results
+
+
+# ---------------------------------------------------------------------- a Dask cluster
+
+
+def _on_cluster(
+    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], scheduler: str, progress: Progress
+) -> dict[int, JobResult]:
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError:
+        raise UserError("--scheduler wants the extra swath[cluster] (dask, distributed)", ExitCode.USAGE) from None
+    try:
+        client = distributed.Client(scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{scheduler}: no Dask scheduler answers there: {error}", ExitCode.IO) from error
+    results: dict[int, JobResult] = {}
+    done = 0
+    with client:
+        shared = client.scatter(list(plans), broadcast=True, hash=False)
+        futures = {
+            client.submit(_do_with, shared, jobs[number], pure=False, priority=-rank): number
+            for rank, number in enumerate(order)
+        }
+        try:
+            for future in distributed.as_completed(list(futures)):
+                number = futures[future]
+                results[number] = _result_of(future, jobs[number])
+                done += jobs[number].size
+                progress(done)
+        except BaseException:
+            with suppress(Exception):  # what ends the run is told, not that a worker cannot be reached
+                client.cancel(list(futures), force=True)
+            raise
+    return results
+
+
+def _do_with(plans: list[SessionPlan], job: Job) -> JobResult:
+    return run_job(plans[job.session], job)
+
+
+def _result_of(future: Any, job: Job) -> JobResult:
+    """What a job on a cluster gave; a worker that was lost is told of by an error of the scheduler's own."""
+    try:
+        result: JobResult = future.result()
+    except (JobError, OSError):
+        raise
+    except Exception as error:
+        if type(error).__name__ in ("KilledWorker", "CancelledError", "FutureCancelledError"):
+            return _failed(job, f"lost by the cluster: {type(error).__name__}")
+        raise
+    return result

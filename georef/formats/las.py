@@ -1,0 +1,268 @@
+"""Writes LAZ 1.4: points as georeferenced into packed records in one compiled pass, and these through LASzip.
+
+LAS 1.4-R15, point format 6; time is adjusted standard GPS time. The bytes depend on the points and their order, never
+on how they were cut into batches.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import lazrs
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.compiled import kept, kernel
+from georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
+from georef.points import ByteArray, FloatArray, Points, SingleArray
+from georef.records import Int64Array
+
+ADJUSTED_GPS_EPOCH_S = 1_000_000_000
+SCAN_ANGLE_UNIT_RAD = math.radians(0.006)
+MAX_SCANNER_CHANNEL = 3
+BLOCK = 1 << 15  # points that are packed at a time: they stay in the cache until they are compressed
+_WITHHELD = 1 << 2
+_LARGEST = 2_147_483_647
+_TURN = 2.0 * math.pi
+_PER_SCAN_ANGLE_UNIT = 1.0 / SCAN_ANGLE_UNIT_RAD
+_AXES = ("easting", "northing", "height")
+
+
+class LasError(ValueError):
+    """Points that a LAS file cannot hold."""
+
+
+@dataclass(frozen=True, slots=True)
+class LasSettings:
+    """What all files of a run have in common.
+
+    Attributes:
+        wkt: coordinate system.
+        offset: (3,) easting, northing, height near the points.
+        scale: (3,) unit of the coordinates' integers, in the units of the coordinate system.
+        sigmas: three sigmas behind each point, uint16 of 0.1 mm.
+        creation_date: of the flight.
+        software, system_identifier: as the header names them.
+        provenance: see `LasHeader`.
+    """
+
+    wkt: str
+    offset: tuple[float, float, float]
+    scale: tuple[float, float, float] = (0.001, 0.001, 0.001)
+    sigmas: bool = True
+    creation_date: dt.date = dt.date(1980, 1, 6)
+    software: str = "swath"
+    system_identifier: str = ""
+    provenance: str = ""
+
+    def header(self, strip: int) -> LasHeader:
+        """The header of a strip's file."""
+        return LasHeader(
+            scale=np.array(self.scale),
+            offset=np.array(self.offset),
+            sigmas=self.sigmas,
+            wkt=self.wkt,
+            creation_date=self.creation_date,
+            software=self.software,
+            system_identifier=self.system_identifier,
+            file_source_id=min(strip, 65535),
+            provenance=self.provenance,
+        )
+
+
+@dataclass(slots=True)
+class Clipped:
+    """Points with a value larger than its field, in which its largest stands instead.
+
+    Attributes:
+        sigma: a sigma of 6.5535 m or more.
+        sigma_unknown: a sigma that is no number; 6.5535 m stands in the file.
+        intensity: an intensity above 65535.
+    """
+
+    sigma: int = 0
+    sigma_unknown: int = 0
+    intensity: int = 0
+
+
+class PointPacker:
+    """Packs points into records as they stand in a file, and keeps what the header says of them.
+
+    Args:
+        header: of the file; its counts and extremes grow.
+        point_source_id: strip, 1 … 65535.
+    """
+
+    def __init__(self, header: LasHeader, point_source_id: int) -> None:
+        self.header = header
+        self._source = point_source_id
+        self._per_unit = 1.0 / header.scale
+        self._clipped = np.zeros(3, np.int64)
+        self._records = np.zeros(BLOCK, header.dtype)
+
+    @property
+    def clipped(self) -> Clipped:
+        """What did not fit so far."""
+        return Clipped(*self._clipped.tolist())
+
+    def pack(
+        self, points: Points, first: int, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False
+    ) -> NDArray[np.void]:
+        """Records of at most `BLOCK` points from ``first`` on; the next call writes over them.
+
+        Raises:
+            LasError: coordinates beyond what the scale allows.
+        """
+        last = min(first + BLOCK, len(points))
+        records = self._records[: last - first]
+        flags = (_WITHHELD if withheld else 0) | min(scanner, MAX_SCANNER_CHANNEL) << 4
+        head = self.header
+        wrong = _pack(
+            records, first, points.time_ns, points.points_map, points.scan_angle_rad, points.intensity,
+            points.return_number, points.number_of_returns, points.channel, head.offset, self._per_unit,
+            intensity_factor, flags, self._source, head.minimum, head.maximum, head.count_by_return, self._clipped,
+        )  # fmt: skip
+        if wrong >= 0:
+            raise LasError(self._out_of_bounds(points.points_map[wrong]))
+        if head.sigmas:
+            if points.sigma_map is None:
+                raise LasError("points without sigmas for a file with sigmas; want sigmas=False")
+            _pack_sigmas(records, first, points.sigma_map, self._clipped)
+        head.count += len(records)
+        return records
+
+    def _out_of_bounds(self, point: NDArray[np.float64]) -> str:
+        head = self.header
+        inside = np.abs((point - head.offset) * self._per_unit) <= _LARGEST - 1
+        axis = int(np.argmin(inside))
+        reach = _LARGEST * float(head.scale[axis])
+        return (
+            f"{_AXES[axis]} {point[axis]:.3f} is beyond what a LAS file of scale {head.scale[axis]:g} can hold, "
+            f"{reach:,.0f} either side of {head.offset[axis]:,.0f}; want a larger scale or another coordinate system"
+        )
+
+
+class LasWriter:
+    """Writes one LAZ file, in bounded memory.
+
+    Args:
+        stream: seekable, empty; the caller closes it.
+        settings: of the run.
+        strip: its number, which is the point source id.
+    """
+
+    def __init__(self, stream: BinaryIO, settings: LasSettings, strip: int) -> None:
+        self.header = settings.header(strip)
+        self._packer = PointPacker(self.header, strip)
+        self._stream = stream
+        extra = self.header.dtype.itemsize - 30
+        self._laszip = lazrs.LazVlr.new_for_compression(POINT_FORMAT, extra)
+        stream.write(self.header.encode(self._laszip.record_data()))
+        self._compressor: Any = lazrs.LasZipCompressor(stream, self._laszip)
+
+    @property
+    def clipped(self) -> Clipped:
+        """What did not fit so far."""
+        return self._packer.clipped
+
+    def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
+        """Append points.
+
+        Args:
+            points: any number.
+            scanner: number of the scanner, 0 …; those beyond 3 stand as 3.
+            intensity_factor: intensities are multiplied with it, and rounded.
+            withheld: points that are there, but not to be used.
+
+        Raises:
+            LasError: coordinates beyond what the scale allows; the file cannot be finished then.
+            OSError: the stream's.
+        """
+        for first in range(0, len(points), BLOCK):
+            records = self._packer.pack(
+                points, first, scanner=scanner, intensity_factor=intensity_factor, withheld=withheld
+            )
+            self._compressor.compress_many(records.view(np.uint8))
+
+    def close(self) -> None:
+        """Finish the points and write the header that tells of them."""
+        self._compressor.done()
+        self._stream.seek(0)
+        self._stream.write(self.header.encode(self._laszip.record_data()))
+        self._stream.seek(0, 2)
+
+
+@kept
+def _pack(
+    out: Any, first: int, time_ns: Int64Array, points_map: FloatArray, angle_rad: SingleArray, intensity: SingleArray,
+    number: ByteArray, of: ByteArray, beam: NDArray[np.uint16], offset: FloatArray, per_unit: FloatArray,
+    intensity_factor: float, flags: int, source: int, least: FloatArray, largest: FloatArray,
+    by_return: Int64Array, clipped: Int64Array,
+) -> int:  # fmt: skip
+    """Pack as many points as there are records; the row of one that is out of bounds, else −1."""
+    off_x, off_y, off_z = offset
+    per_x, per_y, per_z = per_unit
+    low_x, low_y, low_z = least
+    high_x, high_y, high_z = largest
+    clip = 0
+    for j in range(len(out)):
+        i = first + j
+        record = out[j]
+        x = np.rint((points_map[i, 0] - off_x) * per_x)
+        y = np.rint((points_map[i, 1] - off_y) * per_y)
+        z = np.rint((points_map[i, 2] - off_z) * per_z)
+        if not (abs(x) <= 2147483647.0 and abs(y) <= 2147483647.0 and abs(z) <= 2147483647.0):
+            return i
+        record.x, record.y, record.z = np.int32(x), np.int32(y), np.int32(z)
+        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+        strength = np.rint(intensity[i] * intensity_factor)
+        clip += strength > 65535.0
+        record.intensity = np.uint16(min(max(strength, 0.0), 65535.0))
+        slot, slots = min(number[i], 15), min(of[i], 15)
+        by_return[slot] += 1
+        record.returns = np.uint8(slot | slots << 4)
+        record.flags, record.point_source_id = np.uint8(flags), np.uint16(source)
+        record.classification, record.user_data = np.uint8(0), np.uint8(min(beam[i], 255))
+        angle = float(angle_rad[i])
+        if abs(angle) > math.pi:
+            angle -= _TURN * np.rint(angle / _TURN)
+        record.scan_angle = np.int16(np.rint(angle * _PER_SCAN_ANGLE_UNIT))
+        second = time_ns[i] // 1_000_000_000
+        record.gps_time = (second - ADJUSTED_GPS_EPOCH_S) + (time_ns[i] - second * 1_000_000_000) / 1e9
+    least[0], least[1], least[2] = low_x, low_y, low_z
+    largest[0], largest[1], largest[2] = high_x, high_y, high_z
+    clipped[2] += clip
+    return -1
+
+
+@kernel
+def _clip_sigmas(record: Any, east: float, north: float, height: float, clipped: Int64Array) -> None:
+    if east != east or north != north or height != height:
+        clipped[1] += 1
+    else:
+        clipped[0] += 1
+    if not east < 65534.5:
+        record.sigma_easting = np.uint16(65535)
+    if not north < 65534.5:
+        record.sigma_northing = np.uint16(65535)
+    if not height < 65534.5:
+        record.sigma_height = np.uint16(65535)
+
+
+@kept
+def _pack_sigmas(out: Any, first: int, sigma_map: SingleArray, clipped: Int64Array) -> None:
+    """Three sigmas of each record; a sigma that is no number stands as the largest."""
+    per = 1.0 / SIGMA_SCALE_M
+    for j in range(len(out)):
+        i = first + j
+        record = out[j]
+        east, north, height = sigma_map[i, 0] * per, sigma_map[i, 1] * per, sigma_map[i, 2] * per
+        record.sigma_easting = np.uint16(min(east, 65535.0) + 0.5)
+        record.sigma_northing = np.uint16(min(north, 65535.0) + 0.5)
+        record.sigma_height = np.uint16(min(height, 65535.0) + 0.5)
+        if not (east < 65534.5 and north < 65534.5 and height < 65534.5):
+            _clip_sigmas(record, east, north, height, clipped)

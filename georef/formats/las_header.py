@@ -1,0 +1,167 @@
+"""The bytes of a LAS 1.4 header and of the records behind it (LAS 1.4-R15; LASzip 3; COPC 1.0), nothing computed."""
+
+from __future__ import annotations
+
+import datetime as dt
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+HEADER_BYTES = 375
+POINT_FORMAT = 6
+COMPRESSED_BIT = 0x80
+RETURNS = 15
+GPS_TIME_IS_ADJUSTED = 1 << 0
+CRS_IS_WKT = 1 << 4
+
+_HEADER = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I3d3d6dQQIQ15Q")
+_VLR = struct.Struct("<H16sHH32s")
+_EVLR = struct.Struct("<H16sHQ32s")
+_EXTRA_BYTES = struct.Struct("<2xBB32s4x24x24x24xd16x24x32s")
+_UINT16, _SCALED = 3, 1 << 3
+_COPC_INFO = struct.Struct("<5dQQ2d88x")
+
+# Bytes of a point as they stand in a file, those of format 6 first.
+_POINT_FIELDS = [
+    ("x", "<i4"),
+    ("y", "<i4"),
+    ("z", "<i4"),
+    ("intensity", "<u2"),
+    ("returns", "u1"),  # return number, number of returns: four bits each
+    ("flags", "u1"),  # classification flags (withheld is bit 2), scanner channel in bits 4 and 5
+    ("classification", "u1"),
+    ("user_data", "u1"),
+    ("scan_angle", "<i2"),
+    ("point_source_id", "<u2"),
+    ("gps_time", "<f8"),
+]
+_SIGMA_FIELDS = [("sigma_easting", "<u2"), ("sigma_northing", "<u2"), ("sigma_height", "<u2")]
+POINT_DTYPE = np.dtype(_POINT_FIELDS)
+SIGMA_POINT_DTYPE = np.dtype(_POINT_FIELDS + _SIGMA_FIELDS)
+SIGMA_SCALE_M = 1e-4
+
+
+@dataclass(slots=True)
+class LasHeader:
+    """What a header says.
+
+    Attributes:
+        scale, offset: (3,) coordinates = integer · scale + offset.
+        sigmas: the points have the three sigmas behind them.
+        wkt: coordinate system.
+        creation_date: of the file; the flight's here, so that the same input gives the same bytes.
+        system_identifier, software: at most 32 bytes are kept.
+        file_source_id: of a file that is one strip, its number.
+        provenance: what the points were made with, JSON, as a record of ours; empty: none.
+        count, count_by_return, minimum, maximum: filled in when all points are written; the coordinates' integers.
+    """
+
+    scale: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    sigmas: bool
+    wkt: str
+    creation_date: dt.date
+    system_identifier: str = ""
+    software: str = ""
+    file_source_id: int = 0
+    provenance: str = ""
+    count: int = 0
+    count_by_return: NDArray[np.int64] = field(default_factory=lambda: np.zeros(RETURNS + 1, np.int64))
+    minimum: NDArray[np.float64] = field(default_factory=lambda: np.full(3, np.inf))
+    maximum: NDArray[np.float64] = field(default_factory=lambda: np.full(3, -np.inf))
+    evlr_start: int = 0
+    evlr_count: int = 0
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """Of a point."""
+        return SIGMA_POINT_DTYPE if self.sigmas else POINT_DTYPE
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) least and largest coordinates; zeros where there is no point."""
+        if not self.count:
+            return np.zeros((2, 3))
+        bounds: NDArray[np.float64] = np.stack([self.minimum, self.maximum]) * self.scale + self.offset
+        return bounds
+
+    def encode(self, laszip: bytes, first_vlrs: bytes = b"", first_count: int = 0) -> bytes:
+        """Header and records before the points.
+
+        Args:
+            laszip: the LASzip record's data.
+            first_vlrs, first_count: records that must stand first, and how many they are.
+        """
+        vlrs = first_vlrs + encode_vlr("LASF_Projection", 2112, _terminated(self.wkt), "OGC WKT coordinate system")
+        count = first_count + 2
+        if self.sigmas:
+            vlrs += encode_vlr("LASF_Spec", 4, _sigma_records(), "extra bytes")
+            count += 1
+        if self.provenance:
+            vlrs += encode_vlr("swath", 1, self.provenance.encode(), "provenance, JSON")
+            count += 1
+        vlrs += encode_vlr("laszip encoded", 22204, laszip, "LASzip")
+        day = self.creation_date.timetuple().tm_yday
+        (min_x, min_y, min_z), (max_x, max_y, max_z) = self.bounds
+        head = _HEADER.pack(
+            b"LASF",
+            self.file_source_id,
+            GPS_TIME_IS_ADJUSTED | CRS_IS_WKT,
+            bytes(16),
+            1,
+            4,
+            self.system_identifier.encode()[:32],
+            self.software.encode()[:32],
+            day,
+            self.creation_date.year,
+            HEADER_BYTES,
+            HEADER_BYTES + len(vlrs),
+            count,
+            POINT_FORMAT | COMPRESSED_BIT,
+            self.dtype.itemsize,
+            *([0] * 6),  # the counts of LAS 1.3, which know no format 6
+            *self.scale,
+            *self.offset,
+            *(max_x, min_x, max_y, min_y, max_z, min_z),
+            0,
+            self.evlr_start,
+            self.evlr_count,
+            self.count,
+            *self.count_by_return[1:].tolist(),
+        )
+        return head + vlrs
+
+
+def encode_vlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
+    """A variable length record; raises ValueError where the data is longer than one can be."""
+    if len(data) > 0xFFFF:
+        raise ValueError(f"record {user_id} {record_id} of {len(data)} bytes, more than 65535")
+    return _VLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
+
+
+def encode_evlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
+    """An extended record, which stands behind the points."""
+    return _EVLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
+
+
+def encode_copc_info(
+    centre: NDArray[np.float64],
+    half_size: float,
+    spacing: float,
+    hierarchy: tuple[int, int],
+    gps_time: tuple[float, float],
+) -> bytes:
+    """COPC's first record: the root's cube, the spacing of its points, offset and size of the root page, time span."""
+    return _COPC_INFO.pack(*centre, half_size, spacing, *hierarchy, *gps_time)
+
+
+def _terminated(text: str) -> bytes:
+    return text.encode() + b"\0"
+
+
+def _sigma_records() -> bytes:
+    axes = [name for name, _ in _SIGMA_FIELDS]
+    description = b"one sigma, m; 6.5535: or more"
+    return b"".join(_EXTRA_BYTES.pack(_UINT16, _SCALED, name.encode(), SIGMA_SCALE_M, description) for name in axes)

@@ -1,0 +1,287 @@
+"""``swath georef``: points where the truth is, every return accounted for, mistakes named, nothing half done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from daemon.cli.main import run_app
+from daemon.log.reader import open_logs
+from daemon.processing.log_index import index_log
+from georef.formats.sbet import sbet_bytes
+from georef.formats.trajectory_csv import csv_text
+from georef.timescales.gps_time import DAY_NS
+from tests.daemon.one_line import Flown, fly
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
+
+S = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return fly(tmp_path_factory.mktemp("line"))
+
+
+@pytest.fixture(scope="module")
+def products(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("products")
+    assert run_app(flown.arguments(output)) == 0
+    return output
+
+
+def record(output: Path) -> dict[str, Any]:
+    """The sidecar."""
+    read: dict[str, Any] = json.loads(next(output.glob("*.json")).read_text())
+    return read
+
+
+def refused(capsys: pytest.CaptureFixture[str], output: Path, arguments: list[str]) -> str:
+    """The one line of a command that made nothing."""
+    capsys.readouterr()
+    assert run_app(arguments) in (1, 2, 3)
+    line = capsys.readouterr().err
+    assert line.startswith("swath: ")
+    assert line.count("\n") == 1, line
+    assert "internal error" not in line
+    assert not list(output.glob("*"))
+    return line
+
+
+class TestProducts:
+    def test_points_lie_where_the_truth_does(self, flown: Flown, products: Path) -> None:
+        las = laspy.read(next(products.glob("*_strip01.laz")))
+        truth = flown.truth
+        to_map = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
+        expected = np.stack(to_map.transform(*truth["left.point_e"].T), axis=1)
+        of_time = np.lexsort((truth["left.return_number"], truth["left.gps_ns"]))
+        mine = np.lexsort((np.asarray(las.return_number), np.asarray(las.gps_time)))
+        assert len(las) == len(expected) > 50_000
+        gps_s = (truth["left.gps_ns"][of_time] - 10**18) / 1e9
+        assert np.abs(np.asarray(las.gps_time)[mine] - gps_s).max() < 2e-7
+        # an SREP packet counts in 1 mm and the file too
+        assert np.abs(las.xyz[mine] - expected[of_time]).max() < 0.002
+        assert np.array_equal(np.asarray(las.return_number)[mine], truth["left.return_number"][of_time])
+
+    def test_sigmas_come_from_the_trajectory(self, products: Path) -> None:
+        las = laspy.read(next(products.glob("*_strip01.laz")))
+        for name in ("sigma_easting", "sigma_northing", "sigma_height"):
+            assert 0.02 <= np.median(las[name]) < 0.08, name
+
+    def test_the_sidecar_tells_what_they_are_made_of(self, flown: Flown, products: Path) -> None:
+        told = record(products)
+        assert (told["format"], told["complete"], told["holes"]) == ("swath.georef", True, [])
+        digest = hashlib.sha256(flown.log.read_bytes()).hexdigest()
+        assert told["logs"] == [{"name": flown.log.name, "sha256": digest}]
+        calibration = told["flights"][0]["calibrations"]["left"]
+        assert calibration["id"] in (flown.folder / "left.true.toml").read_text()
+        assert calibration["parameters"]["phi_deg"] == pytest.approx(-0.4021)
+        assert told["crs"]["name"] == "WGS 84 / UTM zone 32N"
+        edge = told["flights"][0]["atmosphere_at_edge"]["left"]
+        assert edge["angle_deg"] == pytest.approx(30.0, abs=2.0)  # rolling in turbulence
+        assert 200 < edge["height_above_ground_m"] < 400
+        (strip,) = told["strips"]
+        assert strip["file"] == f"{flown.name}_strip01.laz"
+        assert {path.name for path in products.iterdir()} == {strip["file"], *told["files"], f"{flown.name}.json"}
+
+    def test_the_calibration_stands_in_the_file(self, flown: Flown, products: Path) -> None:
+        with laspy.open(next(products.glob("*_strip01.laz"))) as reader:
+            ours = next(vlr for vlr in reader.header.vlrs if vlr.user_id == "swath")
+        assert json.loads(ours.record_data)["calibrations"] == {
+            "left": record(products)["flights"][0]["calibrations"]["left"]["id"]
+        }
+
+    def test_the_trajectory_that_was_used_can_be_used_again(self, flown: Flown, products: Path, tmp_path: Path) -> None:
+        again = flown.arguments(tmp_path / "again")
+        again[again.index("--trajectory") + 1] = str(products / f"{flown.name}_trajectory.sbet")
+        assert run_app(again) == 0
+        one, other = (laspy.read(next(path.glob("*_strip01.laz"))) for path in (products, tmp_path / "again"))
+        assert np.abs(one.xyz - other.xyz).max() <= 0.001 + 1e-9
+
+    def test_without_a_trajectory_the_log_says_what_is_wanted(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        arguments = flown.arguments(tmp_path / "x")
+        del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
+        assert "want --trajectory FILE" in refused(capsys, tmp_path / "x", arguments)
+
+
+class TestStrips:
+    def times(self, flown: Flown, path: Path, *spans_s: tuple[float, float]) -> Path:
+        """A file of strips, in seconds since the first return."""
+        first = int(flown.truth["left.gps_ns"][0])
+        lines = [f"{first + round(start * S)},{first + round(end * S)}" for start, end in spans_s]
+        path.write_text("\n".join(["start_gps_ns,end_gps_ns", *lines]))
+        return path
+
+    def test_every_return_is_in_a_file_or_counted(self, flown: Flown, tmp_path: Path) -> None:
+        file = self.times(flown, tmp_path / "times.csv", (2.0, 16.0), (16.0, 29.5))
+        assert run_app(flown.arguments(tmp_path / "out", "--strips", str(file), "--json")) == 0
+        told = record(tmp_path / "out")
+        counts = told["counts"]["left"]
+        truth_ns = np.sort(flown.truth["left.gps_ns"])
+        assert counts["read"] == len(truth_ns)
+        assert counts["written"] + sum(counts["dropped"].values()) == counts["read"]
+        assert set(counts["dropped"]) == {"between_strips"}
+        times = []
+        for number, (start, end) in enumerate(((2.0, 16.0), (16.0, 29.5)), start=1):
+            las = laspy.read(tmp_path / "out" / f"{flown.name}_strip{number:02d}.laz")
+            assert set(np.asarray(las.point_source_id)) == {number}
+            since = np.sort(np.asarray(las.gps_time)) + 1e9 - truth_ns[0] / 1e9
+            assert abs(since[0] - start) < 0.05  # a datagram belongs to one strip as a whole
+            assert abs(since[-1] - end) < 0.05
+            times.append(since)
+        joined = np.concatenate(times)
+        assert len(joined) == counts["written"]
+        assert np.diff(joined).min() >= 0
+
+    def test_a_strip_that_the_trajectory_does_not_reach_is_partial(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        first = int(flown.truth["left.gps_ns"][0])
+        short = flown.trajectory().between(first - 20 * S, first + 4 * S)
+        (tmp_path / "short.csv").write_text(csv_text(short))
+        arguments = flown.arguments(tmp_path / "out", "--strips", "whole")
+        arguments[arguments.index("--trajectory") + 1] = str(tmp_path / "short.csv")
+        assert run_app(arguments) == 1
+        assert "partial" in capsys.readouterr().err
+        told = record(tmp_path / "out")
+        outside = int((flown.truth["left.gps_ns"] > short.span[1]).sum())
+        assert told["counts"]["left"]["dropped"] == {"outside_trajectory": outside}
+        assert told["holes"] == [f"strip 1: {outside:,} returns of left are outside the trajectory"]
+
+    def test_cloud_optimised_files_hold_the_same(self, flown: Flown, products: Path, tmp_path: Path) -> None:
+        assert run_app(flown.arguments(tmp_path / "out", "--copc", "--no-sigma")) == 0
+        with laspy.CopcReader.open(tmp_path / "out" / f"{flown.name}_strip01.copc.laz") as reader:
+            found = reader.query()
+        plain = laspy.read(next(products.glob("*_strip01.laz")))
+        orders = [np.lexsort((np.asarray(las.Z), np.asarray(las.gps_time))) for las in (found, plain)]
+        assert np.array_equal(np.asarray(found.X)[orders[0]], np.asarray(plain.X)[orders[1]])
+        assert list(found.point_format.extra_dimension_names) == []
+
+
+class TestPartial:
+    def test_a_damaged_chunk_is_named_and_the_rest_is_delivered(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        log = flown.copy_of_log(tmp_path / "bad")
+        chunks = index_log(open_logs([log])[0]).scanner_chunks()
+        chunk = chunks[len(chunks) // 2]
+        data = bytearray(log.read_bytes())
+        data[chunk.offset + chunk.length // 2] ^= 0xFF
+        log.write_bytes(data)
+        assert run_app(flown.arguments(tmp_path / "out", log=log)) == 1
+        assert "partial" in capsys.readouterr().err
+        told = record(tmp_path / "out")
+        assert not told["complete"]
+        assert len(told["holes"]) == 1
+        assert log.name in told["holes"][0]
+        assert "CRC" in told["holes"][0]
+        missing = len(flown.truth["left.gps_ns"]) - told["counts"]["left"]["written"]
+        assert 0 < missing < 5_000
+
+    def test_a_log_that_was_cut_off_gives_what_it_has(self, flown: Flown, tmp_path: Path) -> None:
+        log = flown.copy_of_log(tmp_path / "cut")
+        log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
+        assert run_app(flown.arguments(tmp_path / "out", log=log)) == 1
+        told = record(tmp_path / "out")
+        assert not told["complete"]
+        assert any("the file ends" in line or "unreadable" in line for line in told["holes"])
+        assert told["counts"]["left"]["written"] > 20_000
+
+    def test_an_interrupted_run_leaves_nothing(
+        self, flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def interrupted(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("daemon.processing.products.write_sidecar", interrupted)
+        monkeypatch.setattr("daemon.processing.products._write_trajectory", interrupted)
+        assert run_app(flown.arguments(tmp_path / "out")) == 130
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+class TestRefusals:
+    def test_products_of_an_earlier_run_are_kept(
+        self, flown: Flown, products: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        before = {path.name: path.stat().st_mtime_ns for path in products.iterdir()}
+        assert run_app(flown.arguments(products)) == 2
+        assert "--overwrite" in capsys.readouterr().err
+        assert {path.name: path.stat().st_mtime_ns for path in products.iterdir()} == before
+
+    @pytest.mark.parametrize(("shift_s", "words"), [(18, "UTC"), (-7 * 86_400, "week"), (3 * 3600, "do not overlap")])
+    def test_a_trajectory_of_another_time_is_named(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_s: int, words: str
+    ) -> None:
+        truth = flown.trajectory()
+        (tmp_path / "late.csv").write_text(csv_text(replace(truth, time_ns=truth.time_ns - shift_s * S)))
+        arguments = flown.arguments(tmp_path / "out")
+        arguments[arguments.index("--trajectory") + 1] = str(tmp_path / "late.csv")
+        line = refused(capsys, tmp_path / "out", arguments)
+        assert "late.csv" in line
+        assert words in line
+
+    def test_seconds_of_the_day_are_named(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        table = np.frombuffer(sbet_bytes(flown.trajectory()), "<f8").reshape(-1, 17).copy()
+        table[:, 0] %= DAY_NS // S
+        (tmp_path / "day.sbet").write_bytes(table.tobytes())
+        arguments = flown.arguments(tmp_path / "out")
+        arguments[arguments.index("--trajectory") + 1] = str(tmp_path / "day.sbet")
+        assert "seconds of the day" in refused(capsys, tmp_path / "out", arguments)
+
+    @pytest.mark.parametrize(
+        ("more", "words"),
+        [
+            (("--strips", "nowhere.csv"), "nowhere.csv"),
+            (("--min-strip", "500"), "no strip"),
+            (("--scale", "0.0000001"), "beyond what a LAS file"),
+            (("--trajectory-at", "nose"), "want body, antenna, scanner or x,y,z"),
+            (("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler"),
+            (("--calibration", "right=left.true.toml"), "left.true.toml"),
+        ],
+    )
+    def test_wrong_wishes(
+        self,
+        flown: Flown,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+        more: tuple[str, str],
+        words: str,
+    ) -> None:
+        monkeypatch.setattr("daemon.processing.workers.CONNECT_S", 1)
+        assert words in refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", *more))
+
+    def test_a_calibration_of_another_head_or_atmosphere(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        text = (flown.folder / "left.true.toml").read_text()
+        for old, new, words in (
+            ('scanner_serial = "', 'scanner_serial = "other-', "another head"),
+            ('refraction = "none"', 'refraction = "ardc"', "estimated with refraction"),
+        ):
+            assert old in text
+            (tmp_path / "other.toml").write_text(text.replace(old, new))
+            arguments = flown.arguments(tmp_path / "out")
+            arguments[arguments.index("--calibration") + 1] = str(tmp_path / "other.toml")
+            line = refused(capsys, tmp_path / "out", arguments)
+            assert "other.toml" in line
+            assert words in line
+
+    def test_two_recordings_of_one_time(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        log = flown.copy_of_log(tmp_path / "second")
+        renamed = log.read_bytes().replace(flown.name.encode(), flown.name[:-4].encode() + b"0000")
+        log.write_bytes(renamed)
+        line = refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", str(log)))
+        assert "two recordings of one time" in line

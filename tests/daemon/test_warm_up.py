@@ -1,0 +1,122 @@
+"""``swath warm-up``: after it nothing is left to be compiled, and nothing to be read from the cache either."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+
+from daemon.processing.warm_up import WarmUp, cache_folder, compilations
+from tests.daemon.test_cli import ROOT, swath
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+ALL_SIGNATURES = """
+import gc, json, sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+
+def signatures():
+    known = (one for one in gc.get_objects() if isinstance(one, Dispatcher))
+    return {f"{one.py_func.__qualname__} {signature}" for one in known for signature in one.overloads}
+"""
+
+FLY = (
+    ALL_SIGNATURES
+    + """
+from daemon.config.tables import LiveConfig
+from daemon.processing.live import replay
+from daemon.processing.warm_up import compilations, warm_setup, warm_up
+from tests.daemon.test_live import Flown
+
+folder = Path(sys.argv[1])
+flown = Flown(folder)
+warm_up()
+setup = flown.setup()
+warm_setup(setup)
+before = signatures()
+with compilations() as names:
+    found = replay(flown.session(), setup, folder / "live", LiveConfig(), None)
+print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "known": len(before),
+                  "points": sum(found["points"].values())}))
+"""
+)
+
+NO_CACHE = """
+import numpy as np
+from daemon.processing.live_grid import CountGrid
+from daemon.processing.warm_up import WarmUp, cache_folder
+from tests.drivers.test_compiled import random_slots, returns_table
+from drivers.compiled.rows import fill
+
+grid = CountGrid(1.0)
+grid.add(np.zeros((3, 3)))
+made = random_slots(1, None, 1)
+print(cache_folder(), grid.points, fill(made, returns_table(made.content.size)) > 500)
+"""
+
+
+def run_python(text: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", text, *(str(argument) for argument in arguments)]
+    return subprocess.run(
+        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+@pytest.mark.timeout(400)
+def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path) -> None:
+    """The first pulse costs what the thousandth does: neither compiling nor reading what was compiled before."""
+    done = run_python(FLY, tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["new"] == []
+    assert found["compiled"] == []
+    assert found["known"] > 15
+    assert found["points"] > 20_000
+
+
+def test_what_is_compiled_is_noticed() -> None:
+    def twice(x: int) -> int:
+        return 2 * x
+
+    compiled: Any = numba.njit(twice)
+    with compilations() as names:
+        assert compiled(3) == 6
+    assert any("twice" in name for name in names)
+    with compilations() as names:
+        assert compiled(4) == 8
+    assert names == []
+
+
+@pytest.mark.skipif(
+    tuple(int(part) for part in numba.__version__.split(".")[:2]) < (0, 62), reason="its caches cannot be taken away"
+)
+def test_without_a_place_to_keep_them_loops_are_compiled_in_memory(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    nowhere = str(tmp_path / "file/cache")
+    done = run_python(NO_CACHE, NUMBA_CACHE_DIR=nowhere, NUMBA_CACHE_LOCATOR_CLASSES="_UserProvidedCacheLocator")
+    assert done.stdout.split() == ["None", "3", "True"], done.stderr
+
+
+def test_says_where_the_cache_is_or_that_there_is_none(tmp_path: Path) -> None:
+    folder = cache_folder()
+    assert folder is not None
+    assert folder.is_dir()
+    assert WarmUp(12, 3.25, tmp_path).text() == f"12 loops compiled in 3.2 s; kept in {tmp_path}"
+    assert "already" in WarmUp(0, 0.5, tmp_path).text()
+    assert "compiles in memory: set NUMBA_CACHE_DIR" in WarmUp(12, 3.25, None).text()
+
+
+def test_a_wrong_configuration_is_a_line(tmp_path: Path) -> None:
+    config = tmp_path / "swath.toml"
+    config.write_text('[session]\nname = "a"\nspeed = 3\n')
+    done = swath("warm-up", str(config))
+    assert done.returncode == 2
+    assert done.stderr.startswith("swath: ")
+    assert "speed" in done.stderr
