@@ -5,13 +5,27 @@ Nothing is compiled with fast-math or in parallel: a return's result depends on 
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 
 Compiled = TypeVar("Compiled", bound=Callable[..., Any])
 _njit: Any = numba.njit
+
+
+def _digest() -> int:
+    """A number that changes with the text of any module whose functions or constants may be compiled into another's."""
+    digest = 0
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        if "timescales" not in path.parts:
+            digest = zlib.crc32(path.read_bytes(), digest)
+    return digest
+
+
+_DIGEST = _digest()
 
 
 def kernel(function: Compiled) -> Compiled:
@@ -23,12 +37,17 @@ def kernel(function: Compiled) -> Compiled:
 def kept(function: Compiled) -> Compiled:
     """Compile an outermost function, and keep it on disk.
 
-    Numba knows it again by the age of its file. Where no folder can be written to, it is compiled anew in every
-    process.
+    Numba takes it for the same by the age of its own file, though kernels of others are compiled into it: the digest of
+    them all goes into the stamp, for else a new version would run the old one's loops. Where no folder can be written
+    to, or numba keeps its stamp elsewhere, it is compiled anew in every process.
     """
-    compiled: Compiled
+    options = {"nogil": True, "error_model": "numpy"}
+    compiled: Any
     try:
-        compiled = _njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        compiled = _njit(nogil=True, error_model="numpy")(function)
-    return compiled
+        compiled = _njit(cache=True, **options)(function)
+        index = compiled._cache._cache_file  # noqa: SLF001  (numba has no other way in)
+        index._source_stamp = (index._source_stamp, _DIGEST)  # noqa: SLF001
+    except (RuntimeError, AttributeError):
+        compiled = _njit(**options)(function)
+    kept_one: Compiled = compiled
+    return kept_one

@@ -1,0 +1,57 @@
+"""Compiled loops are kept between processes, and never outlive the text they were made of."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import georef
+
+INNER = "from georef.compiled import kernel\n\n\n@kernel\ndef inner(x: float) -> float:\n    return {factor} * x\n"
+OUTER = """from georef.compiled import kept
+from georef.inner import inner
+
+
+@kept
+def outer(x: float) -> float:
+    return inner(x)
+
+
+print(outer(1.0), sum(outer.stats.cache_hits.values()))
+"""
+
+
+def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> None:
+    package = tmp_path / "georef"
+    package.mkdir()
+    shutil.copy(Path(str(georef.__file__)).parent / "compiled.py", package)
+    (package / "__init__.py").touch()
+    (package / "outer.py").write_text(OUTER)
+
+    def run(factor: float) -> str:
+        (package / "inner.py").write_text(INNER.format(factor=factor))
+        environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        command = [sys.executable, "-c", "import georef.outer"]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert run(2.0) == "2.0 0"
+    assert run(2.0) == "2.0 1"
+    assert run(3.0) == "3.0 0"
+
+
+def test_without_a_folder_to_write_to_it_is_compiled_all_the_same(tmp_path: Path) -> None:
+    package = tmp_path / "georef"
+    package.mkdir()
+    shutil.copy(Path(str(georef.__file__)).parent / "compiled.py", package)
+    (package / "__init__.py").touch()
+    (package / "inner.py").write_text(INNER.format(factor=4.0))
+    (package / "outer.py").write_text(OUTER.replace(", sum(outer.stats.cache_hits.values())", ""))
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": "/proc/nowhere"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import georef.outer"], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "4.0", done.stderr
