@@ -8,9 +8,10 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 Compiled = TypeVar("Compiled", bound=Callable[..., Any])
 _njit: Any = numba.njit
@@ -51,3 +52,8 @@ def kept(function: Compiled) -> Compiled:
         compiled = _njit(**options)(function)
     kept_one: Compiled = compiled
     return kept_one
+
+
+def whole(value: int) -> int:
+    """A constant for calls between compiled functions: numba compiles a function anew for every bare number."""
+    return cast(int, np.int64(value))

@@ -13,22 +13,27 @@ is between two steps stays in the processor's cache; a point depends on its retu
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.mapping import Mapping
+from georef.kernels.columns import fill_columns
+from georef.kernels.covariance import Flown
+from georef.kernels.types import PointColumns
+from georef.mapping import Mapping, MappingError
 from georef.points import ByteArray, Fate, Points, Rays
+from georef.ranging import PulseRates
 from georef.records import Int64Array, StructArray
-from georef.sensor_model import SensorModel
+from georef.sensor_model import SensorModel, contiguous
 from georef.trajectory import Trajectory
-from georef.uncertainty import Uncertainty
+from georef.uncertainty import Uncertainty, flown_between
 
 FloatArray = NDArray[np.float64]
 
-BLOCK_ROWS = 16_384
+BLOCK_ROWS = 4096
 
 
 class EncoderMotion(Protocol):
@@ -46,7 +51,7 @@ class Georeferencer:
         mapping: frame of the points; None: e.
         uncertainty: gives sigmas; None: none.
         encoder_motion: of the scanner's encoder, where its calibration has a latency or torsion.
-        prf_hz: pulse rate, where its calibration has range offsets by it.
+        prf_hz: pulse rate, where its calibration has range offsets by it; the attribute ``rates`` tells it by pulse.
     """
 
     def __init__(
@@ -59,6 +64,8 @@ class Georeferencer:
     ) -> None:
         self.model, self.mapping, self.uncertainty = model, mapping, uncertainty
         self.encoder_motion, self.prf_hz = encoder_motion, prf_hz
+        self._mapped = False  # any point so far
+        self.rates: PulseRates | None = None
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
         """Points of returns.
@@ -73,14 +80,17 @@ class Georeferencer:
 
         Raises:
             TrajectoryError: the trajectory has no attitude.
-            MappingError: the mapping frame does not reach there.
+            MappingError: the mapping frame has a place for no point of the first batches. Later, or where it has one
+                for some, those that it has none for are NOT_FINITE.
         """
         motion = None
         if self.encoder_motion is not None and self.model.needs_encoder_motion:
             motion = self.encoder_motion.motion(rows, time_ns)  # of all at once: a reading's rate asks its neighbours
-        pieces, fates = [], []
-        for start in range(0, max(len(rows), 1), BLOCK_ROWS):
-            block = slice(start, start + BLOCK_ROWS)
+        flown = self._flown(time_ns, trajectory)
+        points, fates = _room(len(rows), self.uncertainty is not None), np.empty(len(rows), np.uint8)
+        filled = 0
+        failed: MappingError | None = None
+        for block, prf_hz in self._blocks(rows):
             rate, acceleration = (None, None) if motion is None else (motion[0][block], motion[1][block])
             rays = self.model.rays(
                 rows[block],
@@ -89,47 +99,104 @@ class Georeferencer:
                 encoder_rate=rate,
                 encoder_acceleration=acceleration,
                 with_axes=self.uncertainty is not None,
-                prf_hz=self.prf_hz,
+                prf_hz=prf_hz,
             )
-            fates.append(rays.fate)
-            pieces.append(self._points(rows[block], rays, trajectory))
-        return Points.concatenate(pieces), np.concatenate(fates)
+            count, failure = self._fill(points, filled, rows[block], rays, trajectory, flown)
+            fates[block] = rays.fate
+            filled, failed = filled + count, failed or failure
+        if failed is not None and not filled and not self._mapped:
+            raise failed
+        self._mapped = self._mapped or filled > 0
+        return points if filled == len(rows) else points.take(slice(filled)), fates
 
-    def _points(self, rows: StructArray, rays: Rays, trajectory: Trajectory) -> Points:
-        """Through the air and onto the map: points of the rays that reached the ground."""
-        done = rays.fate == Fate.GEOREFERENCED
-        if not done.all():
-            rows, rays = rows[done], _only(rays, done)
-        points = rays.points_e
-        if self.model.air is not None:
-            self.model.air.apply(rays.origin_e, points)  # in place; NGA Eq. 4 to 11
-        return Points(
-            time_ns=rays.time_ns,
-            points_map=points if self.mapping is None else self.mapping.map_from_e(points),  # ISO Eq. 8
-            sigma_map=self._sigmas(rays, trajectory),
-            scan_angle_rad=rays.angle_rad.astype(np.float32),
-            range_m=rays.range_m.astype(np.float32),
-            intensity=rows["intensity"].copy(),
-            return_number=rows["return_number"].copy(),
-            number_of_returns=rows["number_of_returns"].copy(),
-            channel=rows["channel"].copy(),
-            mta_zone=rows["mta_zone"].copy(),
-        )
+    def _blocks(self, rows: StructArray) -> Iterator[tuple[slice, float | None]]:
+        """Rows that are taken at once, of one pulse rate where that matters, and the rate."""
+        runs = [(0, len(rows), self.prf_hz)]
+        if self.rates is not None and any(row.prf_hz is not None for row in self.model.calibration.range_offsets):
+            runs = [(start, stop, prf_hz) for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"])]
+        for first, last, prf_hz in runs:
+            for start in range(first, last, BLOCK_ROWS):
+                yield slice(start, min(start + BLOCK_ROWS, last)), prf_hz
 
-    def _sigmas(self, rays: Rays, trajectory: Trajectory) -> NDArray[np.float32] | None:
-        """(n, 3) along the axes of the points (ISO Eq. 13, 14)."""
-        if self.uncertainty is None:
+    def _flown(self, time_ns: Int64Array, trajectory: Trajectory) -> Flown | None:
+        """What the covariances of all these pulses need of the trajectory."""
+        if len(time_ns) and time_ns.min() < 0:
+            time_ns = time_ns[time_ns >= 0]
+        if self.uncertainty is None or len(trajectory) < 2 or not len(time_ns):
             return None
-        covariance_e = self.uncertainty.covariance_e(rays, trajectory)
+        offset_ns = round(self.model.calibration.value("time_offset_s") * 1e9)
+        return flown_between(trajectory, int(time_ns.min()) + offset_ns, int(time_ns.max()) + offset_ns)
+
+    def _fill(
+        self, points: Points, filled: int, rows: StructArray, rays: Rays, trajectory: Trajectory, flown: Flown | None
+    ) -> tuple[int, MappingError | None]:
+        """Through the air and onto the map: points of the rays that reached the ground, from row ``filled`` on.
+
+        Returns:
+            how many; and, where there were rays that the map has no place for, what it said. Their fate is NOT_FINITE.
+        """
+        if self.model.air is not None:
+            self.model.air.apply(rays.origin_e, rays.points_e)  # in place; NGA Eq. 4 to 11
+        done = rays.fate == Fate.GEOREFERENCED
+        whole = bool(done.all())
+        failure: MappingError | None = None
+        points_e = rays.points_e if whole else rays.points_e[done]
+        try:
+            mapped = points_e if self.mapping is None else self.mapping.map_from_e(points_e)  # ISO Eq. 8
+        except MappingError as error:
+            failure, whole = error, False
+            reached = self._reached(points_e)
+            rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
+            done[done] = reached
+            points_e = points_e[reached]
+            mapped = points_e if self.mapping is None else self.mapping.map_from_e(points_e)
+        if not whole:
+            rows, rays = rows[done], _only(rays, done)
+        to = slice(filled, filled + len(points_e))
+        points.points_map[to] = mapped
+        columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
+        fill_columns(contiguous(rows), rays.time_ns, rays.angle_rad, rays.range_m, columns)
+        if points.sigma_map is not None and len(points_e):
+            points.sigma_map[to] = self._sigmas(rays, points_e, trajectory, flown)
+        return len(points_e), failure
+
+    def _reached(self, points_e: FloatArray) -> NDArray[np.bool_]:
+        """(n,) whether the map has a place for points that it refused together."""
+        finite: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points_e), axis=1)
+        finite[finite] = self.mapping.reaches(points_e[finite]) if self.mapping is not None else True
+        return finite
+
+    def _sigmas(
+        self, rays: Rays, points_e: FloatArray, trajectory: Trajectory, flown: Flown | None
+    ) -> NDArray[np.float32]:
+        """(n, 3) along the axes of the points (ISO Eq. 13, 14)."""
+        assert self.uncertainty is not None
+        covariance_e = self.uncertainty.covariance_e(rays, trajectory, flown=flown)
         if self.mapping is None:
             return np.sqrt(covariance_e[:, [0, 3, 5]]).astype(np.float32)
-        return self.mapping.sigma_map(rays.points_e, covariance_e)
+        return self.mapping.sigma_map(points_e, covariance_e)
+
+
+def _room(count: int, with_sigmas: bool) -> Points:
+    """Room for n points."""
+    return Points(
+        time_ns=np.empty(count, np.int64),
+        points_map=np.empty((count, 3)),
+        sigma_map=np.empty((count, 3), np.float32) if with_sigmas else None,
+        scan_angle_rad=np.empty(count, np.float32),
+        range_m=np.empty(count, np.float32),
+        intensity=np.empty(count, np.float32),
+        return_number=np.empty(count, np.uint8),
+        number_of_returns=np.empty(count, np.uint8),
+        channel=np.empty(count, np.uint16),
+        mta_zone=np.empty(count, np.uint8),
+    )
 
 
 def _only(rays: Rays, which: NDArray[np.bool_]) -> Rays:
-    """Some of the rays."""
+    """Some of the rays; vectors stay columns beside each other."""
     columns: dict[str, Any] = {}
     for field in fields(Rays):
         column = getattr(rays, field.name)
-        columns[field.name] = None if column is None else column[which]
+        columns[field.name] = None if column is None else column.T[..., which].T
     return Rays(**columns)

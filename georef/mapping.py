@@ -30,7 +30,7 @@ from georef.datums import (
     transformer_of,
 )
 from georef.earth import geodetic_from_e
-from georef.map_cells import APPROXIMATION_M, MapCells
+from georef.map_cells import APPROXIMATION_M, ROOT_M, MapCells
 
 __all__ = ["Mapping", "MappingError"]
 
@@ -121,6 +121,23 @@ class Mapping:
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
         return self._cells.map(points)
+
+    def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
+        """Whether `map_from_e` has coordinates for each of finite positions in e (n, 3); never raises for one of them.
+
+        Raises MappingError where no operation can be chosen.
+        """
+        points = np.ascontiguousarray(points_e, dtype=np.float64)
+        self._settle_by_first(points)
+        reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(self._forward(points)), axis=1)
+        centres, cube = np.unique(np.floor(points / ROOT_M), axis=0, return_inverse=True)
+        admitted = np.ones(len(centres), dtype=bool)
+        for k, centre in enumerate((centres + 0.5) * ROOT_M):
+            try:
+                self._admit(centre[np.newaxis])
+            except MappingError:
+                admitted[k] = False
+        return reached & admitted[cube.reshape(-1)]
 
     def sigma_map(self, points_e: FloatArray, covariance_e: FloatArray) -> NDArray[np.float32]:
         """Sigmas (n, 3) along easting, northing and up, in metres, of covariances in e (n, 6) xx xy xz yy yz zz, m².

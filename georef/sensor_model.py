@@ -18,7 +18,7 @@ from georef.atmosphere import Air
 from georef.beams import Geometry
 from georef.calibration import Calibration
 from georef.kernels.beam import FIXED_ANGLE, SPINNING
-from georef.kernels.rays import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, cast, fill_axes
+from georef.kernels.rays import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, cast
 from georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
 from georef.mount import Mount
 from georef.points import Fate, Rays
@@ -102,21 +102,19 @@ class SensorModel:
             text = "encoder latency and torsion need the encoder's motion"
             raise ValueError(f"calibration of {self.calibration.scanner}: {text}")
         trajectory.require_attitude()
-        rows, time_ns = _own(rows), _own(time_ns)
+        rows, time_ns = contiguous(rows), contiguous(time_ns)
         out, axes = _out(len(rows)), _axes(len(rows) if with_axes else 0)
         if len(trajectory) < 2:
             out.fate[:] = Fate.OUTSIDE_TRAJECTORY
         elif len(rows):
             model = self._model(time_ns, trajectory, encoder_rate, encoder_acceleration, prf_hz)
-            cast(rows, time_ns, model, out)
-            if with_axes:
-                fill_axes(rows, time_ns, model, out, axes)
+            cast(rows, time_ns, model, out, axes)
         if not with_axes:
             return Rays(**out._asdict())
         still = np.zeros(len(rows))
         return Rays(
             **out._asdict(),
-            **axes._asdict(),
+            **{name: column.T for name, column in axes._asdict().items()},
             measured_m=rows["range_m"].copy(),
             encoder_rad=self._readings(rows),
             encoder_rate=still if encoder_rate is None else encoder_rate,
@@ -172,8 +170,8 @@ class SensorModel:
             offset_rad=value("scan_angle_offset_rad"),
             latency_s=value("encoder_latency_s"),
             torsion_s2=value("torsion_s2"),
-            rate=_own(rate),
-            acceleration=_own(acceleration),
+            rate=contiguous(rate),
+            acceleration=contiguous(acceleration),
         )
 
     def _mounted(self, time_ns: Int64Array) -> Mounted:
@@ -189,10 +187,10 @@ class SensorModel:
 
     def _track(self, trajectory: Trajectory, offset_ns: float) -> Track:
         return Track(
-            _own(trajectory.time_ns),
-            _own(trajectory.position_e),
-            _own(trajectory.q_e_from_b),
-            _own(trajectory.rotvec_b),
+            contiguous(trajectory.time_ns),
+            contiguous(trajectory.position_e),
+            contiguous(trajectory.q_e_from_b),
+            contiguous(trajectory.rotvec_b),
             trajectory.max_gap_ns,
             offset_ns,
             self.calibration.value("imu_latency_s") * _SECOND_NS,
@@ -211,9 +209,10 @@ class SensorModel:
         return chosen
 
 
-def _own(array: NDArray[Any]) -> NDArray[Any]:
+def contiguous(array: NDArray[Any]) -> NDArray[Any]:
     """The array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
-    return np.require(array, requirements=["C", "W"])
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else array.copy()
 
 
 def _out(count: int) -> Out:
@@ -229,15 +228,15 @@ def _out(count: int) -> Out:
 
 
 def _axes(count: int) -> Axes:
-    """Room for their axes; zero where there are none."""
+    """Room for their axes."""
     return Axes(
-        q_e_from_b=np.zeros((count, 4)),
+        q_e_from_b=np.empty((4, count)),
         epoch=np.zeros(count, np.int64),
         share=np.zeros(count),
-        arm_b=np.zeros((count, 3)),
-        range_axis_b=np.zeros((count, 3)),
-        angle_axis_b=np.zeros((count, 3)),
-        tilt_axis_b=np.zeros((count, 3)),
+        arm_b=np.empty((3, count)),
+        range_axis_b=np.empty((3, count)),
+        angle_axis_b=np.empty((3, count)),
+        tilt_axis_b=np.empty((3, count)),
     )
 
 

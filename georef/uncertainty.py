@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from georef.calibration import INDEX, PARAMETERS, Calibration
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.kernels.covariance import (
+    ALONG_ONLY,
     ANGLE,
     ANGLE_BY_ACCELERATION,
     ANGLE_BY_RATE,
@@ -89,9 +90,11 @@ class Uncertainty:
             text = f"calibration {calibration.id}: its correlations are no covariance; want a positive definite matrix"
             raise UncertaintyError(text) from error
         errors = factor.T @ _effects(calibration)[active]
+        along = errors[:, ALONG_ONLY]
         self._known = Known(
             np.ascontiguousarray(errors),
             not errors[:, _BEYOND_LENGTH].any(),
+            np.ascontiguousarray(along.T @ along),
             calibration.lever_arm_b,
             calibration.value("scan_angle_offset_rad"),
             noise.range_m,
@@ -100,21 +103,39 @@ class Uncertainty:
             noise.divergence_rad,
         )
 
-    def covariance_e(self, rays: Rays, trajectory: Trajectory, incidence_rad: FloatArray | None = None) -> FloatArray:
+    def covariance_e(
+        self,
+        rays: Rays,
+        trajectory: Trajectory,
+        incidence_rad: FloatArray | None = None,
+        flown: Flown | None = None,
+    ) -> FloatArray:
         """(n, 6) xx xy xz yy yz zz in e, m²; nan where the trajectory says no sigma.
 
         Args:
             rays: georeferenced returns only, with axes, of this trajectory.
             trajectory: whose sigmas count.
             incidence_rad: (n,) between beam and the surface's normal, where the surface is known.
+            flown: of the trajectory, for callers that ask more than once (`flown_between`).
         """
         covariance_e = np.empty((len(rays.points_e), 6))
         if not len(covariance_e):
             return covariance_e
         seen = _seen(rays, _NONE if incidence_rad is None else incidence_rad)
-        flown = _flown(trajectory, int(seen.epoch.min()), int(seen.epoch.max()) + 2)
+        if flown is None:
+            flown = _flown(trajectory, int(seen.epoch.min()), int(seen.epoch.max()) + 2)
         covariances(seen, flown, self._known, covariance_e)
         return covariance_e
+
+
+def flown_between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Flown:
+    """What `covariance_e` needs of a trajectory for pulses from first_ns to last_ns; what lies outside it is left out.
+
+    The trajectory has at least two epochs.
+    """
+    last = len(trajectory.time_ns) - 2
+    first, end = np.searchsorted(trajectory.time_ns, [first_ns, last_ns], side="right") - 1
+    return _flown(trajectory, min(max(int(first), 0), last), min(max(int(end), 0), last) + 2)
 
 
 def _effects(calibration: Calibration) -> FloatArray:
@@ -139,7 +160,8 @@ def _effects(calibration: Calibration) -> FloatArray:
 
 def _seen(rays: Rays, incidence_rad: FloatArray) -> Seen:
     columns = {name: getattr(rays, name) for name in Seen._fields if name != "incidence_rad"}
-    return Seen(**columns, incidence_rad=incidence_rad)
+    across = {name: np.ascontiguousarray(column.T) for name, column in columns.items()}
+    return Seen(**across, incidence_rad=incidence_rad)
 
 
 def _flown(trajectory: Trajectory, first: int, end: int) -> Flown:

@@ -2,15 +2,23 @@
 
 The parameters' covariance is L Lᵀ: each column of L is one independent error of all parameters at once, and turns,
 shifts, lengthens and tilts the beam. The covariance of a point is the sum of the outer products of what these errors
-do to it, and of what trajectory, range, angle and time do. What turns with the body is summed in b.
+do to it, and of what trajectory, range, angle and time do. Where the errors only turn, shift and lengthen, their sum is
+taken before the returns. What turns with the body is summed in b.
+
+Returns go through in blocks, none of them longer than an interval of the trajectory, step by step: see
+`georef.kernels.block`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from georef.compiled import kept, kernel
+import numpy as np
+
+from georef.compiled import kept, kernel, whole
+from georef.kernels.block import BLOCK, put, three
+from georef.kernels.rotations import cross, dot, plus
 from georef.kernels.types import FloatArray, Six, Three
 from georef.records import Int64Array
 
@@ -19,10 +27,17 @@ TURN, TURN_BY_ANGLE, SHIFT = 0, 3, 6  # rotation vectors of the beam in b, the s
 LONGER, LONGER_BY_RANGE, TILTED, LATER, ATTITUDE_LATER = 9, 10, 11, 12, 13
 ANGLE, ANGLE_BY_READING, ANGLE_BY_RATE, ANGLE_BY_ACCELERATION = 14, 15, 16, 17
 COLUMNS = 18
+ALONG_ONLY = (*range(TURN, TURN + 3), *range(SHIFT, SHIFT + 3), LONGER, LONGER_BY_RANGE)  # columns of `Known.gram`
+
+# Rows of a block: rot_e_from_b; vectors in b; what a later attitude and a later pulse do, per second; numbers of the
+# return; its covariance
+ROT, ROT_2, ROT_3, ARM, ALONG, ACROSS, TILT, TURNING, MOVED = (whole(row) for row in range(0, 27, 3))
+SHARE, VARIANCE, MEASURED, THETA, ANGLE_OFF, COVARIANCE, COVARIANCE_2 = (whole(27 + k) for k in (0, 1, 2, 3, 4, 5, 8))
+ROWS, FIRST = 38, whole(0)
 
 
 class Seen(NamedTuple):
-    """Of each return, (n,) or (n, 3): `georef.points.Rays`; incidence_rad (0,): the surface is not known."""
+    """Of each return, (n,), (3, n), (4, n): `georef.points.Rays`; incidence_rad (0,): the surface is not known."""
 
     q_e_from_b: FloatArray
     epoch: Int64Array
@@ -63,6 +78,7 @@ class Known(NamedTuple):
     Attributes:
         errors: (p, 18) independent errors of one sigma, columns as above.
         along_only: whether no error has more than turn, shift and length.
+        gram: (8, 8) the covariance of these, which do for all errors then.
         lever_arm_b: (3,).
         angle_offset_rad: of the parameters.
         range_sigma_m, angle_sigma_rad, time_sigma_s: of one return.
@@ -71,6 +87,7 @@ class Known(NamedTuple):
 
     errors: FloatArray
     along_only: bool
+    gram: FloatArray
     lever_arm_b: FloatArray
     angle_offset_rad: float
     range_sigma_m: float
@@ -80,28 +97,23 @@ class Known(NamedTuple):
 
 
 @kernel
-def cross(a: Three, b: Three) -> Three:
-    """a × b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@kernel
-def plus_scaled(a: Three, factor: float, b: Three) -> Three:
-    """a + factor · b."""
-    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
-
-
-@kernel
-def dot(a: Three, b: Three) -> float:
-    """a · b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@kernel
 def with_outer(c: Six, factor: float, a: Three) -> Six:
     """C + factor · a aᵀ; xx, xy, xz, yy, yz, zz."""
     x, y, z = factor * a[0], factor * a[1], factor * a[2]
     return c[0] + x * a[0], c[1] + x * a[1], c[2] + x * a[2], c[3] + y * a[1], c[4] + y * a[2], c[5] + z * a[2]
+
+
+@kernel
+def sum_of(a: Six, b: Six) -> Six:
+    """a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@kernel
+def with_transpose(a: Three, b: Three) -> Six:
+    """a bᵀ + b aᵀ."""
+    mixed = a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1]
+    return 2.0 * a[0] * b[0], mixed[0], mixed[1], 2.0 * a[1] * b[1], mixed[2], 2.0 * a[2] * b[2]
 
 
 @kernel
@@ -152,73 +164,190 @@ def axes_of(w: float, x: float, y: float, z: float) -> tuple[Three, Three, Three
     )
 
 
+@kernel
+def six_at(array: FloatArray, k: int) -> Six:
+    """Row k of (n, 6)."""
+    return array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5]
+
+
+@kernel
+def six(block: FloatArray, i: int) -> Six:
+    """The covariance so far."""
+    at = COVARIANCE
+    return block[at, i], block[at + 1, i], block[at + 2, i], block[at + 3, i], block[at + 4, i], block[at + 5, i]
+
+
+@kernel
+def keep(block: FloatArray, i: int, c: Six) -> None:
+    """The covariance so far."""
+    put(block, COVARIANCE, i, (c[0], c[1], c[2]))
+    put(block, COVARIANCE_2, i, (c[3], c[4], c[5]))
+
+
+@kernel
+def axes_at(block: FloatArray, i: int) -> tuple[Three, Three, Three]:
+    """Rows of rot_e_from_b."""
+    return three(block, ROT, i), three(block, ROT_2, i), three(block, ROT_3, i)
+
+
+@kernel
+def take_vector(block: FloatArray, at: int, n: int, column: Any) -> None:
+    """Three rows from those of (3, n)."""
+    for axis in range(3):
+        for i in range(n):
+            block[at + axis, i] = column[axis, i]
+
+
+@kernel
+def take_number(block: FloatArray, at: int, n: int, column: Any) -> None:
+    """One row."""
+    for i in range(n):
+        block[at, i] = column[i]
+
+
+@kernel
+def take(block: FloatArray, n: int, here: Any, seen: Seen, known: Known) -> None:
+    """Fill a block."""
+    q = seen.q_e_from_b[:, here]
+    for i in range(n):
+        rows = axes_of(q[0, i], q[1, i], q[2, i], q[3, i])
+        put(block, ROT, i, rows[0])
+        put(block, ROT_2, i, rows[1])
+        put(block, ROT_3, i, rows[2])
+    take_vector(block, ARM, n, seen.arm_b[:, here])
+    take_vector(block, ALONG, n, seen.range_axis_b[:, here])
+    take_vector(block, ACROSS, n, seen.angle_axis_b[:, here])
+    take_number(block, SHARE, n, seen.share[here])
+    take_number(block, MEASURED, n, seen.measured_m[here])
+    own, quarter = known.range_sigma_m * known.range_sigma_m, 0.25 * known.divergence_rad
+    for i in range(n):
+        block[VARIANCE, i] = own
+    if len(seen.incidence_rad):  # a footprint on a surface that leans (FORMULAS 6.2)
+        incidence, ranges = seen.incidence_rad[here], seen.range_m[here]
+        for i in range(n):
+            smear = quarter * ranges[i] * math.tan(incidence[i])
+            block[VARIANCE, i] += smear * smear
+    if not known.along_only:
+        take_vector(block, TILT, n, seen.tilt_axis_b[:, here])
+        take_number(block, THETA, n, seen.angle_rad[here])
+
+
+@kernel
+def move(block: FloatArray, n: int, rate_b: Three, velocity_e: Three) -> None:
+    """Rows TURNING and MOVED."""
+    for i in range(n):
+        turning = cross(rate_b, three(block, ARM, i))
+        rows = axes_at(block, i)
+        put(block, TURNING, i, turning)
+        moved = plus(plus(turning, velocity_e[0], rows[0]), velocity_e[1], rows[1])
+        put(block, MOVED, i, plus(moved, velocity_e[2], rows[2]))
+
+
+@kernel
+def begin(block: FloatArray, n: int, here: Six, there: Six, angle_variance: float, time_variance: float) -> None:
+    """What attitude, scan angle and time do."""
+    for i in range(n):
+        c = of_turn(between(here, there, block[SHARE, i]), three(block, ARM, i))
+        c = with_outer(c, angle_variance, three(block, ACROSS, i))
+        keep(block, i, with_outer(c, time_variance, three(block, MOVED, i)))
+
+
+@kernel
+def add_along(block: FloatArray, n: int) -> None:
+    """What the range does."""
+    for i in range(n):
+        keep(block, i, with_outer(six(block, i), block[VARIANCE, i], three(block, ALONG, i)))
+
+
+@kernel
+def add_gram(block: FloatArray, n: int, g: FloatArray, lever: Three) -> None:
+    """What all errors do that turn, shift and lengthen: 8 × 8 of their columns; and the range."""
+    turn = g[0, 0], g[0, 1], g[0, 2], g[1, 1], g[1, 2], g[2, 2]
+    shift = g[3, 3], g[3, 4], g[3, 5], g[4, 4], g[4, 5], g[5, 5]
+    by_x, by_y, by_z = (g[0, 3], g[1, 3], g[2, 3]), (g[0, 4], g[1, 4], g[2, 4]), (g[0, 5], g[1, 5], g[2, 5])
+    turn_longer, turn_scaled = (g[0, 6], g[1, 6], g[2, 6]), (g[0, 7], g[1, 7], g[2, 7])
+    shift_longer, shift_scaled = (g[3, 6], g[4, 6], g[5, 6]), (g[3, 7], g[4, 7], g[5, 7])
+    longer, both, scaled = g[6, 6], g[6, 7], g[7, 7]
+    for i in range(n):
+        c, own = six(block, i), of_turn(turn, plus(three(block, ARM, i), -1.0, lever))
+        keep(block, i, sum_of(sum_of(c, own), shift))
+    for i in range(n):
+        c, beam = six(block, i), plus(three(block, ARM, i), -1.0, lever)
+        x, y, z = cross(by_x, beam), cross(by_y, beam), cross(by_z, beam)  # columns; their transpose counts too
+        keep(block, i, sum_of(c, (2.0 * x[0], x[1] + y[0], x[2] + z[0], 2.0 * y[1], y[2] + z[1], 2.0 * z[2])))
+    for i in range(n):
+        c, beam, along = six(block, i), plus(three(block, ARM, i), -1.0, lever), three(block, ALONG, i)
+        far = block[MEASURED, i]
+        variance = block[VARIANCE, i] + longer + far * (2.0 * both + far * scaled)
+        h = plus(cross(plus(turn_longer, far, turn_scaled), beam), 1.0, plus(shift_longer, far, shift_scaled))
+        h = plus(h, 0.5 * variance, along)
+        keep(block, i, sum_of(c, with_transpose(h, along)))
+
+
+@kernel
+def add_error(block: FloatArray, n: int, e: Any, lever: Three) -> None:
+    """What one error does; its part in the scan angle stands in row ANGLE_OFF."""
+    turn, by_angle = (e[0], e[1], e[2]), (e[TURN_BY_ANGLE], e[TURN_BY_ANGLE + 1], e[TURN_BY_ANGLE + 2])
+    shift, longer, by_range = (e[SHIFT], e[SHIFT + 1], e[SHIFT + 2]), e[LONGER], e[LONGER_BY_RANGE]
+    tilted, later, attitude_later = e[TILTED], e[LATER], e[ATTITUDE_LATER]
+    for i in range(n):
+        beam = plus(three(block, ARM, i), -1.0, lever)
+        effect = plus(shift, 1.0, cross(plus(turn, block[THETA, i], by_angle), beam))
+        effect = plus(effect, longer + by_range * block[MEASURED, i], three(block, ALONG, i))
+        effect = plus(effect, block[ANGLE_OFF, i], three(block, ACROSS, i))
+        effect = plus(effect, tilted, three(block, TILT, i))
+        effect = plus(effect, later, three(block, MOVED, i))
+        effect = plus(effect, attitude_later, three(block, TURNING, i))
+        keep(block, i, with_outer(six(block, i), 1.0, effect))
+
+
+@kernel
+def add_errors(block: FloatArray, n: int, here: Any, seen: Seen, known: Known, lever: Three) -> None:
+    """What the errors do one by one."""
+    readings, rates, accelerations = seen.encoder_rad[here], seen.encoder_rate[here], seen.encoder_acceleration[here]
+    offset = known.angle_offset_rad
+    for p in range(len(known.errors)):
+        e = known.errors[p]
+        constant, by_reading, by_rate, by_acceleration = e[14], e[15], e[16], e[17]
+        for i in range(n):
+            angle = constant + by_reading * (readings[i] - offset)
+            block[ANGLE_OFF, i] = angle + by_rate * rates[i] + by_acceleration * accelerations[i]
+        add_error(block, n, e, lever)
+
+
+@kernel
+def give(block: FloatArray, n: int, here: Six, there: Six, covariance_e: Any) -> None:
+    """Turn what stands in b to e, and add the position's."""
+    for i in range(n):
+        place = between(here, there, block[SHARE, i])
+        keep(block, i, sum_of(turned(six(block, i), axes_at(block, i)), place))
+    for i in range(n):
+        c = six(block, i)
+        covariance_e[i, 0], covariance_e[i, 1], covariance_e[i, 2] = c[0], c[1], c[2]
+        covariance_e[i, 3], covariance_e[i, 4], covariance_e[i, 5] = c[3], c[4], c[5]
+
+
 @kept
 def covariances(seen: Seen, flown: Flown, known: Known, covariance_e: FloatArray) -> None:
-    """Fill covariance_e (n, 6) xx xy xz yy yz zz, m².
-
-    Arrays are read here only: to hand one to a function costs more than the function does.
-    """
-    errors, lever = known.errors, (known.lever_arm_b[0], known.lever_arm_b[1], known.lever_arm_b[2])
-    own_variance, quarter = known.range_sigma_m * known.range_sigma_m, 0.25 * known.divergence_rad
+    """Fill covariance_e (n, 6) xx xy xz yy yz zz, m²."""
+    lever = known.lever_arm_b[0], known.lever_arm_b[1], known.lever_arm_b[2]
     angle_variance, time_variance = known.angle_sigma_rad**2, known.time_sigma_s**2
-    q, arms, along_b, across_b, tilt_b = (
-        seen.q_e_from_b,
-        seen.arm_b,
-        seen.range_axis_b,
-        seen.angle_axis_b,
-        seen.tilt_axis_b,
-    )
-    epochs, shares, incidence = seen.epoch, seen.share, seen.incidence_rad
-    ranges, angles, measured, readings = seen.range_m, seen.angle_rad, seen.measured_m, seen.encoder_rad
-    encoder_rates, accelerations = seen.encoder_rate, seen.encoder_acceleration
-    velocities, rates, turns, places = flown.velocity_e, flown.rate_b, flown.turn_b, flown.position_e
-    for k in range(len(ranges)):
-        at, share, theta = epochs[k] - flown.first, shares[k], angles[k]
-        on = at + 1
-        arm = arms[k, 0], arms[k, 1], arms[k, 2]
-        along = along_b[k, 0], along_b[k, 1], along_b[k, 2]
-        across = across_b[k, 0], across_b[k, 1], across_b[k, 2]
-        rows = axes_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
-        turning = cross((rates[at, 0], rates[at, 1], rates[at, 2]), arm)
-        moved = plus_scaled(turning, velocities[at, 0], rows[0])
-        moved = plus_scaled(plus_scaled(moved, velocities[at, 1], rows[1]), velocities[at, 2], rows[2])
-        c = of_turn(
-            between(
-                (turns[at, 0], turns[at, 1], turns[at, 2], turns[at, 3], turns[at, 4], turns[at, 5]),
-                (turns[on, 0], turns[on, 1], turns[on, 2], turns[on, 3], turns[on, 4], turns[on, 5]),
-                share,
-            ),
-            arm,
-        )
-        variance = own_variance
-        if len(incidence):  # a footprint on a surface that leans (FORMULAS 6.2)
-            smear = quarter * ranges[k] * math.tan(incidence[k])
-            variance += smear * smear
-        c = with_outer(with_outer(c, variance, along), angle_variance, across)
-        c = with_outer(c, time_variance, moved)
-        beam = arm[0] - lever[0], arm[1] - lever[1], arm[2] - lever[2]
-        for p in range(len(errors)):
-            turn = errors[p, 0], errors[p, 1], errors[p, 2]
-            longer = errors[p, LONGER] + errors[p, LONGER_BY_RANGE] * measured[k]
-            if not known.along_only:
-                by_angle = errors[p, TURN_BY_ANGLE], errors[p, TURN_BY_ANGLE + 1], errors[p, TURN_BY_ANGLE + 2]
-                turn = plus_scaled(turn, theta, by_angle)
-            effect = plus_scaled(cross(turn, beam), longer, along)
-            effect = plus_scaled(effect, 1.0, (errors[p, SHIFT], errors[p, SHIFT + 1], errors[p, SHIFT + 2]))
-            if not known.along_only:
-                angle = errors[p, ANGLE] + errors[p, ANGLE_BY_READING] * (readings[k] - known.angle_offset_rad)
-                angle += errors[p, ANGLE_BY_RATE] * encoder_rates[k]
-                angle += errors[p, ANGLE_BY_ACCELERATION] * accelerations[k]
-                effect = plus_scaled(effect, angle, across)
-                effect = plus_scaled(effect, errors[p, TILTED], (tilt_b[k, 0], tilt_b[k, 1], tilt_b[k, 2]))
-                effect = plus_scaled(effect, errors[p, LATER], moved)
-                effect = plus_scaled(effect, errors[p, ATTITUDE_LATER], turning)
-            c = with_outer(c, 1.0, effect)
-        c = turned(c, rows)
-        of_place = between(
-            (places[at, 0], places[at, 1], places[at, 2], places[at, 3], places[at, 4], places[at, 5]),
-            (places[on, 0], places[on, 1], places[on, 2], places[on, 3], places[on, 4], places[on, 5]),
-            share,
-        )
-        for element in range(6):
-            covariance_e[k, element] = c[element] + of_place[element]
+    epochs, velocities, rates = seen.epoch, flown.velocity_e, flown.rate_b
+    block = np.zeros((ROWS, BLOCK))
+    k = FIRST
+    while k < len(epochs):
+        last, n = min(len(epochs), k + BLOCK), 1
+        while k + n < last and epochs[k + n] == epochs[k]:
+            n += 1
+        here, at = slice(k, k + n), epochs[k] - flown.first
+        take(block, n, here, seen, known)
+        rate = rates[at, 0], rates[at, 1], rates[at, 2]
+        move(block, n, rate, (velocities[at, 0], velocities[at, 1], velocities[at, 2]))
+        begin(block, n, six_at(flown.turn_b, at), six_at(flown.turn_b, at + 1), angle_variance, time_variance)
+        if known.along_only:
+            add_gram(block, n, known.gram, lever)
+        else:
+            add_along(block, n)
+            add_errors(block, n, here, seen, known, lever)
+        give(block, n, six_at(flown.position_e, at), six_at(flown.position_e, at + 1), covariance_e[here])
+        k += n

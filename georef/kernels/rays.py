@@ -1,8 +1,8 @@
 """Returns to points in e, one pass over the rows (ISO/TS 19159-2 Eq. 10 with CONVENTIONS' parameters).
 
 The trajectory is followed by a moving pointer; what belongs to one of its intervals is computed when the pointer comes
-to it. Within the pass everything is numbers: nothing is allocated, and no array is passed on but where an interval
-changes, for numba counts references to arrays.
+to it. Returns go through in blocks, none of them longer than an interval, so that all of a block's returns have the
+pose's constants in common.
 """
 
 from __future__ import annotations
@@ -10,8 +10,40 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from georef.compiled import kept, kernel
-from georef.kernels.beam import FIXED_ANGLE, RANGE, beam_of, row_of, turn_of
+from georef.compiled import kept, kernel, whole
+from georef.kernels.beam import FIXED_ANGLE, RANGE, SPINNING
+from georef.kernels.block import (
+    ACROSS,
+    ALONG,
+    BEAM,
+    BLOCK,
+    COS,
+    COUNTED,
+    HEAD,
+    HEAD_START,
+    MORE,
+    RHO,
+    SHARE,
+    SIN,
+    START,
+    THETA,
+    TILT,
+    TURN_SHARE,
+    A,
+    B,
+    aim,
+    clear,
+    factors,
+    give,
+    half_turns,
+    hand_over,
+    lean,
+    mount,
+    new_block,
+    put,
+    swing,
+    three,
+)
 from georef.kernels.rotations import (
     cross,
     dot,
@@ -20,15 +52,13 @@ from georef.kernels.rotations import (
     product,
     times,
     transposed_times,
-    turn_factors,
     turned_on,
-    turned_y,
     vector_at,
 )
-from georef.kernels.types import Axes, Matrix, Model, Out, Ranging, Three, Track
+from georef.kernels.types import Axes, FloatArray, Matrix, Model, Mounted, Out, Ranging, Scanning, Three, Track
 from georef.points import Fate
 from georef.records import Int64Array, StructArray
-from georef.trajectory import locate_epoch, slerp
+from georef.trajectory import locate_epoch
 
 ONE, BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER = 0, 1, 2, 3
 DONE, NO_TIME, OUTSIDE, GAP = (
@@ -36,6 +66,9 @@ DONE, NO_TIME, OUTSIDE, GAP = (
 )
 NEAR, FAR, NOT_FINITE = (int(fate) for fate in (Fate.BELOW_RANGE_GATE, Fate.ABOVE_RANGE_GATE, Fate.NOT_FINITE))
 TURN = 2.0 * math.pi
+ORIGIN, POINT = ACROSS, TILT  # places in a block, free again when the axes are computed
+NOWHERE = (0.0, 0.0, 0.0)
+FIRST = whole(0)
 
 
 @kernel
@@ -105,133 +138,219 @@ def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> 
 
 
 @kernel
-def fate_of(t: int, row: Any, channel: int, known: int, covered: int) -> int:
-    """Of a return, before its range is looked at; ``covered`` is what the trajectory says."""
-    if t < 0:
-        return NO_TIME
-    if channel < 0 or not (math.isfinite(row.range_m) and math.isfinite(row.encoder_rad)):
-        return NOT_FINITE
-    if covered == DONE and not known:
-        return OUTSIDE
-    return covered
+def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scanning, covered: int) -> None:
+    """Fates before ranges are looked at; ``covered`` is what the trajectory says, ``known`` (1,) or (n,)."""
+    select, channels, moves = scanning.select, len(scanning.table), len(known) > 1
+    for i in range(len(part)):
+        row = part[i]
+        lost = covered == DONE and not known[i if moves else 0]
+        verdict = OUTSIDE if lost else covered
+        channel = channel_of(select, channels, row.channel, row.encoder_rad)
+        if channel < 0 or not (math.isfinite(row.range_m) and math.isfinite(row.encoder_rad)):
+            verdict = NOT_FINITE
+        fate[i] = NO_TIME if times_ns[i] < 0 else verdict
 
 
 @kernel
-def gated(rho: float, minimum_m: float, maximum_m: float, u: Three) -> int:
-    """Fate of a return by its range, and whether light comes through to it."""
-    if not math.isfinite(u[0]):
-        return NOT_FINITE
-    if rho < minimum_m:
-        return NEAR
-    return FAR if rho > maximum_m else DONE
+def take_table(block: FloatArray, part: Any, scanning: Scanning) -> None:
+    """The table's row of each return; of returns without one the first."""
+    table, select = scanning.table, scanning.select
+    for i in range(len(part)):
+        channel = max(channel_of(select, len(table), part[i].channel, part[i].encoder_rad), 0)
+        for column in range(8):
+            block[BEAM + column, i] = table[channel, column]
 
 
 @kernel
-def fill(array: Any, k: int, v: Three) -> None:
-    """Row k of (n, 3)."""
-    array[k, 0], array[k, 1], array[k, 2] = v
+def take(block: FloatArray, part: Any, ranging: Ranging, scanning: Scanning, rate: Any, acceleration: Any) -> None:
+    """Ranges and scan angles."""
+    n = len(part)
+    scale, offset_m = ranging.scale, ranging.offset_m
+    for i in range(n):
+        block[COUNTED, i] = scale * part[i].range_m
+        block[THETA, i] = part[i].encoder_rad
+        block[MORE, i] = offset_m + block[BEAM + RANGE, i]
+    if len(ranging.ibrc_m):
+        for i in range(n):
+            block[MORE, i] -= ibrc_of(ranging, part[i].intensity)
+    if len(ranging.delta_m) > 1:
+        for i in range(n):
+            block[MORE, i] += ranging.delta_m[part[i].return_number, part[i].mta_zone]
+    if scanning.select >= FIBRE_BY_CHANNEL:
+        for i in range(n):
+            block[THETA, i] = block[BEAM + FIXED_ANGLE, i]
+    scale, offset, latency, torsion = scanning.scale, scanning.offset_rad, scanning.latency_s, scanning.torsion_s2
+    for i in range(n):
+        block[RHO, i] = block[COUNTED, i] + block[MORE, i]
+        block[THETA, i] = scale * (block[THETA, i] - offset)
+    if len(rate):
+        for i in range(n):
+            block[THETA, i] += latency * rate[i] + torsion * acceleration[i]
+
+
+@kernel
+def through_mount(block: FloatArray, n: int, k: int, mounted: Mounted, source: int, target: int, moved: float) -> None:
+    """Vectors of the head as the boresight's ω and φ see them; ``moved`` 1: places, 0: directions."""
+    if len(mounted.inner) == 1:
+        inner = matrix_at(mounted.inner, 0)
+        shift = plus(NOWHERE, moved, vector_at(mounted.shift, 0))
+        for i in range(n):
+            mount(block, i, source, target, inner, shift)
+    else:
+        for i in range(n):
+            shift = plus(NOWHERE, moved, vector_at(mounted.shift, k + i))
+            mount(block, i, source, target, matrix_at(mounted.inner, k + i), shift)
+
+
+@kernel
+def gate(block: FloatArray, fate: Any, minimum_m: float, maximum_m: float) -> None:
+    """Fates by range, and where no light comes through."""
+    for i in range(len(fate)):
+        if fate[i] == DONE:
+            rho = block[RHO, i]
+            verdict = NEAR if rho < minimum_m else DONE
+            verdict = FAR if rho > maximum_m else verdict
+            fate[i] = verdict if math.isfinite(block[ALONG, i]) else NOT_FINITE
+
+
+@kernel
+def to_e(
+    block: FloatArray,
+    n: int,
+    way: tuple[Three, Three],
+    turned: tuple[Matrix, Three],
+    arms: tuple[Three, Three, Three],
+    shifted: bool,
+) -> None:
+    """Beams from where ω and φ see them to e: rows ORIGIN and POINT."""
+    turn, phi = turned
+    for i in range(n):
+        a, b = block[A, i], block[B, i]
+        origin = plus(way[0], block[SHARE, i], way[1])
+        put(block, ORIGIN, i, plus(origin, 1.0, plus(plus(arms[0], a, arms[1]), b, arms[2])))
+    if shifted:  # the beam does not start in the scanner's origin
+        for i in range(n):
+            start = times(turn, turned_on(phi, block[A, i], block[B, i], three(block, START, i)))
+            put(block, ORIGIN, i, plus(three(block, ORIGIN, i), 1.0, start))
+    for i in range(n):
+        u = times(turn, turned_on(phi, block[A, i], block[B, i], three(block, ALONG, i)))
+        origin = plus(three(block, ORIGIN, i), block[MORE, i], u)
+        put(block, ORIGIN, i, origin)
+        put(block, POINT, i, plus(origin, block[COUNTED, i], u))
 
 
 @kept
-def cast(rows: StructArray, time_ns: Int64Array, model: Model, out: Out) -> None:
-    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,), n > 0; the trajectory has at least two epochs."""
+def cast(rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes) -> None:
+    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,), and ``axes`` unless they are of length 0.
+
+    The trajectory has at least two epochs, n > 0.
+    """
     ranging, scanning, mounted, track = model
-    fate_out, time_out, points_e, origin_e, angle_rad, range_m = out
-    kind, table, select, angle_scale, angle_offset, latency_s, torsion_s2, rate, acceleration = scanning
-    slope, shifted, moves = mounted.slope, mounted.shifted, len(mounted.inner) > 1
-    scale, intensive, tabled = ranging.scale, len(ranging.ibrc_m) > 0, len(ranging.delta_m) > 1
+    rate, acceleration, kind = scanning.rate, scanning.acceleration, scanning.kind
+    shifted, slope, moves = mounted.shifted, mounted.slope, len(mounted.inner) > 1
     offset_ns, turn_offset_ns = track.offset_ns, track.offset_ns + track.latency_ns
     whole_ns, turn_ns = round(offset_ns), round(turn_offset_ns)
-    begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, 0)
-    begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, time_ns[0] + turn_ns, 0)
-    inner, shift, known = matrix_at(mounted.inner, 0), vector_at(mounted.shift, 0), mounted.known[0]
-    for k in range(len(rows)):
-        row, t = rows[k], time_ns[k]
-        time_out[k] = t + whole_ns
+    begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, FIRST)
+    begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, time_ns[0] + turn_ns, FIRST)
+    block = new_block()
+    if scanning.select == ONE:
+        for column in range(8):
+            for i in range(BLOCK):
+                block[BEAM + column, i] = scanning.table[0, column]
+    k = FIRST
+    while k < len(rows):
+        t = time_ns[k]
         if not begin <= t + whole_ns < end:
             begin, end, per_ns, fate, at, place, way = way_at(track, t + whole_ns, at)
         if not begun <= t + turn_ns < ended:
             begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, t + turn_ns, turning)
-        if moves:
-            inner, shift, known = matrix_at(mounted.inner, k), vector_at(mounted.shift, k), mounted.known[k]
-        channel = channel_of(select, len(table), row.channel, row.encoder_rad)
-        fate_out[k] = fate_of(t, row, channel, known, max(fate, turn_fate))
-        if fate_out[k] != DONE:
+        last, n = min(len(rows), k + BLOCK), 1
+        first_ns, end_ns = max(begin - whole_ns, begun - turn_ns), min(end - whole_ns, ended - turn_ns)
+        while k + n < last and first_ns <= time_ns[k + n] < end_ns:
+            n += 1
+        here = slice(k, k + n)
+        part, stamps, fates = rows[here], time_ns[here], out.fate[here]
+        covered = max(fate, turn_fate)
+        judge(part, stamps, fates, mounted.known[here] if moves else mounted.known, scanning, covered)
+        given_ns = out.time_ns[here]
+        for i in range(n):
+            given_ns[i] = stamps[i] + whole_ns
+        if covered != DONE:
+            k += n
             continue
 
-        beam = row_of(table, channel)
-        counted, offset_m = scale * row.range_m, ranging.offset_m + beam[RANGE]
-        if intensive:
-            offset_m -= ibrc_of(ranging, row.intensity)
-        if tabled:
-            offset_m += ranging.delta_m[row.return_number, row.mta_zone]
-        theta = angle_scale * ((beam[FIXED_ANGLE] if select >= FIBRE_BY_CHANNEL else row.encoder_rad) - angle_offset)
-        if len(rate):
-            theta += latency_s * rate[k] + torsion_s2 * acceleration[k]
-        sx, sy, sz, ux, uy, uz = beam_of(kind, beam, theta)
-        u = turned_y(slope * theta, times(inner, (ux, uy, uz)))
-        angle_rad[k], range_m[k] = theta, counted + offset_m
-        fate_out[k] = gated(counted + offset_m, ranging.minimum_m, ranging.maximum_m, u)
-
-        share, turn_share = (t - begin + offset_ns) * per_ns, (t - begun + turn_offset_ns) * per_turn_ns
-        a, b = turn_factors(phi2 * turn_share * turn_share, turn_share)
-        u = times(turn, turned_on(phi, a, b, u))  # to e
-        origin = plus(plus(place, share, way), 1.0, plus(plus(arms[0], a, arms[1]), b, arms[2]))
-        if shifted:  # the beam does not start in the scanner's origin
-            start = turned_y(slope * theta, plus(shift, 1.0, times(inner, (sx, sy, sz))))
-            origin = plus(origin, 1.0, times(turn, turned_on(phi, a, b, start)))
-        origin = plus(origin, offset_m, u)
-        fill(origin_e, k, origin)
-        fill(points_e, k, plus(origin, counted, u))
+        if scanning.select != ONE:
+            take_table(block, part, scanning)
+        take(block, part, ranging, scanning, rate[here], acceleration[here])
+        for i in range(n):
+            passed = stamps[i] - begin
+            block[SHARE, i] = (passed + offset_ns) * per_ns
+        for i in range(n):
+            passed = stamps[i] - begun
+            block[TURN_SHARE, i] = (passed + turn_offset_ns) * per_turn_ns
+        aim(block, n, kind)
+        lean(block, n, slope)
+        through_mount(block, n, k, mounted, HEAD, ALONG, 0.0)
+        if shifted:
+            if kind != SPINNING:
+                clear(block, HEAD_START)
+            through_mount(block, n, k, mounted, HEAD_START, START, 1.0)
+        gate(block, fates, ranging.minimum_m, ranging.maximum_m)
+        factors(block, n, phi2)
+        to_e(block, n, (place, way), (turn, phi), arms, shifted)
+        give(block, n, ORIGIN, out.origin_e[here])
+        give(block, n, POINT, out.points_e[here])
+        angles, ranges = out.angle_rad[here], out.range_m[here]
+        for i in range(n):
+            angles[i], ranges[i] = block[THETA, i], block[RHO, i]
+        if len(axes.share):
+            fill_axes(block, n, k, model, axes, turning, at, phi2)
+        k += n
 
 
 @kernel
-def with_slope(turn: Three, slope: float, outer: Matrix, arm: Three) -> Three:
-    """∂point/∂θ where θ turns φ too, whose axis is Rx(ω) y."""
-    return plus(turn, slope, cross((outer[0][1], outer[1][1], outer[2][1]), arm))
+def attitudes(block: FloatArray, q_e_from_b: Any, w: float, v: Three, r: Three) -> None:
+    """(w, v) ⊗ exp(share · r / 2), scalar first, from rows SIN and COS of `half_turns`."""
+    for i in range(q_e_from_b.shape[1]):
+        sin, cos = block[SIN, i], block[COS, i]
+        h = sin * r[0], sin * r[1], sin * r[2]
+        crossed = cross(v, h)
+        q_e_from_b[0, i] = w * cos - dot(v, h)
+        q_e_from_b[1, i] = w * h[0] + v[0] * cos + crossed[0]
+        q_e_from_b[2, i] = w * h[1] + v[1] * cos + crossed[1]
+        q_e_from_b[3, i] = w * h[2] + v[2] * cos + crossed[2]
 
 
-@kept
-def fill_axes(rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes) -> None:
-    """Fill ``axes`` for the rows that `cast` georeferenced."""
+@kernel
+def fill_axes(block: FloatArray, n: int, k: int, model: Model, axes: Axes, turning: int, at: int, phi2: float) -> None:
+    """Fill ``axes`` from row k on for the n returns of a block."""
     _, scanning, mounted, track = model
-    fate_out, time_out, _, _, angle_rad, range_m = out
-    q_e_from_b, epoch, shares, arm_b, range_axis_b, angle_axis_b, tilt_axis_b = axes
-    kind, table, select = scanning.kind, scanning.table, scanning.select
-    slope, moves = mounted.slope, len(mounted.inner) > 1
-    times_ns, quaternions, rotvec_b = track.time_ns, track.q_e_from_b, track.rotvec_b
-    offset_ns, turn_offset_ns = track.offset_ns, track.offset_ns + track.latency_ns
-    later_ns, at, turning = round(turn_offset_ns), 0, 0
-    begin, end, begun, ended = 0, 0, 0, 0
-    lever, outer = vector_at(mounted.lever_arm_b, 0), matrix_at(mounted.outer, 0)
-    inner, shift = matrix_at(mounted.inner, 0), vector_at(mounted.shift, 0)
-    for k in range(len(rows)):
-        if fate_out[k] != DONE:
-            continue
-        t, theta, rho = time_ns[k], angle_rad[k], range_m[k]
-        if not begin <= time_out[k] < end:
-            at = locate_epoch(times_ns, time_out[k], at)
-            begin, end = times_ns[at], times_ns[at + 1]
-        if not begun <= t + later_ns < ended:
-            turning = locate_epoch(times_ns, t + later_ns, turning)
-            begun, ended = times_ns[turning], times_ns[turning + 1]
-        epoch[k], shares[k] = at, (t - begin + offset_ns) / (end - begin)
-        w, x, y, z = quaternions[turning, 0], quaternions[turning, 1], quaternions[turning, 2], quaternions[turning, 3]
-        rx, ry, rz = rotvec_b[turning, 0], rotvec_b[turning, 1], rotvec_b[turning, 2]
-        w, x, y, z = slerp(w, x, y, z, rx, ry, rz, (t - begun + turn_offset_ns) / (ended - begun))
-        q_e_from_b[k, 0], q_e_from_b[k, 1], q_e_from_b[k, 2], q_e_from_b[k, 3] = w, x, y, z
-
-        if moves:
-            inner, shift = matrix_at(mounted.inner, k), vector_at(mounted.shift, k)
-        beam = row_of(table, channel_of(select, len(table), rows[k].channel, rows[k].encoder_rad))
-        sx, sy, sz, ux, uy, uz = beam_of(kind, beam, theta)
-        ax, ay, az, tx, ty, tz = turn_of(kind, beam, theta, rho)
-        start = plus(shift, 1.0, times(inner, (sx, sy, sz)))
-        along = times(outer, turned_y(slope * theta, times(inner, (ux, uy, uz))))
-        across = times(outer, turned_y(slope * theta, times(inner, (ax, ay, az))))
-        tilted = times(outer, turned_y(slope * theta, times(inner, (tx, ty, tz))))
-        arm = plus(times(outer, turned_y(slope * theta, start)), rho, along)
-        fill(arm_b, k, plus(lever, 1.0, arm))
-        fill(range_axis_b, k, along)
-        fill(angle_axis_b, k, with_slope(across, slope, outer, arm))
-        fill(tilt_axis_b, k, tilted)
+    here = slice(k, k + n)
+    outer, lever, slope = matrix_at(mounted.outer, 0), vector_at(mounted.lever_arm_b, 0), mounted.slope
+    epochs, shares = axes.epoch[here], axes.share[here]
+    for i in range(n):
+        epochs[i], shares[i] = at, block[SHARE, i]
+    swing(block, n, scanning.kind)
+    through_mount(block, n, k, mounted, ACROSS, ACROSS, 0.0)
+    through_mount(block, n, k, mounted, TILT, TILT, 0.0)
+    by_phi = outer[0][1], outer[1][1], outer[2][1]
+    if not mounted.shifted:
+        clear(block, START)
+    for i in range(n):
+        along = times(outer, three(block, ALONG, i))
+        put(block, HEAD, i, along)
+        put(block, START, i, plus(times(outer, three(block, START, i)), block[RHO, i], along))
+    for i in range(n):  # where θ turns φ too, whose axis is Rx(ω) y
+        by_slope = cross(by_phi, three(block, START, i))
+        put(block, ACROSS, i, plus(times(outer, three(block, ACROSS, i)), slope, by_slope))
+    for i in range(n):
+        put(block, START, i, plus(lever, 1.0, three(block, START, i)))
+        put(block, TILT, i, times(outer, three(block, TILT, i)))
+    hand_over(block, n, HEAD, axes.range_axis_b[:, here])
+    hand_over(block, n, START, axes.arm_b[:, here])
+    hand_over(block, n, ACROSS, axes.angle_axis_b[:, here])
+    hand_over(block, n, TILT, axes.tilt_axis_b[:, here])
+    half_turns(block, n, phi2)
+    q = track.q_e_from_b
+    v = q[turning, 1], q[turning, 2], q[turning, 3]
+    attitudes(block, axes.q_e_from_b[:, here], q[turning, 0], v, vector_at(track.rotvec_b, turning))

@@ -12,6 +12,7 @@ from georef.kernels.types import FloatArray, Matrix, Three
 SMALL_ANGLE_2 = 1e-2  # below 0.1 rad the series below are exact to the last bit
 LARGE_ANGLE = 1e5  # up to here a whole number of quarter turns times the first part of π/2 is exact
 _PER_QUARTER = 2.0 / math.pi
+_TO_WHOLE = 1.5 * 2.0**52  # added, it leaves no room for a fraction
 _QUARTER = (1.5707963267341256, 6.077100506506192e-11, 2.022266248795951e-21)  # π/2 in three parts of 33 bits
 
 
@@ -44,21 +45,36 @@ def times(m: Matrix, v: Three) -> Three:
 
 
 @kernel
-def sine_cosine(square: float, angle: float) -> tuple[float, float]:
-    """sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
-    if square >= SMALL_ANGLE_2:
-        return math.sin(angle), math.cos(angle)
+def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
+    """factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
     sin = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
     cos = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
     return angle * sin, cos
 
 
 @kernel
-def sin_cos(angle: float) -> tuple[float, float]:
-    """Sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm."""
-    if not abs(angle) < LARGE_ANGLE:
+def sine_cosine(square: float, angle: float) -> tuple[float, float]:
+    """sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
+    if square >= SMALL_ANGLE_2:
         return math.sin(angle), math.cos(angle)
-    quarters = np.rint(angle * _PER_QUARTER)
+    return small_sine_cosine(square, angle)
+
+
+@kernel
+def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, float]:
+    """What `sin_cos` gave, or where it does not reach the library's."""
+    if abs(angle) < LARGE_ANGLE:
+        return sin, cos
+    return math.sin(angle), math.cos(angle)
+
+
+@kernel
+def sin_cos(angle: float) -> tuple[float, float]:
+    """Sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
+
+    Without a branch; beyond LARGE_ANGLE it means nothing.
+    """
+    quarters = (angle * _PER_QUARTER if abs(angle) < LARGE_ANGLE else 0.0) + _TO_WHOLE - _TO_WHOLE
     rest = angle - quarters * _QUARTER[0]
     low = quarters * _QUARTER[1]
     high = rest - low
@@ -78,7 +94,7 @@ def sin_cos(angle: float) -> tuple[float, float]:
         )
     )
     sin, cos = x + x * z * (z * odd - 1.66666666666666324348e-01), 1.0 - (0.5 * z - z * z * even)
-    quadrant = int(quarters) & 3
+    quadrant = np.int32(quarters) & 3
     if quadrant & 1:
         sin, cos = cos, sin
     return -sin if quadrant & 2 else sin, -cos if (quadrant + 1) & 2 else cos
@@ -110,10 +126,17 @@ def product(a: Matrix, b: Matrix) -> Matrix:
 
 
 @kernel
-def turned_y(angle: float, v: Three) -> Three:
-    """Ry(angle) v."""
-    sin, cos = sine_cosine(angle * angle, angle)
+def turned_by(sin: float, cos: float, v: Three) -> Three:
+    """Ry(angle) v, of the angle's sine and cosine."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
+
+
+@kernel
+def small_turn_factors(square: float, share: float) -> tuple[float, float]:
+    """`turn_factors` of turns that are small for sure."""
+    first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
+    second = 0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square * (1.0 / 40320.0 - square / 3628800.0)))
+    return share * first, share * share * second
 
 
 @kernel
@@ -123,9 +146,7 @@ def turn_factors(square: float, share: float) -> tuple[float, float]:
         angle = math.sqrt(square)
         sin, cos = math.sin(0.5 * angle), math.cos(0.5 * angle)
         return share * 2.0 * sin * cos / angle, share * share * 2.0 * sin * sin / square
-    first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
-    second = 0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square * (1.0 / 40320.0 - square / 3628800.0)))
-    return share * first, share * share * second
+    return small_turn_factors(square, share)
 
 
 @kernel

@@ -11,6 +11,8 @@ from georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]
+SingleArray = NDArray[np.float32]
+Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
@@ -122,7 +124,7 @@ class Out(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """The second half; all of length 0 where nobody asked."""
+    """The second half, vectors as columns: (3, n), (4, n); all of length 0 where nobody asked."""
 
     q_e_from_b: FloatArray
     epoch: Int64Array
@@ -131,3 +133,16 @@ class Axes(NamedTuple):
     range_axis_b: FloatArray
     angle_axis_b: FloatArray
     tilt_axis_b: FloatArray
+
+
+class PointColumns(NamedTuple):
+    """Columns (n,) of `georef.points.Points`."""
+
+    time_ns: Int64Array
+    scan_angle_rad: SingleArray
+    range_m: SingleArray
+    intensity: SingleArray
+    return_number: ByteArray
+    number_of_returns: ByteArray
+    channel: NDArray[np.uint16]
+    mta_zone: ByteArray

@@ -25,8 +25,8 @@ STEPS = 256  # single steps after which the narrowest and widest of them begin t
 # Columns of `pulses`, one row a known emission
 ORDINAL, TICKS, PULSE_ID, CHANNEL = range(4)
 # State of the pulse train
-LAST_ORDINAL, LAST_TICKS, LAST_ID, PERIOD, LEAST, MOST, OLD_LEAST, OLD_MOST, SINGLES = range(9)
-STATE_SIZE = 9
+LAST_ORDINAL, LAST_TICKS, LAST_ID, PERIOD, LEAST, MOST, OLD_LEAST, OLD_MOST, SINGLES, COMPLETE = range(10)
+STATE_SIZE = 10
 
 
 @kernel
@@ -52,7 +52,8 @@ def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
     """Number of a pulse in the train; after a break it goes on far ahead.
 
     Within a datagram the pulse_id counts. The datagram before ended with a pulse that may have had no return: how many
-    there were between is told by the time, which has to be near a whole number of periods.
+    there were between is told by the time, which has to be near a whole number of periods; unless rows tell of every
+    pulse, when there were none.
     """
     last: int = state[LAST_ORDINAL]
     fresh = last + SEGMENT
@@ -68,6 +69,10 @@ def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
             state[PERIOD] = passed // steps
         return last + steps
     place = pulse_id & ((1 << DATAGRAM_BITS) - 1)
+    if state[COMPLETE] and ahead == 1 and place == 0:
+        if state[PERIOD] == 0 or passed < 2 * state[PERIOD]:
+            state[PERIOD] = passed  # and not what the laser rested
+        return last + 1
     if ahead != 1 or state[PERIOD] == 0 or passed > (SEGMENT // 2) * state[PERIOD]:
         return fresh
     steps = math.floor(passed / state[PERIOD] + 0.5)

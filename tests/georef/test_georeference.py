@@ -14,7 +14,7 @@ from georef.atmosphere import Air
 from georef.beams import LineGeometry
 from georef.calibration import nominal
 from georef.georeference import Georeferencer
-from georef.mapping import Mapping
+from georef.mapping import Mapping, MappingError
 from georef.points import Fate, Points
 from georef.records import Int64Array, StructArray
 from georef.sensor_model import SensorModel
@@ -177,3 +177,26 @@ def test_no_rows_no_points() -> None:
     for mapping in (None, Mapping("EPSG:32632", datum=None, epoch=None)):
         points, fates = Georeferencer(model(), mapping).georeference(rows[:0], time_ns[:0], flight())
         assert len(points) == len(fates) == 0
+
+
+def test_points_that_the_map_has_no_place_for() -> None:
+    rows, time_ns = returns()
+    clean, fates = Georeferencer(model(), Mapping("EPSG:32632")).georeference(rows, time_ns, flight())
+    wild = rows.copy()
+    at = np.flatnonzero(fates == Fate.GEOREFERENCED)[[40, 41, 200]]
+    wild["range_m"][at] = [2.0e6, 3.0e6, 4.0e6]
+    calibration = model().calibration
+    maker = Georeferencer(SensorModel(calibration, LineGeometry()), Mapping("EPSG:32632"))
+    points, wild_fates = maker.georeference(wild, time_ns, flight())
+    lost = wild_fates == Fate.NOT_FINITE
+    assert lost[at].any()
+    assert not lost[np.setdiff1d(np.arange(len(rows)), at)].any()
+    assert len(points) == (wild_fates == Fate.GEOREFERENCED).sum()
+    kept = np.isin(points.time_ns, np.setdiff1d(clean.time_ns, time_ns[at]))
+    assert np.array_equal(points.points_map[kept], clean.points_map[np.isin(clean.time_ns, points.time_ns[kept])])
+
+
+def test_a_map_that_does_not_reach_there_at_all_is_refused_at_first() -> None:
+    rows, time_ns = returns()
+    with pytest.raises(MappingError, match="outside"):
+        Georeferencer(model(), Mapping("EPSG:32756")).georeference(rows, time_ns, flight())
