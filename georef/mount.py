@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from georef.records import Int64Array, StructArray
 from georef.rotations import rot_l_from_b
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +52,25 @@ class AngleSeries:
             raise MountError("gimbal angles: want at least two epochs of roll, pitch and yaw")
         if (np.diff(self.time_ns) <= 0).any():
             raise MountError("gimbal angles: time does not rise")
+
+    @classmethod
+    def of_solutions(cls, rows: StructArray, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> AngleSeries:
+        """Roll, pitch and heading that a device told, as the angles of the stage it reads.
+
+        Args:
+            rows: `INS_DTYPE`, in the order in which they came; epochs that are told again or late, and those without
+                all three angles, are left out.
+            max_gap_ns: over longer intervals they are unknown.
+
+        Raises:
+            MountError: fewer than two epochs are left.
+        """
+        angles = np.stack([rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"]], axis=1)
+        told = np.isfinite(angles).all(axis=1) & (rows["gps_ns"] >= 0)
+        time_ns, angles = rows["gps_ns"][told], angles[told]
+        newest = np.maximum.accumulate(np.concatenate([[-1], time_ns]))
+        new = time_ns > newest[:-1]
+        return cls(time_ns[new], angles[new], max_gap_ns)
 
     @cached_property
     def _unwrapped(self) -> FloatArray:

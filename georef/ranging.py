@@ -8,7 +8,9 @@ goes there and back in between.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +18,13 @@ from numpy.typing import NDArray
 from georef.kernels.zones import (
     AMBIGUOUS,
     BRIDGED,
+    COMPLETE,
     GAP,
     LAST_ORDINAL,
     LEAST,
     LIGHT_MPS,
     MEDIAN_OF,
+    NO_RETURN,
     OLD_LEAST,
     ORDINAL,
     SEGMENT,
@@ -33,6 +37,8 @@ from georef.records import RETURN_DTYPE, Int64Array, StructArray
 FloatArray = NDArray[np.float64]
 
 ZONE_UNKNOWN = 255
+CONTEXT_FLAG = 128  # of a row's flags: it is there for its neighbours only
+MOST_TICK_HZ = 1_000_000_000  # device times are whole nanoseconds
 
 
 class RangingError(ValueError):
@@ -69,6 +75,36 @@ def gate_times(range_min_m: float, range_max_m: float, group_index: float = 1.0)
     return 2.0 * group_index * range_min_m / LIGHT_MPS, 2.0 * group_index * range_max_m / LIGHT_MPS
 
 
+class PulseRates:
+    """Pulse and tick rates that a scanner's headers tell, each from a pulse on; by ``pulse_id``, so that late rows
+    still find theirs.
+
+    A parser calls `note`; `ZoneResolver` and `georef.georeference.Georeferencer` ask.
+    """
+
+    def __init__(self) -> None:
+        self._first: list[int] = []
+        self._told: list[tuple[float, int]] = []
+
+    def note(self, pulse_id: int, prf_hz: float, tick_hz: int) -> None:
+        """From this pulse on: pulse rate in Hz, 0 unsaid; nominal ticks a second of the counter."""
+        at = bisect_right(self._first, pulse_id)
+        self._first.insert(at, pulse_id)
+        self._told.insert(at, (prf_hz, tick_hz))
+
+    def runs(self, pulse_id: Int64Array) -> list[tuple[int, int, float | None, int | None]]:
+        """Of pulses (n,): bounds of runs of the same rates, prf_hz and tick_hz; None: unsaid."""
+        if not len(pulse_id):
+            return []
+        at = np.searchsorted(np.array(self._first, np.int64), np.asarray(pulse_id, np.int64), side="right") - 1
+        edges = [0, *(np.flatnonzero(np.diff(at)) + 1).tolist(), len(at)]
+        runs = []
+        for start, stop in pairwise(edges):
+            prf_hz, tick_hz = self._told[at[start]] if at[start] >= 0 else (0.0, None)
+            runs.append((start, stop, prf_hz or None, tick_hz))
+        return runs
+
+
 class ZoneResolver:
     """Finds the emission of every return of one scanner that tells apparent ranges.
 
@@ -95,9 +131,13 @@ class ZoneResolver:
         edge_share: of a zone, beside either edge, where nothing is accepted.
         blind_m: apparent ranges below belong to flash and near field of the pulse just fired.
         slanted: the encoder tells the beam's angle from the vertical (line scanners); False: a cone, all ranges alike.
+        every_pulse: rows tell of every pulse, also of those without a return: where a datagram follows another, its
+            first pulse follows that one's last, however long after.
+        rates: tell the tick rate instead, from a pulse on. Returns counted in more than 10⁹ ticks a second are gaps:
+            their device times do not tell the ticks.
 
     Attributes:
-        counts: returns dropped, by reason.
+        counts: returns dropped, by reason; not those that stand there for their neighbours (flag `CONTEXT_FLAG`).
 
     Raises:
         RangingError: a number that cannot be.
@@ -113,22 +153,29 @@ class ZoneResolver:
         edge_share: float = 0.1,
         blind_m: float = 0.0,
         slanted: bool = True,
+        every_pulse: bool = False,
+        rates: PulseRates | None = None,
     ) -> None:
-        if not 1 <= tick_hz <= 1_000_000_000:
+        if not 1 <= tick_hz <= MOST_TICK_HZ:
             raise RangingError(f"tick_hz: got {tick_hz}, want 1 to 1 000 000 000: device times are whole nanoseconds")
         if not 0.0 <= edge_share < 0.5:
             raise RangingError(f"edge_share: got {edge_share:g}, want a share of a zone beside its edge, 0 to 0.5")
         if not 0.0 < range_max_m < math.inf:
             raise RangingError(f"range_max_m: got {range_max_m:g}, want the scanner's longest range in metres")
         self.counts: Counter[str] = Counter()
-        self._tick_hz = tick_hz
-        metres_per_tick = LIGHT_MPS / (2.0 * group_index * tick_hz)
-        self._flight_ticks = math.ceil(range_max_m / metres_per_tick)
-        self._scale = (metres_per_tick, self._flight_ticks)
+        self.rates = rates
+        self._every_pulse = every_pulse
+        self._range_max_m, self._group_index = range_max_m, group_index
+        self._count_by(tick_hz)
         self._limits = (math.nan if height_above_ground_m is None else height_above_ground_m, edge_share, blind_m)
         self._slanted = slanted
         self._median = (np.zeros(MEDIAN_OF), np.zeros(MEDIAN_OF), np.zeros(3, np.int64))
         self._restart()
+
+    @property
+    def waiting(self) -> int:
+        """Returns held back."""
+        return len(self._held)
 
     def feed(self, rows: StructArray, predicted_m: FloatArray | None = None) -> StructArray:
         """Rows of which all is known now, in the order of emission.
@@ -137,6 +184,25 @@ class ZoneResolver:
             rows: (n,) `RETURN_DTYPE`, in the order of their records.
             predicted_m: (n,) range the beam of each row would have, nan where nothing is known.
         """
+        if self.rates is None:
+            return self._fed(rows, predicted_m)
+        given = [rows[:0]]
+        for start, stop, _, tick_hz in self.rates.runs(rows["pulse_id"]):
+            if tick_hz is not None and tick_hz != self._tick_hz:
+                given.append(self.flush())
+                self._count_by(tick_hz)
+            given.append(self._fed(rows[start:stop], None if predicted_m is None else predicted_m[start:stop]))
+        some = [piece for piece in given if len(piece)]
+        return some[0] if len(some) == 1 else np.concatenate(given)
+
+    def _count_by(self, tick_hz: int) -> None:
+        self._tick_hz = tick_hz
+        metres_per_tick = LIGHT_MPS / (2.0 * self._group_index * tick_hz)
+        self._flight_ticks = math.ceil(self._range_max_m / metres_per_tick)
+        self._scale = (metres_per_tick, self._flight_ticks)
+
+    def _fed(self, rows: StructArray, predicted_m: FloatArray | None) -> StructArray:
+        """Rows of one tick rate."""
         unknown = rows["mta_zone"] == ZONE_UNKNOWN
         if not unknown.any():
             return self._passed(rows)
@@ -159,6 +225,7 @@ class ZoneResolver:
     def _restart(self) -> None:
         self._state = np.zeros(STATE_SIZE, np.int64)
         self._state[LAST_ORDINAL] = -1  # no pulse yet
+        self._state[COMPLETE] = self._every_pulse
         self._state[[LEAST, OLD_LEAST]] = np.iinfo(np.int64).max
         self._pulses, self._angles = np.zeros((0, 4), np.int64), np.zeros(0)
         self._held: StructArray = np.zeros(0, RETURN_DTYPE)
@@ -173,6 +240,9 @@ class ZoneResolver:
 
     def _resolved(self, rows: StructArray, predicted_m: FloatArray) -> StructArray:
         """Rows with apparent ranges: those that are complete now, with whole ones."""
+        if self._tick_hz > MOST_TICK_HZ:
+            self._count(np.where(rows["number_of_returns"] > 0, GAP, NO_RETURN), rows)
+            return rows[:0]
         n, known = len(rows), len(self._pulses)
         pulses, angles = np.empty((known + BRIDGED * n, 4), np.int64), np.empty(known + BRIDGED * n)
         pulses[:known], angles[:known] = self._pulses, self._angles
@@ -183,7 +253,7 @@ class ZoneResolver:
         now = int(pulses[known - 1, TICKS])
         keep = int(np.searchsorted(pulses[:known, ORDINAL], self._oldest(pulses[:known])))
         self._pulses, self._angles = pulses[keep:known].copy(), angles[keep:known].copy()
-        self._count(found[:, 0])
+        self._count(found[:, 0], rows)
         which = np.flatnonzero(found[:, 0] >= 0)
         self._hold(rows.take(which), found.take(which, axis=0), whole_m.take(which), angle_rad.take(which))
         old_train = self._held_key[:, 0] < int(pulses[known - 1, ORDINAL]) - SEGMENT // 2
@@ -195,9 +265,10 @@ class ZoneResolver:
         recent = (ordinal > ordinal[-1] - SEGMENT // 2) & (ticks >= ticks[-1] - self._flight_ticks)
         return int(ordinal[int(np.argmax(recent))])
 
-    def _count(self, zones: Int64Array) -> None:
+    def _count(self, zones: Int64Array, rows: StructArray) -> None:
+        own = rows["flags"] & CONTEXT_FLAG == 0
         for reason, code in (("mta_gap", GAP), ("mta_ambiguous", AMBIGUOUS)):
-            dropped = int(np.count_nonzero(zones == code))
+            dropped = int(np.count_nonzero(own & (zones == code)))
             if dropped:
                 self.counts[reason] += dropped
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from collections.abc import Mapping as ByName
+from types import MappingProxyType
+
 import numpy as np
 
 from daemon.config.config import Config
 from daemon.config.tables import GimbalConfig, ScannerConfig
 from drivers.core.parser import Parser
+from drivers.core.registry import find_driver
 from drivers.scanner.beams import BeamTable
 from drivers.scanner.ouster_head import OusterHead
+from drivers.scanner.srep import SrepParser
 from georef.atmosphere import Air
 from georef.beams import Geometry, OusterGeometry, SpinningGeometry, line_scanner, read_fibres
 from georef.calibration import Calibration
@@ -16,12 +22,12 @@ from georef.coarse_terrain import CoarseTerrain
 from georef.encoder_motion import EncoderMotion
 from georef.georeference import Georeferencer
 from georef.mapping import Mapping
-from georef.mount import Mount, Stage
+from georef.mount import AngleSeries, Mount, Stage
 from georef.points import Fate
-from georef.ranging import ZoneResolver
-from georef.records import Int64Array, StructArray
+from georef.ranging import PulseRates, ZoneResolver
+from georef.records import InsSolution, Int64Array, StructArray
 from georef.sensor_model import FloatArray, SensorModel
-from georef.stream import GivenMotion
+from georef.stream import GivenMotion, ScannerChain
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise, Uncertainty
 
@@ -29,6 +35,7 @@ from georef.uncertainty import Noise, Uncertainty
 WAVELENGTH_NM = {"velodyne": 903.0, "hesai": 905.0, "ouster": 865.0}
 USUAL_WAVELENGTH_NM = 1064.0
 FAR_M = 1000.0  # along a beam, to tell its direction
+NO_ANGLES = AngleSeries(np.array([-2, -1]), np.zeros((2, 3)))  # at no time there is
 
 
 def make_georeferencer(
@@ -40,6 +47,7 @@ def make_georeferencer(
     mapping: Mapping | None,
     *,
     uncertainty: bool,
+    angles: ByName[str, AngleSeries] | None = MappingProxyType({}),
 ) -> Georeferencer:
     """What makes points of a scanner's returns.
 
@@ -51,16 +59,24 @@ def make_georeferencer(
         fibres: of a fibre scanner the file of its geometry.
         mapping: None: points stay in e.
         uncertainty: with sigmas.
+        angles: of the gimbal's stages, by the source that logged them; None: the log is yet to be read for them.
 
     Raises:
         ValueError: something cannot be meant, one line.
     """
     table = config.scanner[name]
+    if not isinstance(parser, SrepParser) and any(row.prf_hz is not None for row in calibration.range_offsets):
+        text = f"{table.protocol} tells no pulse rate; want return_slot or mta_zone"
+        raise ValueError(f"calibration {calibration.id}: range_offset.prf_hz: {text}")
+    for number, source in gimbal_sources(config, name):
+        if not tells_attitude(config, source):
+            text = f'"{source}" tells no angles of a gimbal; want angles_deg, or an imu/name or gnss/name with an INS'
+            raise ValueError(f"gimbal.stages[{number}].source: {text}")
     model = SensorModel(
         calibration,
         geometry_of(table, parser, fibres),
         (table.range_min_m, table.range_max_m),
-        mount_of(table.gimbal),
+        mount_of(table.gimbal, angles),
         air_of(config, table),
     )
     noise = Noise(table.range_sigma_m, np.radians(table.angle_sigma_deg), divergence_rad=1e-3 * table.divergence_mrad)
@@ -95,21 +111,54 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
     )
 
 
-def mount_of(gimbal: GimbalConfig | None) -> Mount:
-    """Stages that stand still.
+def mount_of(gimbal: GimbalConfig | None, angles: ByName[str, AngleSeries] | None = None) -> Mount:
+    """Stages of a gimbal: ``angles_deg`` and, where a source is named, the roll, pitch and heading it told.
+
+    Args:
+        gimbal: of the scanner; None: a rigid mount.
+        angles: by source; None: nothing is known yet, returns of such a mount have no place.
 
     Raises:
-        ValueError: a stage's angles are to come from a source, and no protocol tells any.
+        ValueError: a source told no angles.
     """
     stages = []
     for number, stage in enumerate(gimbal.stages if gimbal is not None else []):
+        series = None
         if stage.source is not None:
-            raise ValueError(
-                f'gimbal.stages[{number}].source: "{stage.source}" tells no angles of a gimbal; want angles_deg'
-            )
+            series = NO_ANGLES if angles is None else angles.get(stage.source)
+            if series is None:
+                raise ValueError(f'gimbal.stages[{number}].source: "{stage.source}" told no angles')
         angles_rad = np.radians(np.array(stage.angles_deg, dtype=np.float64))
-        stages.append(Stage(angles_rad, np.array(stage.lever_arm_m, dtype=np.float64)))
+        stages.append(Stage(angles_rad, np.array(stage.lever_arm_m, dtype=np.float64), series))
     return Mount(tuple(stages))
+
+
+def gimbal_sources(config: Config, name: str) -> Iterator[tuple[int, str]]:
+    """Stages of a scanner's gimbal whose angles are logged: number, and the source, ``imu/name`` or ``gnss/name``."""
+    gimbal = config.scanner[name].gimbal
+    for number, stage in enumerate(gimbal.stages if gimbal is not None else []):
+        if stage.source is not None:
+            yield number, stage.source
+
+
+def tells_attitude(config: Config, source: str) -> bool:
+    """Whether a source is one of the configuration's and gives an INS's solutions."""
+    for kind, name, table in config.device_tables():
+        if f"{kind}/{name}" == source:
+            return InsSolution in find_driver(kind, table.protocol).yields
+    return False
+
+
+def refuse_logged_gimbals(config: Config, scanners: list[str]) -> None:
+    """For who cannot wait for the end of the log.
+
+    Raises:
+        ValueError: a gimbal's angles are logged, one line.
+    """
+    for name in scanners:
+        for number, source in gimbal_sources(config, name):
+            where = f"scanner.{name}.gimbal.stages[{number}].source"
+            raise ValueError(f'{where}: angles of "{source}" are known when the log is whole: want swath georef')
 
 
 def air_of(config: Config, table: ScannerConfig) -> Air:
@@ -123,7 +172,20 @@ def make_resolver(table: ScannerConfig, height_above_ground_m: float | None) -> 
     if table.protocol != "srep":
         return None
     kind = table.geometry.type if table.geometry is not None else None
-    return ZoneResolver(table.range_max_m, height_above_ground_m, slanted=kind not in ("nutating", "risley"))
+    slanted = kind not in ("nutating", "risley")
+    return ZoneResolver(table.range_max_m, height_above_ground_m, slanted=slanted, every_pulse=True)
+
+
+def connect(chain: ScannerChain, parser: Parser) -> None:
+    """Have a parser tell the chain its returns go through every pulse that left, and at which rates."""
+    if not isinstance(parser, SrepParser):
+        return
+    rates = PulseRates()
+    parser.emissions, parser.tell_rates = chain.resolver is not None, rates.note
+    if isinstance(chain.resolver, ZoneResolver):
+        chain.resolver.rates = rates
+    if isinstance(chain.georeferencer, Georeferencer):
+        chain.georeferencer.rates = rates
 
 
 def make_motion(table: ScannerConfig, model: SensorModel) -> EncoderMotion | None:
@@ -144,12 +206,13 @@ class TerrainRanges:
 
     def __call__(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> FloatArray:
         """(n,) metres of rows at GPS times (n,); nan where nothing is known. The encoder's latency does not count."""
-        far, still = rows.copy(), np.zeros(len(rows))
+        asked = np.flatnonzero(rows["number_of_returns"])  # the others are pulses without a return
+        far, still = rows.take(asked), np.zeros(len(asked))
         far["range_m"] = FAR_M
-        rays = self._model.rays(far, time_ns, trajectory, encoder_rate=still, encoder_acceleration=still)
+        rays = self._model.rays(far, time_ns.take(asked), trajectory, encoder_rate=still, encoder_acceleration=still)
         known = rays.fate == Fate.GEOREFERENCED
         along_e = rays.points_e[known] - rays.origin_e[known]
         along_e /= np.linalg.norm(along_e, axis=1, keepdims=True)
         ranges_m = np.full(len(rows), np.nan)
-        ranges_m[known] = self._terrain.predicted_m(rays.origin_e[known], along_e)
+        ranges_m[asked[known]] = self._terrain.predicted_m(rays.origin_e[known], along_e)
         return ranges_m

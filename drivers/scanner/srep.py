@@ -31,6 +31,7 @@ from drivers.scanner.srep_layout import (
     RANGE_UNIT_M,
     SLOT_BYTES,
     SLOT_DTYPE,
+    ZONE_UNKNOWN,
     SrepHeader,
     encode_datagram,
     header_checks,
@@ -49,6 +50,9 @@ from georef.records import (
     ScannerReturns,
     StructArray,
 )
+
+FLAG_NO_POINT = 128  # of a row that stands there for its neighbours and is no return
+SAME_RATE = 1e-3  # pulse rates that differ by less, as measured ones do, are one
 
 __all__ = ["DRIVERS", "ScanAngle", "SrepHeader", "SrepParser", "encode_datagram"]
 
@@ -106,6 +110,12 @@ class SrepParser(PacketParser):
         settings: config keys ``mirror_factor``, ``geometry``.
         clock_only: give clock samples (one in 50 ms of host time) and status, no returns; only the CRCs of those
             datagrams, and of those that break the sequence, are then computed.
+
+    Attributes:
+        emissions: where ranges are apparent (byte 15 = 255) a pulse without a return is a row too, of range 0 and no
+            returns, flagged `FLAG_NO_POINT`: who looks for an echo's emission needs time and encoder of all of them.
+        tell_rates: told ``pulse_id``, pulse rate in Hz (0: unsaid) and tick_hz of the first datagram, and of each whose
+            rates are others, before its returns are given.
     """
 
     def __init__(self, settings: DeviceSettings, *, clock_only: bool = False) -> None:
@@ -117,6 +127,9 @@ class SrepParser(PacketParser):
         self._last_sequence: int | None = None
         self._newest = -LATE_DATAGRAMS - 1
         self._last_status: tuple[int, ...] | None = None
+        self._last_rates = (-1, 0)
+        self.emissions = False
+        self.tell_rates: Callable[[int, float, int], None] | None = None
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         """Decode datagrams of equal length; see `PacketParser.parse_units`."""
@@ -142,6 +155,7 @@ class SrepParser(PacketParser):
             clock = _clock_samples(host_time_ns[forward], header[forward], units[forward])
             records.append(DeviceClockSamples(clock))
         if self._thinner is None:
+            self._tell_rates(header, unwrapped)
             rows = self._returns(host_time_ns, header, units, unwrapped)
             if len(rows):
                 records.append(ScannerReturns(rows))
@@ -201,6 +215,19 @@ class SrepParser(PacketParser):
         self._last_status = tuple(keys[-1].tolist())
         return [_status(int(host_time_ns[row]), *keys[row].tolist()) for row in np.flatnonzero(changed).tolist()]
 
+    def _tell_rates(self, header: StructArray, unwrapped: Int64Array) -> None:
+        if self.tell_rates is None:
+            return
+        prf_mhz, tick_hz = header["prf_mhz"].astype(np.int64), header["tick_hz"].astype(np.int64)
+        same = (prf_mhz == self._last_rates[0]) & (tick_hz == self._last_rates[1])
+        for row in np.flatnonzero(~same).tolist():
+            rates = (int(prf_mhz[row]), int(tick_hz[row]))
+            apart_mhz = abs(rates[0] - self._last_rates[0])
+            if rates[1] == self._last_rates[1] and apart_mhz <= SAME_RATE * self._last_rates[0] and rates[0]:
+                continue
+            self._last_rates = rates
+            self.tell_rates(int(unwrapped[row]) << 16, rates[0] / 1000, rates[1])
+
     def _returns(
         self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
     ) -> StructArray:
@@ -212,8 +239,27 @@ class SrepParser(PacketParser):
             part = slice(start, stop)
             if header["pulses"][start]:
                 block = self._block(host_time_ns[part], header[part], units[part], unwrapped[part])
-                filled += self._fill(block, table[filled:])
+                apparent = header["mta_zone"][part] == ZONE_UNKNOWN
+                if self.emissions and apparent.any():
+                    filled += self._fill_all(block, apparent, table[filled:])
+                else:
+                    filled += self._fill(block, table[filled:])
         return table[:filled]
+
+    def _fill_all(self, block: ReturnSlots, apparent: BoolArray, table: StructArray) -> int:
+        """As `fill`; a pulse without a return is a row as well where ranges are apparent, (m,) of datagrams."""
+        content = block.content.copy()
+        returns = np.count_nonzero(content["range"][:, block.others :], axis=1)
+        alone = (returns == 0) & np.repeat(apparent, block.shape[1])
+        content["range"][alone, block.others] = 1  # so that there is a row
+        block.content = content
+        filled = self._fill(block, table)
+        rows = np.where(alone, 1, returns)
+        at = (np.cumsum(rows) - rows)[alone]
+        for name in ("range_m", "intensity", "pulse_width_ns", "return_number", "number_of_returns"):
+            table[name][at] = 0
+        table["flags"][at] |= FLAG_NO_POINT
+        return filled
 
     def _block(
         self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array

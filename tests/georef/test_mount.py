@@ -13,6 +13,7 @@ from georef.beams import LineGeometry, OusterGeometry
 from georef.calibration import nominal
 from georef.mount import AngleSeries, Mount, MountError, Stage
 from georef.points import Fate
+from georef.records import INS_DTYPE
 from georef.sensor_model import SensorModel
 from tests.georef.scanner_cases import TURNED, rows_of, still_trajectory
 
@@ -98,3 +99,22 @@ def test_series_that_cannot_be() -> None:
         AngleSeries(np.array([1]), np.zeros((1, 3)))
     with pytest.raises(MountError, match="gimbal angles: time does not rise"):
         AngleSeries(np.array([1, 1]), np.zeros((2, 3)))
+
+
+def test_angles_a_device_tells_are_the_stages_own() -> None:
+    """Twice told, late, without a heading or a time: left out."""
+    rows = np.zeros(7, INS_DTYPE)
+    rows["gps_ns"] = np.array([10, 20, 20, 15, 30, -1, 40]) * MS
+    rows["gps_ns"][5] = -1
+    rows["roll_rad"], rows["pitch_rad"] = np.arange(7) * 0.1, np.arange(7) * -0.01
+    rows["heading_rad"] = 6.2
+    rows["heading_rad"][4], rows["heading_rad"][6] = np.nan, 0.1
+    series = AngleSeries.of_solutions(rows, 25 * MS)
+    assert series.time_ns.tolist() == [10 * MS, 20 * MS, 40 * MS]
+    assert series.angles_rad[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.6])
+    angles, known = series.at(np.array([5, 15, 30, 41]) * MS)
+    assert known.tolist() == [False, True, True, False]
+    assert angles[1:3, 1] == pytest.approx([-0.005, -0.035])
+    assert angles[2, 2] == pytest.approx(0.5 * (6.2 + 0.1 + 2 * math.pi))
+    with pytest.raises(MountError, match="at least two epochs"):
+        AngleSeries.of_solutions(rows[:1])

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from georef.ranging import (
+    PulseRates,
     RangingError,
     ZoneResolver,
     gate_times,
@@ -295,6 +296,61 @@ def test_ticks_that_are_no_whole_nanoseconds() -> None:
     np.testing.assert_array_equal(found["device_time_ns"], rows["device_time_ns"][:1997])
     floored = fed(ZoneResolver(2000.0, 1000.0, slanted=False), rows)
     assert np.abs(floored["range_m"] - 1000.0).max() > 0.05
+
+
+def test_a_laser_that_rests_between_datagrams_leaves_no_gap_where_every_pulse_is_told() -> None:
+    steps = np.full(1000, 2000)
+    steps[500] = 2000 * 3 + 900  # 3.45 periods, between two datagrams
+    rows, true = train(flat(1234.5), 1000, steps, every_pulse=True)
+    resolver = ZoneResolver(2500.0, 1200.0, every_pulse=True)
+    found = fed(resolver, rows)
+    assert_true(found, true)
+    assert len(found) == len(true)
+    assert not resolver.counts
+    unsure = ZoneResolver(2500.0, 1200.0)
+    assert_true(fed(unsure, rows), true)
+    assert set(unsure.counts) == {"mta_gap"}  # how many pulses were between, the time does not say
+
+
+def test_rows_that_stand_there_for_their_neighbours_are_not_counted() -> None:
+    rows, _ = train(flat(), 300)
+    resolver = ZoneResolver(2000.0, 1000.0)
+    rows["flags"][:2] = 128
+    found = resolver.feed(rows)
+    assert resolver.counts == {"mta_gap": FIRST["mta_gap"] - 2}
+    assert resolver.waiting == len(rows) - 3 - len(found) > 0
+    assert len(resolver.flush()) == len(rows) - 3 - len(found)
+    assert resolver.waiting == 0
+
+
+@pytest.mark.parametrize("cuts", [(), (1, 399, 400, 401, 700)])
+def test_the_tick_rate_is_the_headers_from_a_pulse_on(cuts: tuple[int, ...]) -> None:
+    """70 MHz, then, of another device, 150: its counter begins anew."""
+    rows, zones_m = np.zeros(800, RETURN_DTYPE), []
+    for part, hz in ((slice(0, 400), 70_000_000), (slice(400, 800), 150_000_000)):
+        ticks = 10**11 + hz // 500_000 * np.arange(400)
+        rows["device_time_ns"][part] = [int(tick) * 10**9 // hz for tick in ticks]
+        zones_m.append(hz // 500_000 * C_MPS / (2 * hz))
+        rows["range_m"][part] = 1000.0 - 3 * zones_m[-1]
+    rows["pulse_id"], rows["number_of_returns"], rows["mta_zone"] = np.arange(800) + 9, 1, 255
+    rates = PulseRates()
+    rates.note(0, 500e3, 70_000_000)
+    rates.note(409, 500e3, 150_000_000)
+    resolver = ZoneResolver(2000.0, 1000.0, slanted=False, rates=rates)
+    found = fed(resolver, rows, cuts)
+    assert resolver.counts == {"mta_gap": 6}  # three at either beginning
+    np.testing.assert_allclose(found["range_m"], 1000.0, rtol=0, atol=1e-9)
+    wanted = np.concatenate([rows["device_time_ns"][:397], rows["device_time_ns"][400:797]])
+    np.testing.assert_array_equal(found["device_time_ns"], wanted)
+
+
+def test_ticks_finer_than_device_times_are_gaps() -> None:
+    rows, _ = train(flat(), 300, every_pulse=True)
+    rates = PulseRates()
+    rates.note(0, 0.0, 2_000_000_000)
+    resolver = ZoneResolver(2000.0, 1000.0, rates=rates)
+    assert not len(fed(resolver, rows))
+    assert resolver.counts == {"mta_gap": np.count_nonzero(rows["number_of_returns"])}
 
 
 # ---------------------------------------------------------------------------------------- the virtual aircraft's
