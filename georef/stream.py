@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from georef.points import FATE_NAMES, ByteArray, Fate, Points
 from georef.records import RETURN_DTYPE, Int64Array, StructArray
 from georef.stream_clocks import StreamClocks
 from georef.stream_path import CompletePath, GrowingPath, Path
+from georef.stream_rows import any_has, compact, joined, taken
 
 if TYPE_CHECKING:
     from georef.trajectory import Trajectory
@@ -63,6 +64,10 @@ class Resolver(Protocol):
     """What finds the emissions of returns with pulses in air, and may hold some back: `georef.ranging.ZoneResolver`."""
 
     counts: Counter[str]
+
+    @property
+    def waiting(self) -> int:
+        """Returns held back."""
 
     def feed(self, rows: StructArray, predicted_m: NDArray[np.float64] | None = None) -> StructArray:
         """Rows of which all is known now, in the order of emission."""
@@ -158,8 +163,8 @@ class _Lane:
             self._give_up_unseen(tick_ns, last=last)
             return None
         ready = self._covered(tick_ns, covered_ns, last=last)
-        rows = _joined([held.rows for held in ready], NO_ROWS)
-        time_ns = _joined([held.time_ns for held in ready], NO_TIMES)
+        rows = joined([held.rows for held in ready], NO_ROWS)
+        time_ns = joined([held.time_ns for held in ready], NO_TIMES)
         if self.chain.resolver is not None:
             rows, time_ns = self._resolved(self.chain.resolver, rows, time_ns, trajectory, clocks, last=last)
         return self._points(rows, time_ns, trajectory, last=last)
@@ -167,7 +172,7 @@ class _Lane:
     def _take(self, tick_ns: int) -> None:
         pieces, self.new = [rows for rows in self.new if len(rows)], []
         if pieces:
-            self._untimed.append(_Held(_joined(pieces, NO_ROWS), tick_ns, np.empty(0, np.int64)))
+            self._untimed.append(_Held(compact(joined(pieces, NO_ROWS)), tick_ns, NO_TIMES))
         for held in _beyond(self._untimed, self._settings.max_rows):
             self._give_up(held.rows, Fate.NO_TIME)
 
@@ -241,31 +246,34 @@ class _Lane:
         last: bool,
     ) -> tuple[StructArray, Int64Array]:
         """Rows with the times of their emissions, of those that have become known."""
-        self._resolves = self._resolves or bool((rows["mta_zone"] == ZONE_UNKNOWN).any())
+        self._resolves = self._resolves or any_has(rows, "mta_zone", ZONE_UNKNOWN)
         if not self._resolves:
             return rows, time_ns
-        dropped = resolver.counts.total()
+        held = resolver.waiting
         predict = self.chain.predict
         given = (
             [resolver.feed(rows, None if predict is None else predict(rows, time_ns, trajectory))] if len(rows) else []
         )
         given += [resolver.flush()] if last else []
-        known = _joined([piece for piece in given if len(piece)], rows)
-        self._held_back += len(rows) - len(known) - (resolver.counts.total() - dropped)
+        known = joined(given, rows)
+        self._held_back += resolver.waiting - held
         good, emitted_ns = self._times(known, clocks)
+        if good.all():
+            return known, emitted_ns
         self._give_up(known[~good], Fate.NO_TIME)
-        return known[good], emitted_ns[good]
+        return taken(known, good), emitted_ns[good]
 
     def _points(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory, *, last: bool) -> Points | None:
         chain = self.chain
         if chain.motion is not None and chain.given is not None:
-            rows, time_ns, rate, acceleration = self._moving(chain.motion, rows, time_ns, last=last)
+            rows, time_ns, chain.given.rate, chain.given.acceleration = self._moving(
+                chain.motion, rows, time_ns, last=last
+            )
+        if any_has(rows, "flags", CONTEXT_FLAG):
             own = rows["flags"] & CONTEXT_FLAG == 0
-            chain.given.rate, chain.given.acceleration = rate[own], acceleration[own]
-        else:
-            own = rows["flags"] & CONTEXT_FLAG == 0
-        if not own.all():
-            rows, time_ns = rows[own], time_ns[own]
+            rows, time_ns = taken(rows, own), time_ns[own]
+            if chain.motion is not None and chain.given is not None:
+                chain.given.rate, chain.given.acceleration = chain.given.rate[own], chain.given.acceleration[own]
         if not len(rows):
             return None
         points, fates = chain.georeferencer.georeference(rows, time_ns, trajectory)
@@ -277,7 +285,7 @@ class _Lane:
         moving = motion.feed(rows, time_ns)
         if last:
             rest = motion.flush()
-            moving = tuple(np.concatenate(columns) for columns in zip(moving, rest, strict=True))  # type: ignore[assignment]
+            moving = tuple(joined(list(columns), NO_TIMES) for columns in zip(moving, rest, strict=True))  # type: ignore[assignment]
         self._held_back += len(rows) - len(moving[0])
         return moving
 
@@ -285,30 +293,28 @@ class _Lane:
         self.fates[fate] += int(np.count_nonzero(rows["flags"] & CONTEXT_FLAG == 0))
 
 
-def _joined(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
-    """One after the other; a single one as it is, for it holds many bytes; none as an empty array like another."""
-    if not pieces:
-        return like[:0]
-    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-
-
 def _split(held: _Held, mask: NDArray[np.bool_]) -> tuple[list[_Held], list[_Held]]:
-    """Those of the mask, and the others; each in order, and nothing is copied where they are all of one kind."""
-    if mask.all():
+    """Those of the mask, and the others, each in order; nothing is copied where the others follow in one piece."""
+    count = int(np.count_nonzero(mask))
+    if count == len(mask):
         return [held], []
-    if not mask.any():
+    if not count:
         return [], [held]
-    one, other = (_Held(held.rows[part], held.since_ns, held.time_ns[part]) for part in (mask, ~mask))
+    if mask[:count].all():
+        parts = [(held.rows[part], held.time_ns[part]) for part in (slice(count), slice(count, None))]
+    else:
+        parts = [(taken(held.rows, part), held.time_ns[part]) for part in (mask, ~mask)]
+    one, other = (_Held(rows, held.since_ns, time_ns) for rows, time_ns in parts)
     return [one], [other]
 
 
 def _beyond(queue: deque[_Held], max_rows: int) -> list[_Held]:
     """Taken from the queue: the oldest, until no more than so many rows are left."""
-    rows, taken = sum(len(held.rows) for held in queue), []
+    rows, oldest = sum(len(held.rows) for held in queue), []
     while rows > max_rows:
-        taken.append(queue.popleft())
-        rows -= len(taken[-1].rows)
-    return taken
+        oldest.append(queue.popleft())
+        rows -= len(oldest[-1].rows)
+    return oldest
 
 
 class Stream:
@@ -330,6 +336,10 @@ class Stream:
         self.path = path
         self._lanes = {name: _Lane(chains[name], settings or StreamSettings()) for name in sorted(chains)}
         self._tick_ns = 0
+
+    def chain(self, name: str) -> ScannerChain:
+        """What a scanner's returns go through."""
+        return self._lanes[name].chain
 
     @property
     def scanners(self) -> list[str]:

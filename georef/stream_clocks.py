@@ -33,11 +33,12 @@ def _place(
 
 
 @kept
-def _bounds(values: Int64Array) -> tuple[int, int]:
-    least = most = values[0]
-    for value in values:
-        least, most = min(least, value), max(most, value)
-    return least, most
+def _bounds(device_ns: Int64Array, host_ns: Int64Array) -> tuple[int, int, int, int]:
+    least, most, earliest, latest = device_ns[0], device_ns[0], host_ns[0], host_ns[0]
+    for i in range(len(device_ns)):
+        least, most = min(least, device_ns[i]), max(most, device_ns[i])
+        earliest, latest = min(earliest, host_ns[i]), max(latest, host_ns[i])
+    return least, most, earliest, latest
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +208,12 @@ class StreamClocks:
         something happened between.
         """
         device_ns, host_ns = rows["device_time_ns"], rows["host_time_ns"]
-        first, last = (value >> CELL_BITS for value in _bounds(device_ns))
+        least, most, earliest, latest = _bounds(device_ns, host_ns)
+        first, last = least >> CELL_BITS, most >> CELL_BITS
         if last - first >= MAX_CELLS:
             return None
         edges = np.arange(first, last + 2, dtype=np.int64) << CELL_BITS
-        at_ns = np.repeat(np.array(_bounds(host_ns), dtype=np.int64), len(edges))
+        at_ns = np.repeat(np.array([earliest, latest], dtype=np.int64), len(edges))
         asked_ns, sigma_ns = self.gps_from_device(source, np.tile(edges, 2), at_ns)
         gps_ns, again_ns = np.split(asked_ns, 2)
         rate = np.diff(gps_ns) / float(1 << CELL_BITS)

@@ -16,6 +16,7 @@ import numpy as np
 
 from daemon.log.chunks import LogBatch, json_objects
 from daemon.log.reader import Session
+from daemon.processing.models import connect
 from daemon.processing.setup import Setup
 from daemon.replay import source_of_topic
 from drivers.core.parser import Parser
@@ -38,8 +39,39 @@ from georef.stream_clocks import FrozenClocks, HostClocks
 
 TICK_NS = 100_000_000
 TICK_BYTES = 32 << 20
+JOINED_BYTES = 256 << 10  # of a scanner's units, that are decoded at once where others' stand between them
 MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
 Placed = list[tuple[str, Points]]
+Tick = tuple[int, int, int | None]  # messages from one to before another, and the tick that comes after them
+
+
+class _Run:
+    """Consecutive units of a scanner that wait to be decoded together, for a call of a parser costs as much as many."""
+
+    def __init__(self, parse: Callable[[ChunkBatch], None]) -> None:
+        self._parse = parse
+        self._held: list[ChunkBatch] = []
+        self._bytes = 0
+
+    def add(self, units: ChunkBatch) -> None:
+        """The next ones; those of another wire or length are decoded before them."""
+        if self._held and (
+            self._held[0].source != units.source or self._held[0].units.shape[1] != units.units.shape[1]
+        ):
+            self.flush()
+        self._held.append(units)
+        self._bytes += units.units.size
+        if self._bytes >= JOINED_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Decode them now."""
+        held, self._held, self._bytes = self._held, [], 0
+        if len(held) == 1:
+            self._parse(held[0])
+        elif held:
+            times = np.concatenate([one.host_time_ns for one in held])
+            self._parse(ChunkBatch(held[0].source, times, np.concatenate([one.units for one in held])))
 
 
 class LogFeed:
@@ -58,10 +90,13 @@ class LogFeed:
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
         self._parsers = setup.parsers(("gnss", "scanner")) | setup.ins_parser()
+        for name in stream.scanners:
+            connect(stream.chain(name), self._parsers[f"scanner/{name}"])
         self._newest_ns: int | None = None
         self._bytes = 0
         self._context = False
         self._takers: dict[str, Callable[[LogBatch], None] | None] = {}
+        self._runs: dict[str, _Run] = {}
 
     def take(self, batch: LogBatch, *, context: bool = False) -> Placed:
         """The next messages; the points that have become final.
@@ -71,17 +106,25 @@ class LogFeed:
             context: they stand around the piece of the log that is wanted: they feed clocks, trajectory and parsers,
                 and their returns give no points.
         """
-        self._context = context
+        if context != self._context:
+            self._flush()
+            self._context = context
         placed: Placed = []
         for first, last, tick_ns in self._pieces(batch):
             if first < last:
                 self._feed(batch.between(first, last))
             if tick_ns is not None:
+                self._flush()
                 placed += self.stream.advance(tick_ns)
         return placed
 
+    def _flush(self) -> None:
+        for run in self._runs.values():
+            run.flush()
+
     def close(self) -> Placed:
         """The log is over."""
+        self._flush()
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
         return self.stream.close()
@@ -90,11 +133,16 @@ class LogFeed:
         """The parser of a source (``scanner/left``), for its counters."""
         return self._parsers[source]
 
-    def _pieces(self, batch: LogBatch) -> Iterator[tuple[int, int, int | None]]:
+    def _pieces(self, batch: LogBatch) -> Iterator[Tick]:
         """Runs of messages, and the tick that comes after each; the last run has none unless it fills the bytes."""
         times, size = batch.log_time_ns, batch.rows.shape[1]
         if self._newest_ns is None:
             self._newest_ns = int(times[0])
+        latest_ns = max(int(times.max()), self._newest_ns)
+        if latest_ns // TICK_NS == self._newest_ns // TICK_NS and self._bytes + len(times) * size < TICK_BYTES:
+            self._bytes, self._newest_ns = self._bytes + len(times) * size, latest_ns
+            yield 0, len(times), None
+            return
         newest = np.maximum.accumulate(np.maximum(times, self._newest_ns))
         before = np.concatenate([[self._newest_ns], newest[:-1]])
         crossing = np.flatnonzero(newest // TICK_NS > before // TICK_NS).tolist()
@@ -135,12 +183,14 @@ class LogFeed:
         if not inside:
             return None
 
-        def parse(batch: LogBatch) -> None:
-            units = ChunkBatch(source, batch.log_time_ns, batch.units)
+        def parse(units: ChunkBatch) -> None:
             for name in inside:
                 self._take_records(name, self._parsers[name].feed_batch(units))
 
-        return parse
+        take = parse
+        if source.startswith("scanner/"):  # whose records wait for the tick, each scanner's for themselves
+            take = self._runs.setdefault(inside[0], _Run(parse)).add
+        return lambda batch: take(ChunkBatch(source, batch.log_time_ns, batch.units))
 
     def _take_readings(self, batch: LogBatch) -> None:
         for reading in readings_of(batch):
@@ -162,6 +212,8 @@ class LogFeed:
         clocks = self.stream.clocks
         for record in records:
             rows = getattr(record, "rows", None)
+            if isinstance(record, ScannerReturns):
+                rows = np.flatnonzero(record.rows["number_of_returns"])  # the others are pulses that gave none
             counts[type(record).__name__] += 1 if rows is None else len(rows)
             if isinstance(record, ScannerReturns):
                 self._take_returns(source, record.rows)

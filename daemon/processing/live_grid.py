@@ -36,12 +36,26 @@ class CountGrid:
         self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile that is held
         self._state = np.zeros(2, dtype=np.int64)  # tiles held, points refused
 
-    def add(self, points: NDArray[np.float64]) -> None:
-        """Count points (n, 3): east, north, up, the last of which is not looked at. Blocks may be cut anywhere."""
+    def add(self, points: NDArray[np.float64], east_m: float = 0.0, north_m: float = 0.0) -> None:
+        """Count points (n, 3): east, north, up, the last of which is not looked at. Blocks may be cut anywhere.
+
+        Args:
+            points: from anywhere.
+            east_m, north_m: of the grid's origin in their coordinates.
+        """
         done = 0
         while done < len(points):
             done = count_points(
-                points, done, 1.0 / self.cell_m, self._counts, self._keys, self._slots, self._places, self._state
+                points,
+                east_m,
+                north_m,
+                done,
+                1.0 / self.cell_m,
+                self._counts,
+                self._keys,
+                self._slots,
+                self._places,
+                self._state,
             )
             if done < len(points):
                 self._coarsen()
@@ -136,12 +150,21 @@ _take_tile = kept(_find_tile)
 
 
 def _count_points(
-    points: Any, first: int, per_metre: float, counts: Any, keys: Any, slots: Any, places: Any, state: Any
+    points: Any,
+    east_m: float,
+    north_m: float,
+    first: int,
+    per_metre: float,
+    counts: Any,
+    keys: Any,
+    slots: Any,
+    places: Any,
+    state: Any,
 ) -> int:
     """Count points from ``first`` on; how far it came: less than all where a tile found no room."""
     column_before, row_before, tile = _FAR + 1, 0, -1
     for i in range(first, len(points)):
-        x, y = points[i, 0] * per_metre, points[i, 1] * per_metre
+        x, y = (points[i, 0] - east_m) * per_metre, (points[i, 1] - north_m) * per_metre
         if not (abs(x) < _FAR * TILE and abs(y) < _FAR * TILE):
             state[1] += 1
             continue

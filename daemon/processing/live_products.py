@@ -93,7 +93,7 @@ class Thinning:
 
     def __init__(self, points_per_s: int) -> None:
         self._limit = points_per_s
-        self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE], dtype=np.int64)
+        self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
 
     def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) of points in the order in which they came."""
@@ -104,17 +104,21 @@ class Thinning:
 
 @kept
 def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> None:
-    """state: second, points in it, of them kept, stride."""
+    """state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept."""
+    end, points, shown, stride, until = state[0], state[1], state[2], state[3], state[4]
     for i in range(len(time_ns)):
-        second = time_ns[i] // SECOND_NS
-        if second > state[0]:
-            if state[1] > 0:
-                state[3] = max(1, -(-state[1] // limit))
-            state[0], state[1], state[2] = second, 0, 0
-        if state[1] % state[3] == 0 and state[2] < limit:
-            keep[i] = True
-            state[2] += 1
-        state[1] += 1
+        if time_ns[i] >= end:
+            if points > 0:
+                stride = max(1, -(-points // limit))
+            end, points, shown, until = (time_ns[i] // SECOND_NS + 1) * SECOND_NS, 0, 0, 0
+        if until == 0:
+            until = stride
+            if shown < limit:
+                keep[i] = True
+                shown += 1
+        until -= 1
+        points += 1
+    state[0], state[1], state[2], state[3], state[4] = end, points, shown, stride, until
 
 
 @dataclass(slots=True)
@@ -172,15 +176,17 @@ class LiveProducts:
         self.begin(trajectory)
         if self.frame is None:
             return
-        local = self.frame.of_points(points.points_map)
-        self.grid.add(local)
-        keep = self._thinning.keep(points.time_ns)
-        count = int(np.count_nonzero(keep))
+        if self._mapping is None:
+            self.grid.add(self.frame.of_points(points.points_map))
+        else:
+            self.grid.add(points.points_map, *self.frame.origin[:2].tolist())
+        keep = np.flatnonzero(self._thinning.keep(points.time_ns))
+        count = len(keep)
         if count:
             cloud = np.empty(count, dtype=CLOUD_DTYPE)
-            cloud["x"], cloud["y"], cloud["z"] = local[keep].T
+            cloud["x"], cloud["y"], cloud["z"] = self.frame.of_points(points.points_map.take(keep, axis=0)).T
             cloud["intensity"] = points.intensity[keep]
-            time_ns = unix_from_gps(int(points.time_ns[keep][0]))
+            time_ns = unix_from_gps(int(points.time_ns[keep[0]]))
             written = self._write(lambda mcap: mcap.add_cloud(f"/points/{name}", cloud, time_ns, log_time_ns))
             self.shown += count * written
             self.unwritten += count * (not written)

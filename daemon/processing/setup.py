@@ -72,6 +72,8 @@ class Setup:
         config: of the log, or another one.
         calibrations: by scanner, those in use.
         mapping: frame of the points; None: they are in e.
+        ins_source: whose INS gives the growing trajectory: the first IMU whose protocol tells one, else the first
+            receiver; None: nobody's.
     """
 
     def __init__(self, config: Config, attachments: Mapping[str, bytes], options: Options | None = None) -> None:
@@ -83,6 +85,7 @@ class Setup:
         self.config = config
         self.options = options or Options()
         self._attachments = dict(attachments)
+        self.ins_source = self._ins_source()
         self.scanners = self._chosen()
         self.calibrations = {name: self._calibration(name) for name in self.scanners}
         self.mapping = self._mapping()
@@ -113,9 +116,7 @@ class Setup:
 
     # ------------------------------------------------------------------ sources
 
-    @property
-    def ins_source(self) -> str | None:
-        """Whose INS gives the growing trajectory: the first IMU whose protocol tells one, else the first receiver."""
+    def _ins_source(self) -> str | None:
         for wanted in ("imu", "gnss"):
             for kind, name, table in self.config.device_tables():
                 if kind == wanted and InsSolution in self._driver(kind, name, table).yields:
@@ -192,10 +193,12 @@ class Setup:
 
     def _chosen(self) -> list[str]:
         known = sorted(self.config.scanner)
+        files = {name: f"{file}: " for name, (_, file) in self.options.calibrations.items()}
         for name in [*self.options.scanners, *self.options.calibrations]:
             if name not in known:
                 raise ConfigError(
-                    f"scanner {name}: is not in the configuration; there are: {', '.join(known) or 'none'}"
+                    f"{files.get(name, '')}scanner {name}: is not in the configuration; there are: "
+                    f"{', '.join(known) or 'none'}"
                 )
         return [name for name in known if not self.options.scanners or name in self.options.scanners]
 

@@ -378,6 +378,10 @@ class PulsesInAir:
     counts: Counter[str] = field(default_factory=Counter)
     held: StructArray = field(default_factory=lambda: np.zeros(0, RETURN_DTYPE))
 
+    @property
+    def waiting(self) -> int:
+        return len(self.held)
+
     def feed(self, rows: StructArray, predicted_m: np.ndarray[Any, Any] | None = None) -> StructArray:
         assert predicted_m is None
         rows = np.concatenate([self.held, rows])
@@ -385,7 +389,8 @@ class PulsesInAir:
         return self._given(rows)
 
     def flush(self) -> StructArray:
-        return self._given(self.held)
+        rows, self.held = self.held, self.held[:0]
+        return self._given(rows)
 
     def _given(self, rows: StructArray) -> StructArray:
         dropped = np.rint(rows["range_m"] * 100).astype(np.int64) % 10 == 0
