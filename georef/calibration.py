@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 CONVENTIONS_VERSION = 1
+CONVENTIONS = 1  # version of docs/conventions.md
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
 RANGES = ("corrected", "vacuum")
 REFRACTIONS = ("none", "ardc", "spherical")
@@ -179,6 +180,7 @@ class _Reader:
 
     def calibration(self) -> Calibration:
         header = self._table("calibration", needed=True)
+        self._version(header)
         parameters, _ = self._values("parameters")
         sigmas, estimated = self._values("sigma")
         for index in np.flatnonzero(sigmas < 0.0).tolist():
@@ -219,6 +221,12 @@ class _Reader:
         if header:
             self._wrong(f"calibration.{key}", f"{'missing' if value is None else 'not text'}; want text in quotes")
         return ""
+
+    def _version(self, header: Mapping[str, Any]) -> None:
+        """Of the conventions, whose signs and units the numbers have."""
+        value = header.get("conventions", CONVENTIONS)
+        if value != CONVENTIONS:
+            self._wrong("calibration.conventions", f"got {value!r}, want {CONVENTIONS}: other signs or units, perhaps")
 
     def _choice(self, header: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> str | None:
         value = header.get(key)

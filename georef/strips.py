@@ -61,12 +61,19 @@ class Segment:
 
 
 def straight_spans(
-    time_ns: Int64Array, heading_rad: FloatArray, roll_rad: FloatArray, rules: StripRules | None = None
+    time_ns: Int64Array,
+    heading_rad: FloatArray,
+    roll_rad: FloatArray,
+    rules: StripRules | None = None,
+    unknown: Sequence[Span] = (),
 ) -> list[Span]:
-    """Where the aircraft does not turn: spans of the times (n,), with heading and roll (n,)."""
+    """Where the aircraft does not turn: spans of the times (n,), with heading and roll (n,).
+
+    Where nobody knows, it is taken not to: what is wanted there and cannot be had is then seen to be missing.
+    """
     rules = rules or StripRules()
     if len(time_ns) < 2:
-        return []
+        return sorted(unknown)
     seconds = (time_ns - time_ns[0]) / SECOND_NS
     rate = _windowed(seconds, np.unwrap(heading_rad), rules.window_s)
     bank = _windowed(seconds, _integral(seconds, roll_rad), rules.window_s)
@@ -74,7 +81,7 @@ def straight_spans(
     straight: list[Span] = []
     for start, end in _runs(~turning):
         straight.append((int(time_ns[start]), int(time_ns[end - 1]) + 1))
-    return _joined(straight, round(rules.min_turn_s * SECOND_NS))
+    return _joined(sorted([*straight, *unknown]), round(rules.min_turn_s * SECOND_NS))
 
 
 def _windowed(seconds: FloatArray, integral: FloatArray, window_s: float) -> FloatArray:

@@ -69,7 +69,8 @@ class TimeShift:
         if days and days % 7 == 0:
             parts.append(f"its week is another: {days // 7:+d} would be right")
         elif days:
-            parts.append(f"its time looks like seconds of the day: {days * (DAY_NS // SECOND_NS):+d} s would be right")
+            seconds = days * (DAY_NS // SECOND_NS)
+            parts.append(f"its day is another, or its time is seconds of the day: {seconds:+d} s would be right")
         if self.leap_seconds and abs(rest_s - self.leap_seconds) < NEAR_S:
             parts.append(f"its time is UTC, not GPS: {self.leap_seconds:+d} s would be right")
         elif self.leap_seconds and abs(rest_s + self.leap_seconds) < NEAR_S:

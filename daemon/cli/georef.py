@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from daemon.errors import ExitCode, UserError, one_line
-
-if TYPE_CHECKING:
-    pass
 
 
 def command(
@@ -44,7 +41,9 @@ def command(
     ] = None,
     no_sigma: Annotated[bool, typer.Option("--no-sigma", help="Leave the three sigmas out.")] = False,
     copc: Annotated[bool, typer.Option("--copc", help="Cloud optimised files (.copc.laz).")] = False,
-    scale: Annotated[float, typer.Option(help="Of the coordinates in the files, in their unit.", min=1e-9)] = 0.001,
+    scale: Annotated[
+        float, typer.Option(help="Of the coordinates in the files, in their unit.", min=1e-9, max=1.0)
+    ] = 0.001,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
 ) -> None:
@@ -104,7 +103,8 @@ def _calibrations(given: list[str]) -> dict[str, tuple[str, str]]:
         try:
             text = file.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{file}: cannot be read: {error}", ExitCode.IO) from error
+            why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a calibration file"
+            raise UserError(f"{file}: cannot be read: {why}", ExitCode.IO) from error
         scanner = named if equals else _scanner_of(text, file)
         if scanner in found:
             raise UserError(f"{file}: is the second calibration of scanner {scanner}", ExitCode.USAGE)

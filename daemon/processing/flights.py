@@ -90,7 +90,8 @@ class Flight:
         trajectory: the body's.
         strips: spans of log time, and the number of the first.
         lost: units that the recorder lost, by source.
-        troubles: with the time of returns, a line each.
+        troubles: with time or trajectory, a line each.
+        holes: what will be missing, a line each.
     """
 
     session: Session
@@ -104,6 +105,7 @@ class Flight:
     first_number: int = 1
     lost: dict[str, int] = field(default_factory=dict)
     troubles: list[str] = field(default_factory=list)
+    holes: list[str] = field(default_factory=list)
 
     @property
     def log(self) -> Path:
@@ -161,11 +163,14 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
 
 
 def _setup(wish: Wish, session: Session) -> Setup:
-    setup = (
-        Setup.of_log(session.attachments(), wish.options)
-        if wish.config is None
-        else Setup.of_config(wish.config, wish.options)
-    )
+    if wish.config is None:
+        try:
+            setup = Setup.of_log(session.attachments(), wish.options)
+        except UserError as error:
+            lines = refusals.of_log(session.parts[0].path, error.message.splitlines(), wish.options)
+            raise UserError("\n".join(lines), error.exit_code) from error
+    else:
+        setup = Setup.of_config(wish.config, wish.options)
     if setup.mapping is None:
         raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
     return setup
@@ -182,7 +187,7 @@ def _read(session: Session, setup: Setup) -> Flight:
         raise UserError(f"{log}: no scanner's data in the log")
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
-    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]))
+    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]), setup.config)
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)
     return flight
@@ -190,7 +195,9 @@ def _read(session: Session, setup: Setup) -> Flight:
 
 def _choose(wish: Wish, flight: Flight) -> None:
     """The flight's trajectory; the mapping's operation for where it was."""
-    flight.trajectory = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, flight.log)
+    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, flight.log)
+    flight.trajectory, doubts = chosen
+    flight.troubles += doubts
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)
     flight.setup.mapping.settle(within.position_e[:: max(1, len(within) // 100)])
@@ -198,10 +205,13 @@ def _choose(wish: Wish, flight: Flight) -> None:
 
 def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
     """Each flight's strips in log time, numbered through."""
+    given = None if wish.strips in ("auto", "whole") else _given_strips(wish.strips)
     number = 1
     for flight in flights:
-        flight.strips, flight.first_number = _strips(wish, flight), number
+        flight.strips, flight.first_number = _strips(wish, flight, given), number
         number += len(flight.strips)
+    if given is not None:
+        refusals.note_strips_elsewhere(wish.strips, given, flights)
     if number == 1:
         raise UserError(
             f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
@@ -209,19 +219,44 @@ def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
         )
 
 
-def _strips(wish: Wish, flight: Flight) -> list[Span]:
+def _given_strips(name: str) -> list[Span]:
+    try:
+        return read_strips(Path(name).read_text(encoding="utf-8-sig"), name)
+    except FileNotFoundError:
+        raise UserError(f"--strips {name}: no such file; want auto, whole or a CSV file", ExitCode.IO) from None
+    except UnicodeDecodeError:
+        raise UserError(f"{name}: no text; want a CSV file with start_gps_ns,end_gps_ns", ExitCode.IO) from None
+
+
+def _strips(wish: Wish, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
     laser = laser_spans(*flight.index.spans(), wish.rules)
     if wish.strips == "whole":
         return laser
+    spans = _straight(wish, flight) if given is None else given
+    host = flight.host_from_gps([time_ns for span in spans for time_ns in span])
+    here = list(zip(host[::2], host[1::2], strict=True))
+    if given is None:
+        return cut(here, laser, wish.rules)
+    return [(start, end) for start, end in here if start < flight.host_span[1] and end > flight.host_span[0]]
+
+
+def _straight(wish: Wish, flight: Flight) -> list[Span]:
+    """Straight flight in GPS time, and where the trajectory says nothing.
+
+    Before a device's own INS is aligned there is nothing to be had: that is told, and no strip.
+    """
     trajectory = flight.trajectory
     assert trajectory is not None
-    if wish.strips == "auto":
-        roll, _, heading = trajectory.attitude()
-        spans = straight_spans(trajectory.time_ns, heading, roll, wish.rules)
+    (begin, end), (first, last) = flight.span, trajectory.span
+    unknown = [(start, stop) for start, stop in trajectory.gaps().tolist()]
+    outside = [(start, stop) for start, stop in ((begin, first), (last, end)) if start < stop]
+    if wish.trajectory.file is not None:
+        unknown += outside
     else:
-        spans = read_strips(Path(wish.strips).read_text(encoding="utf-8-sig"), wish.strips)
-    host = flight.host_from_gps([time_ns for span in spans for time_ns in span])
-    given = list(zip(host[::2], host[1::2], strict=True))
-    if wish.strips == "auto":
-        return cut(given, laser, wish.rules)
-    return [(start, end) for start, end in given if start < flight.host_span[1] and end > flight.host_span[0]]
+        flight.troubles += [
+            f"{flight.log}: {(stop - start) / 1e9:.1f} s of the log have no INS solution: no strips there"
+            for start, stop in outside
+            if stop - start >= wish.rules.min_strip_s * 1e9
+        ]
+    roll, _, heading = trajectory.attitude()
+    return straight_spans(trajectory.time_ns, heading, roll, wish.rules, unknown)

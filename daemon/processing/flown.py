@@ -39,26 +39,28 @@ class TrajectoryWish:
 
 def choose_trajectory(
     wish: TrajectoryWish, setup: Setup, clocks: LogClocks, span: tuple[int, int], log: Path
-) -> Trajectory:
-    """The body's trajectory of a session, whose returns lie in a span of GPS time.
+) -> tuple[Trajectory, list[str]]:
+    """The body's trajectory of a session, whose returns lie in a span of GPS time; and doubts about it, a line each.
 
     Raises:
         UserError: there is none, it cannot be read, or it is of another time.
     """
+    doubts: list[str] = []
     try:
         if wish.file is None:
             trajectory = _from_log(setup, clocks, log)
         else:
             trajectory = _from_file(wish, wish.file, span)
-            refuse_other_motion(clocks, trajectory, str(wish.file), log)
+            doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
         refuse_no_overlap(trajectory, str(wish.file or FROM_LOG), span, log)
         trajectory.require_attitude()
         offset = offset_of(wish.at, setup.config)
         if offset is not None:
             trajectory = trajectory.at_body(offset)
     except TrajectoryError as error:
-        raise UserError(str(error)) from error
-    return trajectory
+        named = str(error) if str(log) in str(error) else f"{error} ({log})"
+        raise UserError(named) from error
+    return trajectory, doubts
 
 
 def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int]) -> Trajectory:

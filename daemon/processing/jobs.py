@@ -5,6 +5,7 @@ What a job gives depends on its input only, so it does not matter which process 
 
 from __future__ import annotations
 
+import errno
 import tempfile
 import time
 from collections import Counter
@@ -15,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+import lazrs
 import numpy as np
 
 from daemon.log.chunks import LogBatch
@@ -22,6 +24,7 @@ from daemon.log.reader import PartDamage
 from daemon.processing.feed import LogFeed
 from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
 from daemon.processing.setup import Setup
+from daemon.processing.unread import Unread
 from daemon.replay import source_of_topic
 from georef.earth import geodetic_from_e
 from georef.formats.copc import CopcWriter
@@ -96,6 +99,7 @@ class JobResult:
     Attributes:
         fates: by scanner, returns by what became of them.
         time_refused: by scanner, stamps that its clock did not believe, by reason.
+        unread: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
         first_gps_ns, last_gps_ns: of the points; None: there are none.
         bounds: least and largest coordinates.
         edges: by scanner, of the points seen farthest from nadir among some: the angle, rad, the height of the scanner
@@ -111,6 +115,7 @@ class JobResult:
     end_ns: int
     fates: dict[str, Counter[str]] = field(default_factory=dict)
     time_refused: dict[str, dict[str, int]] = field(default_factory=dict)
+    unread: dict[str, Counter[str]] = field(default_factory=dict)
     clipped: Clipped = field(default_factory=Clipped)
     points: int = 0
     first_gps_ns: int | None = None
@@ -157,6 +162,8 @@ def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobR
                 result.file_bytes = stream.tell()
         except (LasError, MappingError) as error:
             raise JobError(f"{job.path.name}: {error}") from error
+        except lazrs.LazrsError as error:  # which does not say what the file system said
+            raise OSError(errno.EIO, "cannot be written; is the disk full?", str(job.path)) from error
         finally:
             if not result.points:
                 job.path.unlink(missing_ok=True)
@@ -176,11 +183,13 @@ def _write(plan: SessionPlan, job: Job, trajectory: Trajectory, result: JobResul
             _note_span(result, points)
             _note_edge(result, name, points, setup, trajectory)
 
+    unread = Unread({name: feed.parser(f"scanner/{name}") for name in names})
     for batch, own in _messages(plan, job, result, tell):
         write(feed.take(batch, context=not own))
+        unread.note(own=own)
     write(feed.close())
     sink.close()
-    result.clipped = sink.clipped
+    result.clipped, result.unread = sink.clipped, unread.counts
     for name in names:
         fates = georeferenced.fates(name)
         result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})
@@ -201,7 +210,8 @@ def _sink(plan: SessionPlan, job: Job, stream: BinaryIO, opened: ExitStack) -> P
 
 
 def _note_span(result: JobResult, points: Points) -> None:
-    least, largest = points.points_map.min(axis=0), points.points_map.max(axis=0)
+    columns = points.points_map.T  # one by one: all at once they take ten times as long
+    least, largest = np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
     first, last = int(points.time_ns.min()), int(points.time_ns.max())
     if result.first_gps_ns is not None and result.last_gps_ns is not None:
         least, largest = np.minimum(least, result.bounds[0]), np.maximum(largest, result.bounds[1])
@@ -241,11 +251,14 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
                 host_ns = record.rows["host_time_ns"]
                 counts[source] += int(np.count_nonzero((host_ns >= start_ns) & (host_ns < end_ns)))
 
-    for batch, _ in _messages(plan, job, result, tell):
+    unread = Unread({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
+    for batch, own in _messages(plan, job, result, tell):
         wire = source_of_topic(batch.channel.topic) or ""
         source = wire.removesuffix("/aux")
         if source in parsers:
             count(source, parsers[source].feed_batch(ChunkBatch(wire, batch.log_time_ns, batch.units)))
+        unread.note(own=own)
+    result.unread = unread.counts
     for source, parser in parsers.items():
         count(source, parser.close())
         result.fates[source.removeprefix("scanner/")] = Counter({BETWEEN_STRIPS: counts[source]})

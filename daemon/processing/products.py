@@ -25,7 +25,8 @@ from daemon.log.format import LogError
 from daemon.processing import refusals
 from daemon.processing.flights import EIGHT_BIT, INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
-from daemon.processing.sidecar import run_record, sha256_of, write_sidecar
+from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
+from daemon.processing.unread import unread_lines
 from daemon.processing.workers import run_jobs
 from georef.formats.las import LasSettings
 from georef.formats.sbet import sbet_bytes, smrmsg_bytes
@@ -197,7 +198,7 @@ def _is_done(result: JobResult) -> bool:
 
 
 def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
-    """Why returns have no time; UserError where none has one."""
+    """Why returns have no time; UserError where no return at all could be placed."""
     for number, flight in enumerate(flights):
         own = [result for result in results if result.session == number and result.strip]
         status = flight.status(flight.host_span[1])
@@ -208,7 +209,11 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
                 fates.update(result.fates.get(name, {}))
                 refused.update(result.time_refused.get(name, {}))
             flight.troubles += refusals.time_troubles(flight.log, name, fates, refused, status)
-        refusals.refuse_all_lost(flight.troubles, sum(result.points for result in own))
+    if not any(result.points or result.failed for result in results):
+        lines = [line for flight in flights for line in flight.troubles]
+        lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]
+        became = reasons_text(fates for result in results for fates in result.fates.values())
+        refusals.refuse_nothing(flights[0].log, lines, became)
 
 
 def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from daemon.errors import ExitCode, UserError
 from georef.points import Fate
@@ -15,6 +15,8 @@ from georef.trajectory import gps_text
 if TYPE_CHECKING:
     from daemon.config.config import Config
     from daemon.processing.feed import LogClocks
+    from daemon.processing.flights import Flight
+    from daemon.processing.setup import Options
     from georef.timescales import ClockStatus
     from georef.trajectory import Trajectory
 
@@ -22,6 +24,8 @@ Span = tuple[int, int]
 NO_TIME = Fate.NO_TIME.name.lower()
 GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
 MUCH = 0.01  # share of returns without time that is worth a warning
+LATE_S = 0.06  # more than an IMU's samples are late at the host
+UNLIKE = 0.3  # correlation of turn rates below which two motions are hardly one
 
 
 def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -> None:
@@ -50,6 +54,13 @@ def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -
             )
 
 
+def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
+    """What is wrong with the configuration in a log names the log; what the command line said does not."""
+    files = [file for _, file in options.calibrations.values()]
+    own = ("output.", "datum", *files) if options.crs or options.datum or options.epoch else ("--", *files)
+    return [line if line.startswith(own) else f"{log}: {line}" for line in lines]
+
+
 def _said(value: object) -> str:
     return "not set" if value is None else str(value)
 
@@ -70,6 +81,25 @@ def refuse_overlap(spans: Mapping[Path, Span]) -> None:
             )
 
 
+def note_strips_elsewhere(file: str, strips: Sequence[Span], flights: Sequence[Flight]) -> None:
+    """Strips that a file asks for and that lie in no log will be missing; spans in GPS ns.
+
+    Raises:
+        UserError: all of them.
+    """
+    elsewhere = [
+        (start, end)
+        for start, end in strips
+        if not any(start < flight.span[1] and end > flight.span[0] for flight in flights)
+    ]
+    if len(elsewhere) == len(strips):
+        logs = ", ".join(f"{gps_text(flight.span[0])} to {gps_text(flight.span[1])}" for flight in flights)
+        raise UserError(f"{file}: none of its strips lies in the logs, {logs}; want GPS nanoseconds since 1980-01-06")
+    flights[0].holes += [
+        f"{file}: its strip from {gps_text(start)} to {gps_text(end)} lies in no log" for start, end in elsewhere
+    ]
+
+
 def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) -> None:
     """A trajectory and a log have some time in common.
 
@@ -85,7 +115,7 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
     )
 
 
-def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None) -> None:
+def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None, config: Config) -> None:
     """The log's own clock must be known well enough to say which second a pulse belongs to.
 
     Raises:
@@ -97,6 +127,13 @@ def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None) -> 
         raise UserError(
             f"{log}: {clock}: which second an edge is, is not certain: {status.ambiguous}; "
             "want the time messages of the receiver that gives the pulse (gnss.….pps)"
+        )
+    said = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
+    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in said:
+        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in said.items())
+        raise UserError(
+            f"{log}: {clock}: no receiver says which second its edges are ({heard or 'no gnss.….pps is set'}); "
+            "want the receiver that gives the pulse there, with --config"
         )
     if status.state is TimeState.NO_TIME:
         raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
@@ -127,26 +164,41 @@ def time_troubles(
     return [f"{told}: its stamps run free; want a head that is locked to the PPS, or latches it"]
 
 
-def refuse_all_lost(troubles: Sequence[str], points: int) -> None:
+def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:
     """Where no return at all could be placed, there is no product.
 
+    Args:
+        log: the first one.
+        troubles: lines that say why; empty: unknown.
+        became: what became of the returns.
+
     Raises:
-        UserError: with what the clocks say.
+        UserError: always.
     """
-    if not points and troubles:
-        raise UserError("\n".join(troubles))
+    raise UserError("\n".join(troubles) or f"{log}: no return could be georeferenced: {became}")
 
 
-def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> None:
+def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> list[str]:
     """The trajectory turns when the log's IMU does; one in UTC, of another week or of another flight does not.
+
+    Gives a line of doubt where it turns a little earlier or later, or quite otherwise: motion that the IMU's noise
+    hides would look so too.
 
     Raises:
         UserError: it turns at other times; the line says by how much.
     """
     if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
-        return
+        return []
     from georef.trajectory_time import correlate_turn_rates  # scipy.signal, which takes seconds to load
 
     shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
     if shift.is_wrong:
         raise UserError(f"{file}: {shift.what}, by how it turns and how the IMU in {log} does")
+    if shift.is_certain and abs(shift.seconds) > LATE_S:
+        return [f"{file}: turns {-shift.seconds:.3f} s later than the IMU in {log} does; its time may be off by that"]
+    if shift.unshifted < UNLIKE:
+        return [
+            f"{file}: does not turn as the IMU in {log} does (correlation {shift.unshifted:.2f}); it may be of another "
+            "flight, or imu.….rotation_b_imu be another"
+        ]
+    return []

@@ -8,12 +8,13 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daemon.processing.models import air_of
+from daemon.processing.unread import unread_lines
 from georef.calibration import PARAMETERS
 from georef.points import Fate
 
@@ -65,7 +66,29 @@ def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
     for result in results:
         for scanner, fates in result.fates.items():
             total.setdefault(scanner, Counter()).update(fates)
-    return {scanner: counts_entry(fates) for scanner, fates in sorted(total.items())}
+    unread = count_unread(results)
+    return {
+        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(unread.get(scanner, {}).items()))}
+        for scanner, fates in sorted(total.items())
+    }
+
+
+def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
+    """By scanner: messages that gave nothing, by reason."""
+    total: dict[str, Counter[str]] = {}
+    for result in results:
+        for scanner, counts in result.unread.items():
+            total.setdefault(scanner, Counter()).update(counts)
+    return total
+
+
+def reasons_text(fates: Iterable[Counter[str]]) -> str:
+    """What became of returns, for people."""
+    total: Counter[str] = Counter()
+    for counts in fates:
+        total.update(counts)
+    became = (f"{count:,} {reason.replace('_', ' ')}" for reason, count in sorted((+total).items()))
+    return ", ".join(became) or "none came"
 
 
 def counts_entry(fates: Counter[str]) -> dict[str, Any]:
@@ -181,6 +204,7 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
     ]
     lines += [f"{flight.log}: the recorder lost {count:,} units of {source}" for source, count in flight.lost.items()]
     lines += flight.troubles
+    lines += unread_lines(str(flight.log), count_unread(results))[1]
     sigma, unknown, intensity = (
         sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")
     )
@@ -207,11 +231,14 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
     for part in damages:
         damage = part.damage
         lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")
+    lines += flight.holes
+    lines += unread_lines(str(flight.log), count_unread(results))[0]
     for result in results:
         if result.failed:
             lines.append(f"strip {result.strip}: {result.failed}" if result.strip else f"a turn: {result.failed}")
         elif result.strip and not result.points:
-            lines.append(f"strip {result.strip}: no return of it could be georeferenced; it has no file")
+            why = reasons_text(result.fates.values())
+            lines.append(f"strip {result.strip}: no return of it could be georeferenced ({why}); it has no file")
         elif result.strip:
             lines += [
                 f"strip {result.strip}: {count:,} returns of {name} {UNCOVERED[reason]}"

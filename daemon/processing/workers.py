@@ -6,10 +6,11 @@ import importlib
 import multiprocessing
 import pickle
 import signal
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from daemon.errors import ExitCode, UserError
@@ -17,6 +18,8 @@ from daemon.processing.jobs import Job, JobError, JobResult, SessionPlan, run_jo
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
+DIED = "the process died, as it does when memory is short"
+END_S = 5.0  # for a process to end when it was told to
 Progress = Callable[[int], None]  # bytes done so far
 
 _plans: list[SessionPlan] = []  # of a worker process
@@ -74,10 +77,33 @@ def _failed(job: Job, why: str) -> JobResult:
 
 
 def _begin(plans: bytes, done: Any) -> None:
-    """What a worker process does first; an interrupt ends it without a word."""
+    """What a worker process does first; on an interrupt the process that began it ends it."""
     global _plans, _done
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     _plans, _done = pickle.loads(plans), done
+
+
+@contextmanager
+def _held_interrupts() -> Iterator[None]:
+    """An interrupt waits till the end of the block; processes begun within hold theirs till they release them.
+
+    A process that is begun reads the plans for seconds: one that the interrupt found there would be left behind.
+    """
+    came: list[int] = []
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which the processes inherit
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+    if in_main and callable(before):  # another thread may take the signal, and Python hand it to this one
+        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        if in_main and callable(before):
+            signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _do(job: Job) -> JobResult:
@@ -96,8 +122,14 @@ def _in_processes(
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done))
     results: dict[int, JobResult] = {}
+    futures: dict[Future[JobResult], int] = {}
     try:
-        futures = {pool.submit(_do, jobs[number]): number for number in order}
+        with _held_interrupts():
+            for number in order:
+                try:
+                    futures[pool.submit(_do, jobs[number])] = number
+                except BrokenProcessPool:
+                    results[number] = _failed(jobs[number], DIED)
         pending: set[Future[JobResult]] = set(futures)
         while pending:
             finished, pending = wait(pending, TELL_EVERY_S, FIRST_COMPLETED)
@@ -106,12 +138,15 @@ def _in_processes(
                 try:
                     results[number] = future.result()
                 except BrokenProcessPool:
-                    results[number] = _failed(jobs[number], "the process died, as it does when memory is short")
+                    results[number] = _failed(jobs[number], DIED)
             progress(int(done.value))
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - before:
+        ours = set(multiprocessing.active_children()) - before
+        for process in ours:
             process.terminate()
+        for process in ours:
+            process.join(END_S)
         raise
     pool.shutdown()
     return results

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from daemon.config.config import Config
 from daemon.config.loading import parse_config
 from daemon.errors import UserError
 from daemon.processing import refusals
+from daemon.processing.feed import LogClocks
+from daemon.processing.setup import Options
+from daemon.processing.unread import Unread, unread_lines
+from drivers.core.parser import Parser, ParserCounters
+from georef.records import INS_DTYPE
 from georef.timescales import ClockStatus, TimeState
+from georef.trajectory import Trajectory
 
+S = 1_000_000_000
 A, B = Path("a.mcap"), Path("b.mcap")
 TEXT = """
 [session]
@@ -65,13 +75,30 @@ def test_logs_of_one_time() -> None:
 
 def test_a_second_that_is_not_certain_and_no_time() -> None:
     good = ClockStatus(TimeState.LOCKED, 100.0)
-    refusals.refuse_no_time(A, "pps/main", good)
+    settings = config()
+    refusals.refuse_no_time(A, "pps/main", good, settings)
     with pytest.raises(UserError, match="not certain: messages contradict"):
-        refusals.refuse_no_time(A, "pps/main", ClockStatus(TimeState.COARSE, 1e8, ambiguous="messages contradict"))
+        refusals.refuse_no_time(
+            A, "pps/main", ClockStatus(TimeState.COARSE, 1e8, ambiguous="messages contradict"), settings
+        )
+    silent = ClockStatus(TimeState.NO_TIME, float("inf"))
     with pytest.raises(UserError, match="nothing in the log says the time"):
-        refusals.refuse_no_time(A, "pps/main", ClockStatus(TimeState.NO_TIME, float("inf")))
+        refusals.refuse_no_time(A, "gnss/rover", silent, settings)
     with pytest.raises(UserError, match="no source of time"):
-        refusals.refuse_no_time(A, None, None)
+        refusals.refuse_no_time(A, None, None, settings)
+
+
+def test_edges_that_no_receiver_names() -> None:
+    silent = ClockStatus(TimeState.NO_TIME, float("inf"))
+    with pytest.raises(UserError, match=r"no gnss.….pps is set") as refused:
+        refusals.refuse_no_time(A, "pps/main", silent, config())
+    assert "pps/main" in line(refused)
+    tables = TEXT.format(arm="[0.1, 0.0, -1.2]", crs="EPSG:25832", epoch=2026.5)
+    tables = tables.replace('"novatel"', '"novatel"\npps = "other"') + '[pps.other]\nsource = "/dev/pps1"\n'
+    with pytest.raises(UserError, match=r'gnss.rover.pps is "other"'):
+        refusals.refuse_no_time(A, "pps/main", silent, parse_config(tables, Path("swath.toml")))
+    with pytest.raises(UserError, match="nothing in the log says the time"):
+        refusals.refuse_no_time(A, "pps/other", silent, parse_config(tables, Path("swath.toml")))
 
 
 @pytest.mark.parametrize(
@@ -89,6 +116,82 @@ def test_why_returns_have_no_time(refused: dict[str, int], state: TimeState, wor
     assert words in told
     assert "500 of 1,000 returns" in told
     assert refusals.time_troubles(A, "left", {"no_time": 10, "georeferenced": 990}, refused, None) == []
-    refusals.refuse_all_lost([told], 500)
     with pytest.raises(UserError, match="have no time"):
-        refusals.refuse_all_lost([told], 0)
+        refusals.refuse_nothing(A, [told], "")
+    with pytest.raises(UserError, match=r"a\.mcap: no return could be georeferenced: 7 outside trajectory"):
+        refusals.refuse_nothing(A, [], "7 outside trajectory")
+
+
+def turning(time_ns: np.ndarray[Any, np.dtype[np.int64]], seed: int = 1) -> Trajectory:
+    """A flight that rolls slowly and at random, always in one place."""
+    n = len(time_ns)
+    since_s = (time_ns - time_ns[0])[:, np.newaxis] / 1e9
+    phase = np.random.default_rng(seed).uniform(0.0, 2 * np.pi, 40)
+    roll = 0.015 * np.sin(2 * np.pi * np.linspace(0.02, 0.16, 40) * since_s + phase).sum(axis=1)
+    level, lat, lon, height = (np.full(n, value) for value in (0.0, 0.8, 0.15, 800.0))
+    return Trajectory.from_geodetic(time_ns, lat, lon, height, np.zeros((n, 3)), roll, level, level)
+
+
+def test_a_trajectory_that_turns_otherwise_is_doubted() -> None:
+    time_ns = 1_465_549_218_000_000_000 + np.arange(0, 240 * S, S // 20)
+    flown = turning(time_ns)
+    clocks = LogClocks(
+        cast(Any, None), np.empty(0, INS_DTYPE), time_ns, np.vstack([np.zeros(3), flown.turn_rates_b("i")])
+    )
+    assert refusals.refuse_other_motion(clocks, flown, "x.csv", A) == []
+    (late,) = refusals.refuse_other_motion(clocks, replace(flown, time_ns=time_ns + S // 8), "x.csv", A)
+    assert late.startswith("x.csv: turns 0.12")
+    assert "later" in late
+    (other,) = refusals.refuse_other_motion(clocks, turning(time_ns, seed=2), "x.csv", A)
+    assert "another flight" in other
+    with pytest.raises(UserError, match=r"x\.csv: its time is UTC"):
+        refusals.refuse_other_motion(clocks, replace(flown, time_ns=time_ns - 18 * S), "x.csv", A)
+
+
+@dataclass
+class Flew:
+    """What of a flight a file of strips is held against."""
+
+    span: tuple[int, int]
+    holes: list[str] = field(default_factory=list)
+
+
+def test_strips_of_a_file_that_lie_in_no_log() -> None:
+    flights: list[Any] = [Flew((0, 100)), Flew((200, 300))]
+    refusals.note_strips_elsewhere("s.csv", [(50, 120), (250, 260)], flights)
+    assert flights[0].holes == []
+    refusals.note_strips_elsewhere("s.csv", [(50, 120), (300, 310)], flights)
+    (hole,) = flights[0].holes
+    assert hole.startswith("s.csv: its strip from GPS week 0")
+    with pytest.raises(UserError, match=r"s\.csv: none of its strips lies in the logs"):
+        refusals.note_strips_elsewhere("s.csv", [(120, 200), (300, 310)], flights)
+
+
+def test_the_log_is_named_where_its_own_configuration_is_wrong() -> None:
+    lines = ["imu.main: dbc: missing", "left.toml: calibration.scanner: is of another", 'output.crs = "x" is none']
+    given = Options(crs="x", calibrations={"left": ("", "left.toml")})
+    assert refusals.of_log(A, lines, given) == ["a.mcap: imu.main: dbc: missing", *lines[1:]]
+    assert refusals.of_log(A, lines, Options()) == [f"a.mcap: {said}" for said in lines]
+
+
+def test_messages_that_were_not_read() -> None:
+    counts = {"left": {"bad_version": 3, "sequence_gap": 3, "bad_magic": 2}, "right": {"sequence_gap": 7}}
+    holes, warnings = unread_lines("a.mcap", counts)
+    assert holes == [
+        "a.mcap: 3 messages of scanner/left were not read: a version of the protocol that this program does not read"
+    ]
+    assert warnings == [
+        "a.mcap: 2 messages of scanner/left were not read: no sign of the protocol",
+        "a.mcap: 7 messages of scanner/right did not come, by its own numbers",
+    ]
+
+
+def test_only_the_own_messages_of_a_piece_count() -> None:
+    parser = cast(Parser, SimpleNamespace(counters=ParserCounters()))
+    unread = Unread({"left": parser})
+    for own in (False, True, True, False):
+        parser.counters.bad_checksums += 1
+        parser.counters.errors["bad_version"] += 10
+        parser.counters.errors["duplicate"] += 100
+        unread.note(own=own)
+    assert unread.counts == {"left": {"bad_checksum": 2, "bad_version": 20}}

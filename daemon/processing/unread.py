@@ -1,0 +1,66 @@
+"""Messages of scanners that gave nothing: damaged, not understood, or missing from the scanner's own sequence."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+from drivers.core.parser import Parser
+
+BAD_CHECKSUM = "bad_checksum"
+SEQUENCE_GAP = "sequence_gap"
+FOREIGN = ("bad_length", "bad_magic")  # of something else that speaks on this port
+WITHOUT_RETURNS = ("bad_gps", "bad_nmea", "bad_position", "bad_sample")
+WHY = {
+    BAD_CHECKSUM: "a wrong checksum",
+    "bad_version": "a version of the protocol that this program does not read",
+    "bad_length": "a length that the protocol does not have",
+    "bad_magic": "no sign of the protocol",
+}
+
+
+class Unread:
+    """Follows the counters of parsers; what the margin around a piece of a log does to them is left out.
+
+    Attributes:
+        counts: by scanner, messages by reason.
+    """
+
+    def __init__(self, parsers: Mapping[str, Parser]) -> None:
+        self.counts: dict[str, Counter[str]] = {name: Counter() for name in parsers}
+        self._parsers = parsers
+        self._before = {name: refused_by(parser) for name, parser in parsers.items()}
+
+    def note(self, *, own: bool) -> None:
+        """After messages of the piece itself (own), or of the margin."""
+        for name, parser in self._parsers.items():
+            now = refused_by(parser)
+            if own:
+                self.counts[name] += now - self._before[name]
+            self._before[name] = now
+
+
+def refused_by(parser: Parser) -> Counter[str]:
+    """What a parser refused so far, by reason."""
+    counters = parser.counters
+    found = Counter(
+        {code: count for code, count in counters.errors.items() if code.startswith("bad_") or code == SEQUENCE_GAP}
+    )
+    found[BAD_CHECKSUM] = counters.bad_checksums
+    return +found
+
+
+def unread_lines(log: str, unread: Mapping[str, Mapping[str, int]]) -> tuple[list[str], list[str]]:
+    """Of counts by scanner and reason: lines of what is missing from the products, and lines that only warn."""
+    holes: list[str] = []
+    warnings: list[str] = []
+    for scanner, counts in sorted(unread.items()):
+        for reason, count in sorted(counts.items()):
+            if reason == SEQUENCE_GAP:
+                if len(counts) == 1:  # what was refused is missing from the sequence too
+                    warnings.append(f"{log}: {count:,} messages of scanner/{scanner} did not come, by its own numbers")
+                continue
+            why = WHY.get(reason, reason.replace("_", " "))
+            line = f"{log}: {count:,} messages of scanner/{scanner} were not read: {why}"
+            (warnings if reason in (*FOREIGN, *WITHOUT_RETURNS) else holes).append(line)
+    return holes, warnings

@@ -1,0 +1,196 @@
+"""``swath georef`` with what is damaged, missing or full: partial products say so, and refusals leave nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.cli.main import run_app
+from daemon.processing.workers import _held_interrupts
+from georef.formats.sbet import sbet_bytes
+from georef.formats.trajectory_csv import csv_text
+from georef.trajectory import Trajectory
+from tests.daemon.one_line import PLAN, Flown
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
+
+S = 1_000_000_000
+FAULT = """
+[[fault]]
+source = "scanner/left"
+kind = "corrupted"
+at_s = 14.0
+for_s = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """Twelve seconds of one line; for one of them every datagram is damaged."""
+    folder = tmp_path_factory.mktemp("bad")
+    plan = folder / "line.toml"
+    plan.write_text(PLAN.replace("[-1000.0, -80.0]", "[-300.0, -80.0]").replace("[1000.0, -80.0]", "[300.0, -80.0]"))
+    plan.write_text(plan.read_text() + FAULT)
+    assert run_app(["sim", "fly", str(plan), "-o", str(folder / "flight")]) == 0
+    made = Flown(folder / "flight")
+    made.sbet.write_bytes(sbet_bytes(made.trajectory()))
+    return made
+
+
+def georef(flown: Flown, output: Path, *more: str, trajectory: Trajectory | None = None) -> tuple[int, dict[str, Any]]:
+    """Exit code and sidecar."""
+    arguments = flown.arguments(output, "--no-sigma", *more)
+    if trajectory is not None:
+        file = output.parent / "trajectory.csv"
+        file.write_text(csv_text(trajectory))
+        arguments[arguments.index("--trajectory") + 1] = str(file)
+    code = run_app(arguments)
+    sidecars = list(output.glob("*.json"))
+    return code, json.loads(sidecars[0].read_text()) if sidecars else {}
+
+
+def without(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
+    """A trajectory with a gap."""
+    keep = (trajectory.time_ns <= first_ns) | (trajectory.time_ns >= last_ns)
+    columns = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+    return replace(trajectory, **{column: getattr(trajectory, column)[keep] for column in columns})
+
+
+def test_damaged_datagrams_make_it_partial(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, told = georef(flown, tmp_path / "out")
+    assert (code, told["complete"]) == (1, False)
+    unread = told["counts"]["left"]["messages_not_read"]
+    assert unread["bad_checksum"] > 5
+    assert (
+        f"{flown.log}: {unread['bad_checksum']} messages of scanner/left were not read: a wrong checksum"
+        in told["holes"]
+    )
+    assert "partial: " in capsys.readouterr().err
+    times_ns = np.sort(flown.truth["left.gps_ns"])
+    missing = len(times_ns) - told["counts"]["left"]["read"]
+    assert missing == pytest.approx(1500, rel=0.2)  # a second of a laser of 1.5 kHz
+
+
+def test_where_the_trajectory_ends_the_rest_is_missing_not_a_turn(flown: Flown, tmp_path: Path) -> None:
+    first, last = (int(flown.truth["left.gps_ns"][at]) for at in (0, -1))
+    short = flown.trajectory().between(first - 20 * S, (first + last) // 2)
+    code, told = georef(flown, tmp_path / "out", trajectory=short)
+    assert (code, told["complete"]) == (1, False)
+    dropped = told["counts"]["left"]["dropped"]
+    assert set(dropped) == {"outside_trajectory"}
+    assert any(
+        f"{dropped['outside_trajectory']:,} returns of left are outside the trajectory" in hole
+        for hole in told["holes"]
+    )
+
+
+def test_a_gap_of_the_trajectory_is_no_turn_either(flown: Flown, tmp_path: Path) -> None:
+    first = int(flown.truth["left.gps_ns"][0])
+    code, told = georef(flown, tmp_path / "out", trajectory=without(flown.trajectory(), first + 2 * S, first + 5 * S))
+    assert (code, told["complete"]) == (1, False)
+    assert len(told["strips"]) == 1
+    assert set(told["counts"]["left"]["dropped"]) == {"trajectory_gap"}
+
+
+def test_where_nothing_can_be_placed_there_is_no_product(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, last = (int(flown.truth["left.gps_ns"][at]) for at in (0, -1))
+    gone = without(flown.trajectory(), first - S, last + S)
+    capsys.readouterr()
+    code, told = georef(flown, tmp_path / "out", trajectory=gone)
+    assert (code, told) == (1, {})
+    assert list((tmp_path / "out").iterdir()) == []
+    assert capsys.readouterr().err.startswith(f"swath: {flown.log}: ")
+
+
+@contextmanager
+def files_at_most(size: int) -> Iterator[None]:
+    """As on a disk that becomes full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    with files_at_most(60_000):
+        code, _ = georef(flown, tmp_path / "out")
+    assert code == 3
+    line = capsys.readouterr().err
+    assert "strip01.laz: cannot be written; is the disk full?" in line
+    assert line.count("\n") == 1
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        (None, 3, "want auto, whole or a CSV file"),
+        (b"\x89\xff", 3, "no text; want a CSV file"),
+        (b"start_gps_ns,end_gps_ns\n1,2\n", 1, "none of its strips lies in the logs"),
+    ],
+)
+def test_files_of_strips(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: bytes | None, code: int, words: str
+) -> None:
+    file = tmp_path / "strips.csv"
+    if text is not None:
+        file.write_bytes(text)
+    capsys.readouterr()
+    assert georef(flown, tmp_path / "out", "--strips", str(file))[0] == code
+    line = capsys.readouterr().err
+    assert "strips.csv" in line
+    assert words in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_of_other_conventions_or_no_text(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (flown.folder / "left.true.toml").read_text()
+    (tmp_path / "two.toml").write_text(text.replace("conventions = 1", "conventions = 2"))
+    (tmp_path / "right.toml").write_text(text.replace('scanner = "left"', 'scanner = "right"'))
+    for file, code, words in (
+        (tmp_path / "two.toml", 2, "calibration.conventions: got 2, want 1"),
+        (tmp_path / "right.toml", 2, "scanner right: is not in the configuration"),
+        (flown.log, 3, "no text; want a calibration file"),
+        (tmp_path / "none.toml", 3, "cannot be read: No such file"),
+    ):
+        arguments = flown.arguments(tmp_path / "out")
+        arguments[arguments.index("--calibration") + 1] = str(file)
+        assert run_app(arguments) == code
+        line = capsys.readouterr().err
+        assert line.startswith(f"swath: {file}: ")
+        assert words in line
+
+
+def test_an_interrupt_waits_till_the_processes_are_begun() -> None:
+    steps = []
+
+    def begin() -> None:
+        with _held_interrupts():
+            os.kill(os.getpid(), signal.SIGINT)
+            steps.append("begun")
+
+    with pytest.raises(KeyboardInterrupt):
+        begin()
+    assert steps == ["begun"]
+    with _held_interrupts():
+        steps.append("again")
+    assert steps == ["begun", "again"]
