@@ -8,6 +8,8 @@ second, that is 5e-7 rad for a microsecond of latency, a hundredth of a count.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,13 @@ from georef.records import RETURN_DTYPE, Int64Array, StructArray
 
 FloatArray = NDArray[np.float64]
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
+
+
+class TellsMotion(Protocol):
+    """Tells how the encoder moved when it was read."""
+
+    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
+        """(n,) rate and acceleration of the readings, rad/s, rad/s²."""
 
 
 class EncoderMotion:

@@ -14,12 +14,11 @@ is between two steps stays in the processor's cache; a point depends on its retu
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.encoder_motion import TellsMotion
 from georef.kernels.columns import fill_columns
 from georef.kernels.covariance import Flown
 from georef.kernels.types import PointColumns
@@ -29,18 +28,9 @@ from georef.ranging import PulseRates
 from georef.records import Int64Array, StructArray
 from georef.sensor_model import SensorModel, contiguous
 from georef.trajectory import Trajectory
-from georef.uncertainty import Uncertainty, flown_between
-
-FloatArray = NDArray[np.float64]
+from georef.uncertainty import Uncertainty, flown_during
 
 BLOCK_ROWS = 4096
-
-
-class EncoderMotion(Protocol):
-    """How the encoder moved when it was read."""
-
-    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
-        """(n,) rate and acceleration of the readings, rad/s, rad/s²."""
 
 
 class Georeferencer:
@@ -59,7 +49,7 @@ class Georeferencer:
         model: SensorModel,
         mapping: Mapping | None = None,
         uncertainty: Uncertainty | None = None,
-        encoder_motion: EncoderMotion | None = None,
+        encoder_motion: TellsMotion | None = None,
         prf_hz: float | None = None,
     ) -> None:
         self.model, self.mapping, self.uncertainty = model, mapping, uncertainty
@@ -86,8 +76,11 @@ class Georeferencer:
         motion = None
         if self.encoder_motion is not None and self.model.needs_encoder_motion:
             motion = self.encoder_motion.motion(rows, time_ns)  # of all at once: a reading's rate asks its neighbours
-        flown = self._flown(time_ns, trajectory)
-        points, fates = _room(len(rows), self.uncertainty is not None), np.empty(len(rows), np.uint8)
+        flown = None
+        if self.uncertainty is not None:
+            flown = flown_during(trajectory, time_ns, self.model.calibration.value("time_offset_s"))
+        points = Points.empty(len(rows), with_sigmas=self.uncertainty is not None)
+        fates = np.empty(len(rows), np.uint8)
         filled = 0
         failed: MappingError | None = None
         for block, prf_hz in self._blocks(rows):
@@ -110,22 +103,13 @@ class Georeferencer:
         return points if filled == len(rows) else points.take(slice(filled)), fates
 
     def _blocks(self, rows: StructArray) -> Iterator[tuple[slice, float | None]]:
-        """Rows that are taken at once, of one pulse rate where that matters, and the rate."""
+        """Rows that are taken at once, of one pulse rate where that matters; and the rate."""
         runs = [(0, len(rows), self.prf_hz)]
         if self.rates is not None and any(row.prf_hz is not None for row in self.model.calibration.range_offsets):
             runs = [(start, stop, prf_hz) for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"])]
         for first, last, prf_hz in runs:
             for start in range(first, last, BLOCK_ROWS):
                 yield slice(start, min(start + BLOCK_ROWS, last)), prf_hz
-
-    def _flown(self, time_ns: Int64Array, trajectory: Trajectory) -> Flown | None:
-        """What the covariances of all these pulses need of the trajectory."""
-        if len(time_ns) and time_ns.min() < 0:
-            time_ns = time_ns[time_ns >= 0]
-        if self.uncertainty is None or len(trajectory) < 2 or not len(time_ns):
-            return None
-        offset_ns = round(self.model.calibration.value("time_offset_s") * 1e9)
-        return flown_between(trajectory, int(time_ns.min()) + offset_ns, int(time_ns.max()) + offset_ns)
 
     def _fill(
         self, points: Points, filled: int, rows: StructArray, rays: Rays, trajectory: Trajectory, flown: Flown | None
@@ -138,36 +122,25 @@ class Georeferencer:
         if self.model.air is not None:
             self.model.air.apply(rays.origin_e, rays.points_e)  # in place; NGA Eq. 4 to 11
         done = rays.fate == Fate.GEOREFERENCED
-        whole = bool(done.all())
+        points_e = rays.points_e if done.all() else rays.points_e[done]
         failure: MappingError | None = None
-        points_e = rays.points_e if whole else rays.points_e[done]
-        try:
-            mapped = points_e if self.mapping is None else self.mapping.map_from_e(points_e)  # ISO Eq. 8
-        except MappingError as error:
-            failure, whole = error, False
-            reached = self._reached(points_e)
-            rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
-            done[done] = reached
-            points_e = points_e[reached]
-            mapped = points_e if self.mapping is None else self.mapping.map_from_e(points_e)
-        if not whole:
-            rows, rays = rows[done], _only(rays, done)
+        if self.mapping is not None:
+            points_map, reached, failure = self.mapping.map_what_it_can(points_e)  # ISO Eq. 8
+            if failure is not None:
+                rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
+                done[done], points_e = reached, points_e[reached]
+        if not done.all():
+            rows, rays = rows[done], rays.take(done)
         to = slice(filled, filled + len(points_e))
-        points.points_map[to] = mapped
+        points.points_map[to] = points_e if self.mapping is None else points_map
         columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
         fill_columns(contiguous(rows), rays.time_ns, rays.angle_rad, rays.range_m, columns)
         if points.sigma_map is not None and len(points_e):
             points.sigma_map[to] = self._sigmas(rays, points_e, trajectory, flown)
         return len(points_e), failure
 
-    def _reached(self, points_e: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether the map has a place for points that it refused together."""
-        finite: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points_e), axis=1)
-        finite[finite] = self.mapping.reaches(points_e[finite]) if self.mapping is not None else True
-        return finite
-
     def _sigmas(
-        self, rays: Rays, points_e: FloatArray, trajectory: Trajectory, flown: Flown | None
+        self, rays: Rays, points_e: NDArray[np.float64], trajectory: Trajectory, flown: Flown | None
     ) -> NDArray[np.float32]:
         """(n, 3) along the axes of the points (ISO Eq. 13, 14)."""
         assert self.uncertainty is not None
@@ -175,28 +148,3 @@ class Georeferencer:
         if self.mapping is None:
             return np.sqrt(covariance_e[:, [0, 3, 5]]).astype(np.float32)
         return self.mapping.sigma_map(points_e, covariance_e)
-
-
-def _room(count: int, with_sigmas: bool) -> Points:
-    """Room for n points."""
-    return Points(
-        time_ns=np.empty(count, np.int64),
-        points_map=np.empty((count, 3)),
-        sigma_map=np.empty((count, 3), np.float32) if with_sigmas else None,
-        scan_angle_rad=np.empty(count, np.float32),
-        range_m=np.empty(count, np.float32),
-        intensity=np.empty(count, np.float32),
-        return_number=np.empty(count, np.uint8),
-        number_of_returns=np.empty(count, np.uint8),
-        channel=np.empty(count, np.uint16),
-        mta_zone=np.empty(count, np.uint8),
-    )
-
-
-def _only(rays: Rays, which: NDArray[np.bool_]) -> Rays:
-    """Some of the rays; vectors stay columns beside each other."""
-    columns: dict[str, Any] = {}
-    for field in fields(Rays):
-        column = getattr(rays, field.name)
-        columns[field.name] = None if column is None else column.T[..., which].T
-    return Rays(**columns)

@@ -122,6 +122,16 @@ class Mapping:
         self._settle_by_first(points)
         return self._cells.map(points)
 
+    def map_what_it_can(self, points_e: ArrayLike) -> tuple[FloatArray, NDArray[np.bool_], MappingError | None]:
+        """As `map_from_e`, of the positions that can be mapped: (m, 3), which they are (n,), and the others' error."""
+        points = np.ascontiguousarray(points_e, dtype=np.float64)
+        try:
+            return self.map_from_e(points), np.ones(len(points), dtype=bool), None
+        except MappingError as error:
+            reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points), axis=1)
+            reached[reached] = self.reaches(points[reached])
+            return self.map_from_e(points[reached]), reached, error
+
     def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
         """Whether `map_from_e` has coordinates for each of finite positions in e (n, 3); never raises for one of them.
 

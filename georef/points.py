@@ -73,6 +73,22 @@ class Points:
         return Points(*taken)
 
     @classmethod
+    def empty(cls, count: int, *, with_sigmas: bool) -> Points:
+        """Room for n points."""
+        return cls(
+            time_ns=np.empty(count, np.int64),
+            points_map=np.empty((count, 3)),
+            sigma_map=np.empty((count, 3), np.float32) if with_sigmas else None,
+            scan_angle_rad=np.empty(count, np.float32),
+            range_m=np.empty(count, np.float32),
+            intensity=np.empty(count, np.float32),
+            return_number=np.empty(count, np.uint8),
+            number_of_returns=np.empty(count, np.uint8),
+            channel=np.empty(count, np.uint16),
+            mta_zone=np.empty(count, np.uint8),
+        )
+
+    @classmethod
     def concatenate(cls, pieces: Sequence[Points]) -> Points:
         """One after the other; sigmas only where all have them. At least one piece."""
         joined: list[Any] = []
@@ -123,3 +139,11 @@ class Rays:
     encoder_rad: FloatArray | None = None
     encoder_rate: FloatArray | None = None
     encoder_acceleration: FloatArray | None = None
+
+    def take(self, which: NDArray[np.bool_]) -> Rays:
+        """Some of the rays; vectors stay columns beside each other."""
+        columns: dict[str, Any] = {}
+        for field in fields(self):
+            column = getattr(self, field.name)
+            columns[field.name] = None if column is None else column.T[..., which].T
+        return Rays(**columns)

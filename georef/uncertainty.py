@@ -34,6 +34,7 @@ from georef.kernels.covariance import (
     covariances,
 )
 from georef.points import Rays
+from georef.records import Int64Array
 from georef.rotations import rot_from_quaternion, rot_x, rot_y
 from georef.trajectory import Trajectory
 
@@ -126,6 +127,16 @@ class Uncertainty:
             flown = _flown(trajectory, int(seen.epoch.min()), int(seen.epoch.max()) + 2)
         covariances(seen, flown, self._known, covariance_e)
         return covariance_e
+
+
+def flown_during(trajectory: Trajectory, time_ns: Int64Array, offset_s: float) -> Flown | None:
+    """As `flown_between`, for pulses at stamps (n,) and an offset of these; negative stamps are none."""
+    if len(time_ns) and time_ns.min() < 0:
+        time_ns = time_ns[time_ns >= 0]
+    if len(trajectory) < 2 or not len(time_ns):
+        return None
+    offset_ns = round(offset_s * 1e9)
+    return flown_between(trajectory, int(time_ns.min()) + offset_ns, int(time_ns.max()) + offset_ns)
 
 
 def flown_between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Flown:
