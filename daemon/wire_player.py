@@ -23,6 +23,7 @@ from pathlib import Path
 from drivers.transports.base import TransportError
 from drivers.transports.uri import TransportSpec, open_transport
 
+EMPTY_LOOKS = 15  # of 10 ms, until a port counts as read to its end
 _PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted
 _LATE_S = 0.002  # units due within this are sent without another sleep
 LONGEST_PAUSE_NS = 3600 * 1_000_000_000  # between units; a log that says more means another time, nobody waits for it
@@ -102,10 +103,12 @@ class PtyOutput(Output):
     def _drain(self) -> None:
         port = os.open(self._port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
         deadline = time.monotonic() + self._patience_s
-        waiting = array.array("i", [1])
+        waiting, empty = array.array("i", [1]), 0
         try:
-            while waiting[0] and time.monotonic() < deadline:
+            # what was written last may be on its way from end to end still, and be counted at neither
+            while empty < EMPTY_LOOKS and time.monotonic() < deadline:
                 fcntl.ioctl(port, termios.FIONREAD, waiting)
+                empty = 0 if waiting[0] else empty + 1
                 time.sleep(0.01)
         finally:
             os.close(port)
