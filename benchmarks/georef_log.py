@@ -40,7 +40,7 @@ from daemon.processing.products import georeference
 from daemon.processing.setup import Options, Setup
 from georef.formats.las import BLOCK, LasSettings, PointPacker
 from georef.formats.las_header import POINT_FORMAT
-from georef.points import Points
+from georef.points import Fate, Points
 from georef.records import ChunkBatch, ScannerReturns
 from georef.strips import Segment
 from georef.trajectory_buffer import TrajectoryBuffer
@@ -135,8 +135,8 @@ class Bench:
         setup = self.setup
         stream = setup.office_stream(self.clocks.clocks, self.trajectory)
         if not whole:
-            for lane in stream._lanes.values():  # noqa: SLF001
-                lane.chain.georeferencer = _Nothing(len(lane.fates))
+            for name in stream.scanners:
+                stream.chain(name).georeferencer = _Nothing(len(Fate))
         feed = LogFeed(setup, stream)
         for batch in self.batches():
             for _, points in feed.take(batch):

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 from pyproj import CRS, Transformer
-from pyproj.crs import CoordinateOperation  # type: ignore[attr-defined]
+from pyproj.crs import CoordinateOperation
 from pyproj.exceptions import CRSError, ProjError
-from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
+from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 Area = tuple[float, float, float, float]

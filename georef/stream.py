@@ -284,8 +284,13 @@ class _Lane:
         """Rows with the encoder's motion, of those where it is known."""
         moving = motion.feed(rows, time_ns)
         if last:
-            rest = motion.flush()
-            moving = tuple(joined(list(columns), NO_TIMES) for columns in zip(moving, rest, strict=True))  # type: ignore[assignment]
+            (one, at_ns, rate, acceleration), rest = moving, motion.flush()
+            moving = (
+                joined([one, rest[0]], NO_ROWS),
+                joined([at_ns, rest[1]], NO_TIMES),
+                np.concatenate([rate, rest[2]]),
+                np.concatenate([acceleration, rest[3]]),
+            )
         self._held_back += len(rows) - len(moving[0])
         return moving
 

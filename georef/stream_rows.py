@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from georef.records import RETURN_DTYPE, StructArray
 
 WORDS = RETURN_DTYPE.itemsize // 8
+_OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).items()}
 
 
 def words(rows: StructArray) -> NDArray[np.uint64]:
@@ -19,7 +20,7 @@ def words(rows: StructArray) -> NDArray[np.uint64]:
 
 def any_has(rows: StructArray, name: str, bits: int) -> bool:
     """Whether any row has all these bits in a field of its last word."""
-    offset: int = RETURN_DTYPE.fields[name][1]  # type: ignore[index]
+    offset = _OFFSETS[name]
     word = bits << 8 * (offset % 8)
     if not len(rows) or int(np.bitwise_or.reduce(words(rows)[:, -1])) & word != word:
         return False

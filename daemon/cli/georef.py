@@ -9,7 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.config import load_config
 from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
 
 
 def command(
@@ -52,21 +54,14 @@ def command(
     Every return that was read is in a file or counted with the reason why not. Exit code 1 when the products are
     partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
     """
-    try:
-        from daemon.processing.flights import Wish
-        from daemon.processing.flown import TrajectoryWish
-        from daemon.processing.products import georeference
-        from daemon.processing.progress import progress_bar
-        from daemon.processing.setup import Options
-    except ModuleNotFoundError as error:
-        raise UserError(f"georeferencing wants the extra swath[process]: {error}", ExitCode.USAGE) from error
+    require_installed("swath georef")
+    from daemon.processing.flights import Wish
+    from daemon.processing.flown import TrajectoryWish
+    from daemon.processing.products import georeference
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.setup import Options
     from georef.strips import StripRules
 
-    stored = None
-    if config is not None:
-        from daemon.config.loading import load_config
-
-        stored = load_config(config)
     wish = Wish(
         logs=logs,
         output=output,
@@ -74,7 +69,7 @@ def command(
         options=Options(
             crs=crs, datum=datum, epoch=epoch, calibrations=_calibrations(calibration or []), uncertainty=not no_sigma
         ),
-        config=stored,
+        config=None if config is None else load_config(config),
         strips=strips,
         rules=StripRules(min_strip_s=min_strip),
         workers=workers or os.cpu_count() or 1,
@@ -86,12 +81,7 @@ def command(
     )
     with progress_bar() as tell:
         report = georeference(wish, tell)
-    if as_json:
-        print(json.dumps(report.record, indent=2))
-    else:
-        _print(report.record, report.sidecar)
-    if not report.record["complete"]:
-        raise UserError(f"{report.sidecar}: partial: " + "; ".join(map(one_line, report.record["holes"][:5])))
+    _tell(report.record, report.sidecar, as_json=as_json)
 
 
 def _calibrations(given: list[str]) -> dict[str, tuple[str, str]]:
@@ -119,6 +109,15 @@ def _scanner_of(text: str, file: Path) -> str:
         return read_calibration(text, str(file)).scanner
     except CalibrationError as error:
         raise UserError(str(error), ExitCode.USAGE) from error
+
+
+def _tell(record: dict[str, Any], sidecar: Path, *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(record, indent=2))
+    else:
+        _print(record, sidecar)
+    if not record["complete"]:
+        raise UserError(f"{sidecar}: partial: " + "; ".join(map(one_line, record["holes"][:5])))
 
 
 def _print(record: dict[str, Any], sidecar: Path) -> None:

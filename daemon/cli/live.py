@@ -15,6 +15,7 @@ import typer
 
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.places import DEFAULT_CONFIG, log_directory
+from daemon.processing.installed import require_installed
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -52,8 +53,6 @@ def command(
     and live.json under live/ in the log directory. Positions are the device's own INS solution. The recorder does not
     notice: not even when this is killed.
     """
-    from daemon.processing.installed import require_installed
-
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)
     paths = where or [DEFAULT_CONFIG]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Annotated
 import typer
 
 from daemon.errors import ExitCode, UserError, one_line
-
-NEEDS = ("numba", "laspy", "lazrs", "pyproj", "scipy", "matplotlib")
+from daemon.processing.installed import require_installed
 
 
 def command(
@@ -34,10 +32,7 @@ def command(
 
     Exit code 4 when a file could be read in part only.
     """
-    missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
-    if missing:
-        text = f"swath view needs {', '.join(missing)}, not installed here: pip install 'swath[process]'"
-        raise UserError(text, ExitCode.USAGE)
+    require_installed("swath view", "matplotlib")
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise UserError(f"--cell: got {cell:g}, want metres above 0", ExitCode.USAGE)
     ends = _ends(profile)

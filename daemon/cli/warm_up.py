@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from daemon.processing.installed import require_installed
+
 
 def command(
     config: Annotated[
@@ -18,8 +20,6 @@ def command(
     It is kept in NUMBA_CACHE_DIR, else beside the program or in the user's cache. Once is enough, for as long as the
     program and the computer stay the same.
     """
-    from daemon.processing.installed import require_installed
-
     require_installed("swath warm-up")
     from daemon.config import load_config
     from daemon.processing.setup import Options, Setup

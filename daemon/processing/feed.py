@@ -235,21 +235,23 @@ class LogFeed:
 def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int]]:
     """realtime_ns, monotonic_ns and monotonic_raw_ns of ``/clock``; what is none is left out."""
     for _, value in json_objects(batch):
-        reading = (value.get("realtime_ns"), value.get("monotonic_ns"), value.get("monotonic_raw_ns"))
-        if all(_is_time(one) for one in reading):
-            yield reading  # type: ignore[misc]
+        realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
+        raw_ns = _time_of(value.get("monotonic_raw_ns"))
+        if realtime_ns is not None and monotonic_ns is not None and raw_ns is not None:
+            yield realtime_ns, monotonic_ns, raw_ns
 
 
 def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
     """Edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
     for _, value in json_objects(batch):
-        time_ns, sequence = value.get("edge_time_ns"), value.get("sequence", 0)
-        fits = _is_time(time_ns) and _is_time(sequence) and value.get("edge", edge) == edge
-        yield PpsEdge(time_ns, sequence) if fits else None  # type: ignore[arg-type]
+        time_ns, sequence = _time_of(value.get("edge_time_ns")), _time_of(value.get("sequence", 0))
+        wanted = value.get("edge", edge) == edge
+        yield PpsEdge(time_ns, sequence) if wanted and time_ns is not None and sequence is not None else None
 
 
-def _is_time(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS
+def _time_of(value: Any) -> int | None:
+    """A whole number that can be a time; None for anything else that a stranger's log may say."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS else None
 
 
 # ---------------------------------------------------------------------- all of a log's clocks, before its returns

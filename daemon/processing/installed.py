@@ -7,13 +7,13 @@ import importlib.util
 from daemon.errors import ExitCode, UserError
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
-EXTRA_OF = {"foxglove": "live"}  # package: what else brings it
+EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it
 
 
 def require_installed(command: str, *others: str) -> None:
     """UserError where a package that a command wants is missing, with what installs it."""
     missing = [name for name in (*PROCESS, *others) if importlib.util.find_spec(name) is None]
     if missing:
-        extras = ",".join(["process", *(EXTRA_OF[name] for name in others)])
+        extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF[name] for name in others)]))
         text = f"{command} needs {', '.join(missing)}, not installed here: pip install 'swath[{extras}]'"
         raise UserError(text, ExitCode.USAGE)

@@ -72,8 +72,17 @@ def cell_for(density: float, points_a_cell: float) -> float:
 
 
 @kept
-def _sum_up(  # type: ignore[no-untyped-def]
-    x_m, y_m, z_m, intensity, first, sigma_m, west_m, south_m, cell_m, sums
+def _sum_up(
+    x_m: Any,
+    y_m: Any,
+    z_m: Any,
+    intensity: Any,
+    first: Any,
+    sigma_m: Any,
+    west_m: float,
+    south_m: float,
+    cell_m: float,
+    sums: FloatArray,
 ) -> int:
     """Add points to sums (rows, columns, 6); gives how many lie outside."""
     rows, columns = sums.shape[0], sums.shape[1]

@@ -34,8 +34,18 @@ HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 1000
 
 
 @kept
-def _sum_moments(  # type: ignore[no-untyped-def]
-    begin, x_m, y_m, z_m, strip, first, single, frame, tiles, used, moments
+def _sum_moments(
+    begin: int,
+    x_m: FloatArray,
+    y_m: FloatArray,
+    z_m: FloatArray,
+    strip: Any,
+    first: Any,
+    single: Any,
+    frame: tuple[float, float, float, float],
+    tiles: Any,
+    used: int,
+    moments: FloatArray,
 ) -> tuple[int, int, int]:
     """Add points from ``begin`` on; gives where it stopped, for want of a tile, the tiles in use, and points outside.
 

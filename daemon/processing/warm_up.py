@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numba.core.event
 import numpy as np
@@ -128,7 +129,8 @@ def compilations() -> Iterator[list[str]]:
 
 def cache_folder() -> Path | None:
     """Where loops are kept; None: nowhere."""
-    path = count_points.stats.cache_path  # type: ignore[attr-defined]
+    loop: Any = count_points
+    path: str | None = loop.stats.cache_path
     return None if path is None else Path(path)
 
 

@@ -8,13 +8,13 @@ import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from daemon.errors import ExitCode, UserError
-from daemon.processing.jobs import Job, JobError, JobResult, SessionPlan, run_job
+from daemon.processing.jobs import Job, JobResult, SessionPlan, run_job
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
@@ -192,13 +192,10 @@ def _do_with(plans: list[SessionPlan], job: Job) -> JobResult:
 
 
 def _result_of(future: Any, job: Job) -> JobResult:
-    """What a job on a cluster gave; a worker that was lost is told of by an error of the scheduler's own."""
+    """What a job on a cluster gave; a job whose worker was lost is one that failed."""
+    scheduler = importlib.import_module("distributed.scheduler")
     try:
         result: JobResult = future.result()
-    except (JobError, OSError):
-        raise
-    except Exception as error:
-        if type(error).__name__ in ("KilledWorker", "CancelledError", "FutureCancelledError"):
-            return _failed(job, f"lost by the cluster: {type(error).__name__}")
-        raise
+    except (scheduler.KilledWorker, CancelledError) as error:
+        return _failed(job, f"lost by the cluster: {type(error).__name__}")
     return result

@@ -8,7 +8,7 @@ import numpy as np
 import pyproj
 import pytest
 from numpy.typing import NDArray
-from pyproj.network import is_network_enabled, set_network_enabled  # type: ignore[attr-defined]
+from pyproj.network import is_network_enabled, set_network_enabled
 
 from georef import datums
 from georef.earth import e_from_geodetic
