@@ -13,8 +13,6 @@ import argparse
 import gzip
 import json
 import re
-import statistics
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -24,6 +22,7 @@ import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
 from fastcrc.crc64 import xz as crc64_xz
 
+from benchmarks.cpu_time import cpu_seconds
 from daemon.memory import keep_freed_memory
 from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
@@ -61,18 +60,8 @@ class Figure:
 
 
 def rate(work: Callable[[], object], items: float, repeats: int) -> float:
-    """Median of items a second of CPU time; the work is repeated within a measurement until it takes 30 ms."""
-    work()
-    start = time.process_time()
-    work()
-    rounds = max(1, int(0.03 / max(time.process_time() - start, 1e-6)))
-    spent = []
-    for _ in range(repeats):
-        start = time.process_time()
-        for _ in range(rounds):
-            work()
-        spent.append((time.process_time() - start) / rounds)
-    return items / statistics.median(spent)
+    """Median of items a second of CPU time."""
+    return items / cpu_seconds(work, repeats, at_least_s=0.03)
 
 
 def batches_of(units: ByteRows) -> list[ChunkBatch]:

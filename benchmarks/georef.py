@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -22,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.cpu_time import cpu_seconds
 from daemon.memory import keep_freed_memory
 from georef.atmosphere import Air
 from georef.beams import LineGeometry
@@ -74,13 +73,7 @@ class Figure:
 
 def rate(work: Callable[[], object], repeats: int) -> float:
     """Median of returns a second of CPU time."""
-    work()
-    spent = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        spent.append(time.process_time() - start)
-    return RETURNS / statistics.median(spent)
+    return RETURNS / cpu_seconds(work, repeats)
 
 
 def trajectory() -> Trajectory:

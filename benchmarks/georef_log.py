@@ -14,7 +14,6 @@ import argparse
 import io
 import json
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from typing import Any
 import lazrs
 import numpy as np
 
+from benchmarks.cpu_time import cpu_seconds
 from daemon.config.tables import LiveConfig
 from daemon.log.chunks import LogBatch
 from daemon.log.reader import Session, open_logs
@@ -192,13 +192,7 @@ def compress(blocks: list[bytes], extra: int) -> None:
 
 def cost(work: Callable[[], object], returns: int, repeats: int) -> float:
     """Median of nanoseconds of CPU time a return."""
-    work()
-    spent = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        spent.append(time.process_time() - start)
-    return statistics.median(spent) / returns * 1e9
+    return cpu_seconds(work, repeats) / returns * 1e9
 
 
 def file_costs(bench: Bench, repeats: int) -> tuple[float, float]:

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -20,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.cpu_time import cpu_seconds
 from daemon.memory import keep_freed_memory
 from sim.plan import parse_plan
 from sim.scene import Scene, build_scene
@@ -62,13 +61,7 @@ class Figure:
 
 def rate(work: Callable[[], object], repeats: int) -> float:
     """Median of rays a second of CPU time."""
-    work()
-    spent = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        spent.append(time.process_time() - start)
-    return RAYS / statistics.median(spent)
+    return RAYS / cpu_seconds(work, repeats)
 
 
 def scene_of(terrain: str) -> Scene:

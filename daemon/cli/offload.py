@@ -11,10 +11,9 @@ import typer
 
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.places import log_directory
+from daemon.transfer_bar import transfer_bar
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from daemon.offload import OffloadReport
 
 
@@ -42,7 +41,7 @@ def command(
         give_way()
     report: OffloadReport | None = None
     said = 0
-    with _progress() as bar:
+    with transfer_bar() as bar:
         task = bar.add_task("", total=None)
 
         def tell(name: str, done: int, total: int) -> None:
@@ -62,20 +61,6 @@ def command(
     lines = [*report.differ, *report.failed, *([report.stopped] if report.stopped else [])]
     if lines:
         raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE if report.differ else ExitCode.IO)
-
-
-def _progress() -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _print(report: OffloadReport, verify: bool) -> None:

@@ -1,9 +1,11 @@
-"""A bar on the terminal: what is being done, how much of it, how fast, and how long it will take."""
+"""Tells on the terminal what is being done, how much of it, how fast, and how long it will take."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from daemon.transfer_bar import transfer_bar
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 
@@ -11,17 +13,7 @@ Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
     """A bar on stderr while the block runs, where that is a terminal; takes what it shall show."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with transfer_bar() as bar:
         task = bar.add_task("reading", total=None)
 
         def tell(what: str, done: int, total: int) -> None:
