@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.config import load_config
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -55,6 +54,7 @@ def command(
     partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
     """
     require_installed("swath georef")
+    from daemon.config import load_config
     from daemon.processing.flights import Wish
     from daemon.processing.flown import TrajectoryWish
     from daemon.processing.products import georeference
