@@ -20,15 +20,14 @@ from numpy.typing import NDArray
 
 from georef.encoder_motion import TellsMotion
 from georef.kernels.columns import fill_columns
-from georef.kernels.covariance import Flown
 from georef.kernels.types import PointColumns
 from georef.mapping import Mapping, MappingError
-from georef.points import ByteArray, Fate, Points, Rays
+from georef.points import ByteArray, Fate, Points, Rays, contiguous
 from georef.ranging import PulseRates
 from georef.records import Int64Array, StructArray
-from georef.sensor_model import SensorModel, contiguous
+from georef.sensor_model import SensorModel
 from georef.trajectory import Trajectory
-from georef.uncertainty import Uncertainty, flown_during
+from georef.uncertainty import Uncertainty
 
 BLOCK_ROWS = 4096
 
@@ -76,9 +75,6 @@ class Georeferencer:
         motion = None
         if self.encoder_motion is not None and self.model.needs_encoder_motion:
             motion = self.encoder_motion.motion(rows, time_ns)  # of all at once: a reading's rate asks its neighbours
-        flown = None
-        if self.uncertainty is not None:
-            flown = flown_during(trajectory, time_ns, self.model.calibration.value("time_offset_s"))
         points = Points.empty(len(rows), with_sigmas=self.uncertainty is not None)
         fates = np.empty(len(rows), np.uint8)
         filled = 0
@@ -91,10 +87,10 @@ class Georeferencer:
                 trajectory,
                 encoder_rate=rate,
                 encoder_acceleration=acceleration,
-                with_axes=self.uncertainty is not None,
+                uncertainty=self.uncertainty,
                 prf_hz=prf_hz,
             )
-            count, failure = self._fill(points, filled, rows[block], rays, trajectory, flown)
+            count, failure = self._fill(points, filled, rows[block], rays)
             fates[block] = rays.fate
             filled, failed = filled + count, failed or failure
         if failed is not None and not filled and not self._mapped:
@@ -111,9 +107,7 @@ class Georeferencer:
             for start in range(first, last, BLOCK_ROWS):
                 yield slice(start, min(start + BLOCK_ROWS, last)), prf_hz
 
-    def _fill(
-        self, points: Points, filled: int, rows: StructArray, rays: Rays, trajectory: Trajectory, flown: Flown | None
-    ) -> tuple[int, MappingError | None]:
+    def _fill(self, points: Points, filled: int, rows: StructArray, rays: Rays) -> tuple[int, MappingError | None]:
         """Through the air and onto the map: points of the rays that reached the ground, from row ``filled`` on.
 
         Returns:
@@ -122,29 +116,29 @@ class Georeferencer:
         if self.model.air is not None:
             self.model.air.apply(rays.origin_e, rays.points_e)  # in place; NGA Eq. 4 to 11
         done = rays.fate == Fate.GEOREFERENCED
-        points_e = rays.points_e if done.all() else rays.points_e[done]
-        failure: MappingError | None = None
-        if self.mapping is not None:
-            points_map, reached, failure = self.mapping.map_what_it_can(points_e)  # ISO Eq. 8
-            if failure is not None:
-                rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
-                done[done], points_e = reached, points_e[reached]
-        if not done.all():
-            rows, rays = rows[done], rays.take(done)
-        to = slice(filled, filled + len(points_e))
-        points.points_map[to] = points_e if self.mapping is None else points_map
+        kept, failure = rays if done.all() else rays.take(done), None
+        try:
+            points_map, sigma_map = self._mapped_points(kept)
+        except MappingError as error:
+            failure = error
+            assert self.mapping is not None
+            reached = self.mapping.reaches(kept.points_e)
+            rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
+            done[done], kept = reached, kept.take(reached)
+            points_map, sigma_map = self._mapped_points(kept)
+        to = slice(filled, filled + len(points_map))
+        points.points_map[to] = points_map
         columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
-        fill_columns(contiguous(rows), rays.time_ns, rays.angle_rad, rays.range_m, columns)
-        if points.sigma_map is not None and len(points_e):
-            points.sigma_map[to] = self._sigmas(rays, points_e, trajectory, flown)
-        return len(points_e), failure
+        rows = rows if done.all() else rows[done]
+        fill_columns(contiguous(rows), kept.time_ns, kept.angle_rad, kept.range_m, columns)
+        if points.sigma_map is not None:
+            points.sigma_map[to] = sigma_map
+        return len(points_map), failure
 
-    def _sigmas(
-        self, rays: Rays, points_e: NDArray[np.float64], trajectory: Trajectory, flown: Flown | None
-    ) -> NDArray[np.float32]:
-        """(n, 3) along the axes of the points (ISO Eq. 13, 14)."""
-        assert self.uncertainty is not None
-        covariance_e = self.uncertainty.covariance_e(rays, trajectory, flown=flown)
-        if self.mapping is None:
-            return np.sqrt(covariance_e[:, [0, 3, 5]]).astype(np.float32)
-        return self.mapping.sigma_map(points_e, covariance_e)
+    def _mapped_points(self, rays: Rays) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+        """(n, 3) coordinates and sigmas along the same axes (ISO Eq. 8, 13, 14); MappingError: not all have a place."""
+        if self.mapping is not None:
+            return self.mapping.map_with_sigmas(rays.points_e, rays.covariance_e)
+        if rays.covariance_e is None:
+            return rays.points_e, None
+        return rays.points_e, np.sqrt(rays.covariance_e[:, [0, 3, 5]]).astype(np.float32)

@@ -91,20 +91,24 @@ class MapCells:
         """Map coordinates (n, 3) of positions in e (n, 3); what has none is for `alone` to say."""
         mapped = np.empty((len(points_e), 3))
         for block in _blocks(len(points_e)):
-            points, out = points_e[block], mapped[block]
-            nodes = self._locate(points)
-            if _expand(points, nodes, self._rows, self._kinds, out):
-                beyond = (nodes < 0) | (self._kinds[nodes] == EXACT)
-                out[beyond] = self._alone(points[beyond])
+            self._expand(points_e[block], mapped[block])
         return mapped
 
-    def sigmas(self, points_e: FloatArray, covariance_e: FloatArray) -> NDArray[np.float32]:
-        """Sigmas (n, 3) in metres along the axes of the map, of covariances in e (n, 6) xx xy xz yy yz zz, m²."""
-        sigmas = np.empty((len(points_e), 3), dtype=np.float32)
+    def map_with_sigmas(self, points_e: FloatArray, covariance_e: FloatArray) -> tuple[FloatArray, NDArray[np.float32]]:
+        """As `map`; and sigmas (n, 3) in metres along the map's axes, of covariances in e (n, 6) xx xy xz yy yz zz."""
+        mapped, sigmas = np.empty((len(points_e), 3)), np.empty((len(points_e), 3), dtype=np.float32)
         for block in _blocks(len(points_e)):
-            nodes = self._locate(points_e[block])
+            nodes = self._expand(points_e[block], mapped[block])
             _project(nodes, covariance_e[block], self._rows, self._unit_m, sigmas[block])
-        return sigmas
+        return mapped, sigmas
+
+    def _expand(self, points: FloatArray, out: FloatArray) -> NDArray[np.int32]:
+        """Fill ``out``; the cubes of the points are returned."""
+        nodes = self._locate(points)
+        if _expand(points, nodes, self._rows, self._kinds, out):
+            beyond = (nodes < 0) | (self._kinds[nodes] == EXACT)
+            out[beyond] = self._alone(points[beyond])
+        return nodes
 
     def _clear(self) -> None:
         self._node_of: dict[int, int] = {}

@@ -122,24 +122,30 @@ class Mapping:
         self._settle_by_first(points)
         return self._cells.map(points)
 
-    def map_what_it_can(self, points_e: ArrayLike) -> tuple[FloatArray, NDArray[np.bool_], MappingError | None]:
-        """As `map_from_e`, of the positions that can be mapped: (m, 3), which they are (n,), and the others' error."""
+    def map_with_sigmas(
+        self, points_e: FloatArray, covariance_e: FloatArray | None
+    ) -> tuple[FloatArray, NDArray[np.float32] | None]:
+        """As `map_from_e`; and sigmas (n, 3) along easting, northing and up, in metres, where there are covariances.
+
+        Covariances are (n, 6) xx xy xz yy yz zz in e, m². The sigmas are those of the coordinates as they stand in the
+        file: the projection's scale is left in (a part in a thousand in UTM), units other than metres are taken out.
+        Taken from the derivatives at the cube's centre.
+        """
+        if covariance_e is None:
+            return self.map_from_e(points_e), None
         points = np.ascontiguousarray(points_e, dtype=np.float64)
-        try:
-            return self.map_from_e(points), np.ones(len(points), dtype=bool), None
-        except MappingError as error:
-            reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points), axis=1)
-            reached[reached] = self.reaches(points[reached])
-            return self.map_from_e(points[reached]), reached, error
+        self._settle_by_first(points)
+        return self._cells.map_with_sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
 
     def reaches(self, points_e: FloatArray) -> NDArray[np.bool_]:
-        """Whether `map_from_e` has coordinates for each of finite positions in e (n, 3); never raises for one of them.
+        """Whether `map_from_e` has coordinates for each of positions in e (n, 3); never raises for one of them.
 
         Raises MappingError where no operation can be chosen.
         """
         points = np.ascontiguousarray(points_e, dtype=np.float64)
+        reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(points), axis=1)
+        points = points[reached]
         self._settle_by_first(points)
-        reached: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(self._forward(points)), axis=1)
         centres, cube = np.unique(np.floor(points / ROOT_M), axis=0, return_inverse=True)
         admitted = np.ones(len(centres), dtype=bool)
         for k, centre in enumerate((centres + 0.5) * ROOT_M):
@@ -147,17 +153,10 @@ class Mapping:
                 self._admit(centre[np.newaxis])
             except MappingError:
                 admitted[k] = False
-        return reached & admitted[cube.reshape(-1)]
-
-    def sigma_map(self, points_e: FloatArray, covariance_e: FloatArray) -> NDArray[np.float32]:
-        """Sigmas (n, 3) along easting, northing and up, in metres, of covariances in e (n, 6) xx xy xz yy yz zz, m².
-
-        They are those of the coordinates as they stand in the file: the projection's scale is left in (a part in a
-        thousand in UTM), units other than metres are taken out. Taken from the derivatives at the cube's centre.
-        """
-        points = np.ascontiguousarray(points_e, dtype=np.float64)
-        self._settle_by_first(points)
-        return self._cells.sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
+        reached[reached] = (
+            np.logical_and.reduce(np.isfinite(self._forward(points)), axis=1) & admitted[cube.reshape(-1)]
+        )
+        return reached
 
     def exact(self, points_e: FloatArray) -> FloatArray:
         """What `map_from_e` approximates: PROJ's own results (n, 3)."""

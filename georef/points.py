@@ -17,6 +17,12 @@ SingleArray = NDArray[np.float32]
 ByteArray = NDArray[np.uint8]
 
 
+def contiguous(array: NDArray[Any]) -> NDArray[Any]:
+    """The array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
+    flags = array.flags
+    return array if flags.c_contiguous and flags.writeable else array.copy()
+
+
 class Fate(IntEnum):
     """What became of a return; every one that was read has exactly one."""
 
@@ -120,6 +126,7 @@ class Rays:
         measured_m: range as measured.
         encoder_rad: encoder reading.
         encoder_rate, encoder_acceleration: rad/s, rad/s²; zero where nobody asked.
+        covariance_e: (n, 6) xx xy xz yy yz zz, m², where covariances were asked for.
     """
 
     fate: ByteArray
@@ -139,6 +146,7 @@ class Rays:
     encoder_rad: FloatArray | None = None
     encoder_rate: FloatArray | None = None
     encoder_acceleration: FloatArray | None = None
+    covariance_e: FloatArray | None = None
 
     def take(self, which: NDArray[np.bool_]) -> Rays:
         """Some of the rays; vectors stay columns beside each other."""

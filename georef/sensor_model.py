@@ -9,7 +9,6 @@ where there is one (NGA Eq. 3). The beam is straight and the air does nothing: t
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,11 @@ from georef.kernels.beam import FIXED_ANGLE, SPINNING
 from georef.kernels.rays import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, cast
 from georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
 from georef.mount import Mount
-from georef.points import Fate, Rays
+from georef.points import Fate, Rays, contiguous
 from georef.records import Int64Array, StructArray
 from georef.rotations import rot_x, rot_y, rot_z
 from georef.trajectory import Trajectory
+from georef.uncertainty import Uncertainty
 
 FloatArray = NDArray[np.float64]
 
@@ -80,6 +80,8 @@ class SensorModel:
         encoder_rate: FloatArray | None = None,
         encoder_acceleration: FloatArray | None = None,
         with_axes: bool = False,
+        uncertainty: Uncertainty | None = None,
+        incidence_rad: FloatArray | None = None,
         prf_hz: float | None = None,
     ) -> Rays:
         """Points of returns.
@@ -89,7 +91,9 @@ class SensorModel:
             time_ns: (n,) GPS time of their emission by the scanner's stamps; negative: unknown.
             trajectory: of the body, with attitude.
             encoder_rate, encoder_acceleration: (n,) of the readings, rad/s, rad/s².
-            with_axes: the second half of `Rays` too.
+            with_axes: the second half of `Rays` too, but for covariances.
+            uncertainty: gives these; they are nan where the trajectory says no sigma.
+            incidence_rad: (n,) between beam and the surface's normal, where the surface is known.
             prf_hz: of the scanner, for range offsets by pulse rate.
 
         Returns:
@@ -103,14 +107,16 @@ class SensorModel:
             raise ValueError(f"calibration of {self.calibration.scanner}: {text}")
         trajectory.require_attitude()
         rows, time_ns = contiguous(rows), contiguous(time_ns)
-        out, axes = _out(len(rows)), _axes(len(rows) if with_axes else 0)
+        out, axes = _out(len(rows)), _axes(len(rows)) if with_axes else None
+        doubt = None if uncertainty is None else uncertainty.doubt(trajectory, len(rows), incidence_rad)
         if len(trajectory) < 2:
             out.fate[:] = Fate.OUTSIDE_TRAJECTORY
         elif len(rows):
             model = self._model(time_ns, trajectory, encoder_rate, encoder_acceleration, prf_hz)
-            cast(rows, time_ns, model, out, axes)
-        if not with_axes:
-            return Rays(**out._asdict())
+            cast(rows, time_ns, model, out, axes, doubt)
+        covariance_e = None if doubt is None else doubt.covariance_e
+        if axes is None:
+            return Rays(**out._asdict(), covariance_e=covariance_e)
         still = np.zeros(len(rows))
         return Rays(
             **out._asdict(),
@@ -119,6 +125,7 @@ class SensorModel:
             encoder_rad=self._readings(rows),
             encoder_rate=still if encoder_rate is None else encoder_rate,
             encoder_acceleration=still if encoder_acceleration is None else encoder_acceleration,
+            covariance_e=covariance_e,
         )
 
     def _model(
@@ -207,12 +214,6 @@ class SensorModel:
             fibre = np.rint(readings * (count / (2.0 * np.pi))).astype(np.int64) % count
         chosen: FloatArray = deflection.table[fibre, FIXED_ANGLE]
         return chosen
-
-
-def contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, or a copy where it is strided or read-only: the kernels are compiled for one kind."""
-    flags = array.flags
-    return array if flags.c_contiguous and flags.writeable else array.copy()
 
 
 def _out(count: int) -> Out:

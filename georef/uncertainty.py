@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.calibration import INDEX, PARAMETERS, Calibration
-from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.kernels.covariance import (
     ALONG_ONLY,
     ANGLE,
@@ -28,14 +27,12 @@ from georef.kernels.covariance import (
     TILTED,
     TURN,
     TURN_BY_ANGLE,
+    Doubt,
     Flown,
     Known,
-    Seen,
-    covariances,
 )
-from georef.points import Rays
-from georef.records import Int64Array
-from georef.rotations import rot_from_quaternion, rot_x, rot_y
+from georef.points import contiguous
+from georef.rotations import rot_x, rot_y
 from georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -75,7 +72,7 @@ class Noise:
 
 
 class Uncertainty:
-    """Covariances of the points of one scanner."""
+    """Covariances of the points of one scanner, by `georef.sensor_model.SensorModel.rays`."""
 
     def __init__(self, calibration: Calibration, noise: Noise) -> None:
         """Take the parameters' covariance apart.
@@ -91,7 +88,9 @@ class Uncertainty:
             text = f"calibration {calibration.id}: its correlations are no covariance; want a positive definite matrix"
             raise UncertaintyError(text) from error
         errors = factor.T @ _effects(calibration)[active]
-        along = errors[:, ALONG_ONLY]
+        from_origin = errors.copy()  # turns about the body's origin, not about the scanner's
+        from_origin[:, SHIFT : SHIFT + 3] -= np.cross(errors[:, TURN : TURN + 3], calibration.lever_arm_b)
+        along = from_origin[:, ALONG_ONLY]
         self._known = Known(
             np.ascontiguousarray(errors),
             not errors[:, _BEYOND_LENGTH].any(),
@@ -104,49 +103,11 @@ class Uncertainty:
             noise.divergence_rad,
         )
 
-    def covariance_e(
-        self,
-        rays: Rays,
-        trajectory: Trajectory,
-        incidence_rad: FloatArray | None = None,
-        flown: Flown | None = None,
-    ) -> FloatArray:
-        """(n, 6) xx xy xz yy yz zz in e, m²; nan where the trajectory says no sigma.
-
-        Args:
-            rays: georeferenced returns only, with axes, of this trajectory.
-            trajectory: whose sigmas count.
-            incidence_rad: (n,) between beam and the surface's normal, where the surface is known.
-            flown: of the trajectory, for callers that ask more than once (`flown_between`).
-        """
-        covariance_e = np.empty((len(rays.points_e), 6))
-        if not len(covariance_e):
-            return covariance_e
-        seen = _seen(rays, _NONE if incidence_rad is None else incidence_rad)
-        if flown is None:
-            flown = _flown(trajectory, int(seen.epoch.min()), int(seen.epoch.max()) + 2)
-        covariances(seen, flown, self._known, covariance_e)
-        return covariance_e
-
-
-def flown_during(trajectory: Trajectory, time_ns: Int64Array, offset_s: float) -> Flown | None:
-    """As `flown_between`, for pulses at stamps (n,) and an offset of these; negative stamps are none."""
-    if len(time_ns) and time_ns.min() < 0:
-        time_ns = time_ns[time_ns >= 0]
-    if len(trajectory) < 2 or not len(time_ns):
-        return None
-    offset_ns = round(offset_s * 1e9)
-    return flown_between(trajectory, int(time_ns.min()) + offset_ns, int(time_ns.max()) + offset_ns)
-
-
-def flown_between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Flown:
-    """What `covariance_e` needs of a trajectory for pulses from first_ns to last_ns; what lies outside it is left out.
-
-    The trajectory has at least two epochs.
-    """
-    last = len(trajectory.time_ns) - 2
-    first, end = np.searchsorted(trajectory.time_ns, [first_ns, last_ns], side="right") - 1
-    return _flown(trajectory, min(max(int(first), 0), last), min(max(int(end), 0), last) + 2)
+    def doubt(self, trajectory: Trajectory, count: int, incidence_rad: FloatArray | None = None) -> Doubt:
+        """For the kernels, with room for the covariances of n returns."""
+        columns = (contiguous(getattr(trajectory, name)) for name in Flown._fields)
+        incidence_rad = _NONE if incidence_rad is None else contiguous(incidence_rad)
+        return Doubt(Flown(*columns), self._known, incidence_rad, np.empty((count, 6)))
 
 
 def _effects(calibration: Calibration) -> FloatArray:
@@ -167,46 +128,3 @@ def _effects(calibration: Calibration) -> FloatArray:
     for name, column in _ALONE.items():
         effects[INDEX[name], column] = 1.0
     return effects
-
-
-def _seen(rays: Rays, incidence_rad: FloatArray) -> Seen:
-    columns = {name: getattr(rays, name) for name in Seen._fields if name != "incidence_rad"}
-    across = {name: np.ascontiguousarray(column.T) for name, column in columns.items()}
-    return Seen(**across, incidence_rad=incidence_rad)
-
-
-def _flown(trajectory: Trajectory, first: int, end: int) -> Flown:
-    """Covariances at epochs first … end − 1, motion of the intervals between them."""
-    part = slice(first, end)
-    lat, lon, _ = geodetic_from_e(trajectory.position_e[part])
-    ned = rot_e_from_l(lat, lon)
-    seconds = np.diff(trajectory.time_ns[part])[:, np.newaxis] * 1e-9
-    return Flown(
-        first,
-        _covariance(ned * trajectory.position_sigma_l[part, np.newaxis, :]),
-        _covariance(
-            _attitude_axes_b(trajectory.q_e_from_b[part], ned) * trajectory.attitude_sigma_rad[part, np.newaxis]
-        ),
-        np.diff(trajectory.position_e[part], axis=0) / seconds,
-        trajectory.rotvec_b[first : end - 1] / seconds,
-    )
-
-
-def _covariance(axes: FloatArray) -> FloatArray:
-    """(m, 6) xx xy xz yy yz zz of axes (m, 3, 3), each column what one sigma of one error does."""
-    full = axes @ np.swapaxes(axes, 1, 2)
-    six: FloatArray = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    return np.ascontiguousarray(six)
-
-
-def _attitude_axes_b(q_e_from_b: FloatArray, rot_e_from_ned: FloatArray) -> FloatArray:
-    """(m, 3, 3), columns: axes in b about which roll, pitch and heading turn the body: its x, the level y, and down."""
-    rot_l_from_b = np.swapaxes(rot_e_from_ned, 1, 2) @ rot_from_quaternion(q_e_from_b)
-    nose_n, nose_e = rot_l_from_b[:, 0, 0], rot_l_from_b[:, 1, 0]
-    level = np.hypot(nose_n, nose_e)
-    level_y = np.stack([-nose_e / level, nose_n / level, np.zeros_like(level)], axis=1)
-    axes = np.zeros((len(level), 3, 3))
-    axes[:, 0, 0] = 1.0
-    axes[:, :, 1] = np.einsum("nji,nj->ni", rot_l_from_b, level_y)
-    axes[:, :, 2] = rot_l_from_b[:, 2]
-    return axes

@@ -42,7 +42,7 @@ from georef.kernels.rotations import (
 )
 from georef.kernels.types import Eight, FloatArray, Matrix, Three
 
-BLOCK = 128
+BLOCK = 64
 
 # One row each: θ; ρ, its measured part and the rest; where in its interval of position and of attitude a return is;
 # factors of the turn since the interval began; sine and cosine of up to two angles of the beam, and of slope · θ
@@ -51,7 +51,13 @@ SIN, COS, SIN_2, COS_2, SLOPE_SIN, SLOPE_COS = (whole(row) for row in range(9, 1
 # Three rows each: direction and start of the beam in the head, and then in the axes that the boresight's ω and φ turn;
 # ∂direction/∂θ and ∂direction/∂Δη (the first two of them are places for origin and point in e too)
 HEAD, HEAD_START, ALONG, START, ACROSS, TILT = (whole(row) for row in range(15, 33, 3))
-BEAM, ROWS = whole(33), 41  # the row of the geometry's table, eight rows
+BEAM = whole(33)  # the row of the geometry's table, eight rows
+# Of covariances: rot_e_from_b, three rows of three; what a later attitude and a later pulse do, per second; the
+# covariance xx xy xz, yy yz zz. One each: range as measured; variance of the range; encoder reading from its offset on,
+# rate, acceleration, and what an error in these is in the scan angle
+ROT, ROT_2, ROT_3, TURNING, MOVED, COVARIANCE, COVARIANCE_2 = (whole(row) for row in range(41, 62, 3))
+MEASURED, VARIANCE, READING, RATE, ACCELERATION, ANGLE_OFF = (whole(row) for row in range(62, 68))
+ROWS = 68
 
 
 @kernel
@@ -214,11 +220,12 @@ def give(block: FloatArray, n: int, at: int, out: Any) -> None:
 
 
 @kernel
-def hand_over(block: FloatArray, n: int, at: int, out: Any) -> None:
-    """Three rows to those of (3, n)."""
+def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> None:
+    """Three rows to those of (3, …) from column k on."""
     for axis in range(3):
+        row = out[axis, k : k + n]
         for i in range(n):
-            out[axis, i] = block[at + axis, i]
+            row[i] = block[at + axis, i]
 
 
 @kernel

@@ -13,6 +13,7 @@ from typing import Any
 from georef.compiled import kept, kernel, whole
 from georef.kernels.beam import FIXED_ANGLE, RANGE, SPINNING
 from georef.kernels.block import (
+    ACCELERATION,
     ACROSS,
     ALONG,
     BEAM,
@@ -21,7 +22,10 @@ from georef.kernels.block import (
     COUNTED,
     HEAD,
     HEAD_START,
+    MEASURED,
     MORE,
+    RATE,
+    READING,
     RHO,
     SHARE,
     SIN,
@@ -44,12 +48,22 @@ from georef.kernels.block import (
     swing,
     three,
 )
+from georef.kernels.covariance import (
+    Doubt,
+    Interval,
+    doubt_range,
+    give_six,
+    interval_at,
+    spread,
+    take_axes,
+)
 from georef.kernels.rotations import (
     cross,
     dot,
     matrix_at,
     plus,
     product,
+    rot_at,
     times,
     transposed_times,
     turned_on,
@@ -114,12 +128,7 @@ def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int
     """
     track, mounted = model.track, model.mounted
     begin, end, per_ns, fate, at = interval_of(track, t, guess)
-    w, x, y, z = track.q_e_from_b[at, 0], track.q_e_from_b[at, 1], track.q_e_from_b[at, 2], track.q_e_from_b[at, 3]
-    rot_e_from_b = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
+    rot_e_from_b = rot_at(track.q_e_from_b, at)
     phi, lever, outer = vector_at(track.rotvec_b, at), vector_at(mounted.lever_arm_b, 0), matrix_at(mounted.outer, 0)
     once = cross(phi, lever)
     arms = times(rot_e_from_b, lever), times(rot_e_from_b, once), times(rot_e_from_b, cross(phi, once))
@@ -240,8 +249,10 @@ def to_e(
 
 
 @kept
-def cast(rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes) -> None:
-    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,), and ``axes`` unless they are of length 0.
+def cast(
+    rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes | None, doubt: Doubt | None
+) -> None:
+    """Fill ``out`` from rows (n,) `RETURN_DTYPE` at GPS times (n,); ``axes`` and ``doubt`` where they are asked for.
 
     The trajectory has at least two epochs, n > 0.
     """
@@ -253,6 +264,8 @@ def cast(rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: A
     begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, FIRST)
     begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, time_ns[0] + turn_ns, FIRST)
     block = new_block()
+    if doubt is not None:
+        interval, doubted = interval_at(doubt.flown, at), at
     if scanning.select == ONE:
         for column in range(8):
             for i in range(BLOCK):
@@ -303,37 +316,41 @@ def cast(rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: A
         angles, ranges = out.angle_rad[here], out.range_m[here]
         for i in range(n):
             angles[i], ranges[i] = block[THETA, i], block[RHO, i]
-        if len(axes.share):
-            fill_axes(block, n, k, model, axes, turning, at, phi2)
+        if axes is not None:
+            turn_axes(block, n, k, kind, mounted, True)
+            fill_axes(block, n, k, track, axes, turning, at, phi2)
+        if doubt is not None:
+            turn_axes(block, n, k, kind, mounted, not doubt.known.along_only)
+            if at != doubted:
+                interval, doubted = interval_at(doubt.flown, at), at
+            if not doubt.known.along_only:
+                take_readings(block, n, part, scanning, rate[here], acceleration[here])
+            fill_covariance(block, n, k, part, track, turning, interval, doubt)
         k += n
 
 
 @kernel
-def attitudes(block: FloatArray, q_e_from_b: Any, w: float, v: Three, r: Three) -> None:
+def attitudes(block: FloatArray, n: int, k: int, q_e_from_b: FloatArray, w: float, v: Three, r: Three) -> None:
     """(w, v) ⊗ exp(share · r / 2), scalar first, from rows SIN and COS of `half_turns`."""
-    for i in range(q_e_from_b.shape[1]):
+    here = slice(k, k + n)
+    q_w, q_x, q_y, q_z = q_e_from_b[0, here], q_e_from_b[1, here], q_e_from_b[2, here], q_e_from_b[3, here]
+    for i in range(n):
         sin, cos = block[SIN, i], block[COS, i]
         h = sin * r[0], sin * r[1], sin * r[2]
         crossed = cross(v, h)
-        q_e_from_b[0, i] = w * cos - dot(v, h)
-        q_e_from_b[1, i] = w * h[0] + v[0] * cos + crossed[0]
-        q_e_from_b[2, i] = w * h[1] + v[1] * cos + crossed[1]
-        q_e_from_b[3, i] = w * h[2] + v[2] * cos + crossed[2]
+        q_w[i] = w * cos - dot(v, h)
+        q_x[i] = w * h[0] + v[0] * cos + crossed[0]
+        q_y[i] = w * h[1] + v[1] * cos + crossed[1]
+        q_z[i] = w * h[2] + v[2] * cos + crossed[2]
 
 
 @kernel
-def fill_axes(block: FloatArray, n: int, k: int, model: Model, axes: Axes, turning: int, at: int, phi2: float) -> None:
-    """Fill ``axes`` from row k on for the n returns of a block."""
-    _, scanning, mounted, track = model
-    here = slice(k, k + n)
+def turn_axes(block: FloatArray, n: int, k: int, kind: int, mounted: Mounted, tilts: bool) -> None:
+    """Rows in b: HEAD the beam, START from the body's origin to the point, ACROSS ∂point/∂θ, TILT ∂point/∂Δη."""
     outer, lever, slope = matrix_at(mounted.outer, 0), vector_at(mounted.lever_arm_b, 0), mounted.slope
-    epochs, shares = axes.epoch[here], axes.share[here]
-    for i in range(n):
-        epochs[i], shares[i] = at, block[SHARE, i]
-    swing(block, n, scanning.kind)
-    through_mount(block, n, k, mounted, ACROSS, ACROSS, 0.0)
-    through_mount(block, n, k, mounted, TILT, TILT, 0.0)
     by_phi = outer[0][1], outer[1][1], outer[2][1]
+    swing(block, n, kind)
+    through_mount(block, n, k, mounted, ACROSS, ACROSS, 0.0)
     if not mounted.shifted:
         clear(block, START)
     for i in range(n):
@@ -345,12 +362,48 @@ def fill_axes(block: FloatArray, n: int, k: int, model: Model, axes: Axes, turni
         put(block, ACROSS, i, plus(times(outer, three(block, ACROSS, i)), slope, by_slope))
     for i in range(n):
         put(block, START, i, plus(lever, 1.0, three(block, START, i)))
-        put(block, TILT, i, times(outer, three(block, TILT, i)))
-    hand_over(block, n, HEAD, axes.range_axis_b[:, here])
-    hand_over(block, n, START, axes.arm_b[:, here])
-    hand_over(block, n, ACROSS, axes.angle_axis_b[:, here])
-    hand_over(block, n, TILT, axes.tilt_axis_b[:, here])
+    if tilts:
+        through_mount(block, n, k, mounted, TILT, TILT, 0.0)
+        for i in range(n):
+            put(block, TILT, i, times(outer, three(block, TILT, i)))
+
+
+@kernel
+def fill_axes(block: FloatArray, n: int, k: int, track: Track, axes: Axes, turning: int, at: int, phi2: float) -> None:
+    """Fill ``axes`` from row k on for the n returns of a block."""
+    epochs, shares = axes.epoch[k : k + n], axes.share[k : k + n]
+    for i in range(n):
+        epochs[i], shares[i] = at, block[SHARE, i]
+    hand_over(block, n, HEAD, axes.range_axis_b, k)
+    hand_over(block, n, START, axes.arm_b, k)
+    hand_over(block, n, ACROSS, axes.angle_axis_b, k)
+    hand_over(block, n, TILT, axes.tilt_axis_b, k)
     half_turns(block, n, phi2)
     q = track.q_e_from_b
     v = q[turning, 1], q[turning, 2], q[turning, 3]
-    attitudes(block, axes.q_e_from_b[:, here], q[turning, 0], v, vector_at(track.rotvec_b, turning))
+    attitudes(block, n, k, axes.q_e_from_b, q[turning, 0], v, vector_at(track.rotvec_b, turning))
+
+
+@kernel
+def take_readings(block: FloatArray, n: int, part: Any, scanning: Scanning, rate: Any, acceleration: Any) -> None:
+    """The encoder's, as errors of its parameters see them."""
+    fixed = scanning.select >= FIBRE_BY_CHANNEL
+    for i in range(n):
+        reading = block[BEAM + FIXED_ANGLE, i] if fixed else part[i].encoder_rad
+        block[READING, i] = reading - scanning.offset_rad
+    if len(rate):
+        for i in range(n):
+            block[RATE, i], block[ACCELERATION, i] = rate[i], acceleration[i]
+
+
+@kernel
+def fill_covariance(
+    block: FloatArray, n: int, k: int, part: Any, track: Track, turning: int, interval: Interval, doubt: Doubt
+) -> None:
+    """Of the n returns of a block, whose axes and readings are there, to row k and on."""
+    take_axes(block, n, rot_at(track.q_e_from_b, turning), vector_at(track.rotvec_b, turning))
+    for i in range(n):
+        block[MEASURED, i] = part[i].range_m
+    doubt_range(block, n, doubt.known, doubt.incidence_rad[k : k + n])
+    spread(block, n, interval, doubt.known)
+    give_six(block, n, doubt.covariance_e[k : k + n])

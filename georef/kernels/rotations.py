@@ -33,6 +33,22 @@ def matrix_at(array: FloatArray, k: int) -> Matrix:
 
 
 @kernel
+def rot_at(q: FloatArray, k: int) -> Matrix:
+    """Matrix of unit quaternion k of (n, 4), scalar first."""
+    return rot_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
+
+
+@kernel
+def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
+    """Matrix of a unit quaternion."""
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@kernel
 def dot(a: Three, b: Three) -> float:
     """Inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -124,7 +124,7 @@ class Out(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """The second half, vectors as columns: (3, n), (4, n); all of length 0 where nobody asked."""
+    """The second half, vectors as columns: (3, n), (4, n)."""
 
     q_e_from_b: FloatArray
     epoch: Int64Array

@@ -94,9 +94,10 @@ def normalised_errors(flown: Flown, seed: int) -> FloatArray:
             around,
             encoder_rate=rate[k : k + 1],
             encoder_acceleration=acceleration[k : k + 1],
-            with_axes=True,
+            uncertainty=Uncertainty(drawn, NOISE),
         )
-        xx, xy, xz, yy, yz, zz = Uncertainty(drawn, NOISE).covariance_e(rays, around)[0]
+        assert rays.covariance_e is not None
+        xx, xy, xz, yy, yz, zz = rays.covariance_e[0]
         covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         missed = rays.points_e[0] - flown.truth["left.point_e"][k]
         errors.append(missed @ np.linalg.solve(covariance, missed))

@@ -143,10 +143,10 @@ def test_sigmas_in_e_where_there_is_no_map() -> None:
     uncertainty = Uncertainty(model().calibration, Noise())
     points, fates = Georeferencer(model(), uncertainty=uncertainty).georeference(rows, time_ns, flight())
     good = fates == Fate.GEOREFERENCED
-    rays = model().rays(rows[good], time_ns[good], flight(), with_axes=True)
-    covariance = uncertainty.covariance_e(rays, flight())
+    rays = model().rays(rows[good], time_ns[good], flight(), uncertainty=uncertainty)
     assert points.sigma_map is not None
-    assert points.sigma_map**2 == pytest.approx(covariance[:, [0, 3, 5]], rel=1e-6)
+    assert rays.covariance_e is not None
+    assert points.sigma_map**2 == pytest.approx(rays.covariance_e[:, [0, 3, 5]], rel=1e-6)
 
 
 class Steady:

@@ -152,7 +152,7 @@ def test_points_that_are_nowhere_come_back_from_the_map_itself() -> None:
     made = cells(quadratic)
     np.testing.assert_array_equal(made.map(points)[:2], quadratic(points)[:2])
     covariance = np.tile([1.0, 0, 0, 1.0, 0, 1.0], (3, 1))
-    assert np.isnan(made.sigmas(points, covariance)).all(axis=1).tolist() == [True, True, False]
+    assert np.isnan(made.map_with_sigmas(points, covariance)[1]).all(axis=1).tolist() == [True, True, False]
 
 
 def test_sigmas_by_the_law_of_propagation() -> None:
@@ -165,7 +165,7 @@ def test_sigmas_by_the_law_of_propagation() -> None:
     made = MapCells(quadratic, 0.5 * METRES, lambda centres: None)
     jacobian = made._rows[made._locate(points)[0], map_cells.FIRST].reshape(3, 3)
     expected = 0.5 * np.sqrt(np.einsum("ij,njk,ik->ni", jacobian, full, jacobian))
-    np.testing.assert_allclose(made.sigmas(points, packed), expected, rtol=1e-6)
+    np.testing.assert_allclose(made.map_with_sigmas(points, packed)[1], expected, rtol=1e-6)
 
 
 def test_who_admits_cubes_is_asked_for_each_root_once() -> None:
