@@ -16,8 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.calibration import Calibration, is_rotation
-from georef.kernels.beam import COLUMNS, FIXED_ANGLE, LINE, NUTATING, RANGE, RISLEY, SPINNING
-from georef.kernels.rays import BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, ONE
+from georef.kernels.beam import (
+    BY_CHANNEL,
+    COLUMNS,
+    FIBRE_BY_CHANNEL,
+    FIBRE_BY_ENCODER,
+    FIXED_ANGLE,
+    LINE,
+    NUTATING,
+    ONE,
+    RANGE,
+    RISLEY,
+    SPINNING,
+)
 
 FloatArray = NDArray[np.float64]
 

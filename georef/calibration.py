@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-CONVENTIONS_VERSION = 1
 CONVENTIONS = 1  # version of docs/conventions.md
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
 RANGES = ("corrected", "vacuum")
 REFRACTIONS = ("none", "ardc", "spherical")
 ROTATION_TOLERANCE = 1e-6
+MOST = 65_535  # of channels, which have 16 bits, and of what is fewer
 ONE_TABLE = "want it once"
+TABLES = ("calibration", "parameters", "sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
 
 
 class CalibrationError(ValueError):
@@ -179,6 +180,7 @@ class _Reader:
         self.mistakes: list[str] = []
 
     def calibration(self) -> Calibration:
+        self._known(self._document, "", TABLES)
         header = self._table("calibration", needed=True)
         self._version(header)
         parameters, _ = self._values("parameters")
@@ -205,6 +207,11 @@ class _Reader:
 
     def _wrong(self, key: str, text: str) -> None:
         self.mistakes.append(f"{key}: {text}")
+
+    def _known(self, table: Mapping[str, Any], where: str, keys: tuple[str, ...]) -> None:
+        """What nobody would look at, as a table or key that is misspelt, is wrong too."""
+        for key in sorted(table.keys() - set(keys)):
+            self._wrong(f"{where}{key}", f"is not known; want {', '.join(keys)}")
 
     def _table(self, key: str, *, needed: bool = False) -> Mapping[str, Any]:
         table = self._document.get(key)
@@ -246,11 +253,11 @@ class _Reader:
             return 0.0
         return float(value)
 
-    def _whole(self, table: Mapping[str, Any], key: str, where: str) -> int:
+    def _whole(self, table: Mapping[str, Any], key: str, where: str, *, least: int = 0) -> int:
         value = table.get(key)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MOST:
             got = "missing" if value is None else f"got {value!r}"
-            self._wrong(f"{where}.{key}", f"{got}, want a whole number from 0")
+            self._wrong(f"{where}.{key}", f"{got}, want a whole number from {least} to {MOST}")
             return 0
         return value
 
@@ -258,7 +265,7 @@ class _Reader:
         """(16,) in SI units, and which of them were said."""
         table = self._table(section, needed=section == "parameters")
         values, said = np.zeros(len(PARAMETERS)), set()
-        for key in table.keys() - _INDEX_OF_KEY.keys():
+        for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
             self._wrong(f"{section}.{key}", "no parameter of the model; want the keys of CONVENTIONS")
         for index, parameter in enumerate(PARAMETERS):
             needed = parameter.needed and section == "parameters" and bool(table)
@@ -274,7 +281,7 @@ class _Reader:
         if not table:
             return whole
         names = table.get("names")
-        if not isinstance(names, list) or any(_INDEX_OF_KEY.get(name) not in estimated for name in names):
+        if not isinstance(names, list) or any(_INDEX_OF_KEY.get(str(name)) not in estimated for name in names):
             self._wrong("correlation.names", "want a list of keys of [sigma]")
             return whole
         matrix = _array(table.get("matrix"), (len(names), len(names)))
@@ -314,29 +321,30 @@ class _Reader:
             return None
         return intensity, correction
 
-    def _rows(self, key: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _rows(self, key: str, columns: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Rows of an array of tables, with where each stands."""
         rows = self._document.get(key, [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             self._wrong(key, f"want tables [[{key}]]")
             return
         for place, row in enumerate(rows):
+            self._known(row, f"{key}[{place}].", columns)
             yield f"{key}[{place}]", row
 
     def _range_offsets(self) -> Iterator[RangeOffset]:
-        for where, row in self._rows("range_offset"):
+        for where, row in self._rows("range_offset", ("return_slot", "mta_zone", "prf_hz", "offset_m")):
             if not row.keys() & {"return_slot", "mta_zone", "prf_hz"}:
                 self._wrong(where, "matches everything; want return_slot, mta_zone or prf_hz")
             yield RangeOffset(
                 self._number(row, "offset_m", where),
-                self._whole(row, "return_slot", where) if "return_slot" in row else None,
+                self._whole(row, "return_slot", where, least=1) if "return_slot" in row else None,
                 self._whole(row, "mta_zone", where) if "mta_zone" in row else None,
                 self._number(row, "prf_hz", where) if "prf_hz" in row else None,
             )
 
     def _facets(self) -> dict[int, float]:
         tilts: dict[int, float] = {}
-        for where, row in self._rows("facet"):
+        for where, row in self._rows("facet", ("index", "tilt_deg")):
             index = self._whole(row, "index", where)
             if index in tilts:
                 self._wrong(f"{where}.index", f"facet {index} stands there twice; {ONE_TABLE}")
@@ -345,7 +353,7 @@ class _Reader:
 
     def _beams(self) -> dict[int, BeamCorrection]:
         beams: dict[int, BeamCorrection] = {}
-        for where, row in self._rows("beam"):
+        for where, row in self._rows("beam", ("channel", "azimuth_deg", "elevation_deg", "range_m")):
             channel = self._whole(row, "channel", where)
             if channel in beams:
                 self._wrong(f"{where}.channel", f"beam {channel} stands there twice; {ONE_TABLE}")

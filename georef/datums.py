@@ -22,9 +22,12 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
+from georef.earth import A_M, B_M
+
 Area = tuple[float, float, float, float]
 
 ACCURACY_M = 0.05
+ELLIPSOID_M = 0.01  # of its axes: GRS 80 and WGS 84 are a tenth of a millimetre apart
 WGS84 = "EPSG:4978"
 SAME = "same"
 _NAMED = 'name their datum (gnss.datum or --trajectory-datum, such as "EPSG:7912", ITRF2014, with output.epoch)'
@@ -111,16 +114,23 @@ def read_target(text: str) -> Target:
 
 
 def read_source(datum: str | None, target: Target) -> CRS:
-    """The geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own datum."""
-    if datum == SAME:
-        return _geocentric(target.horizontal)
+    """The geocentric CRS of positions in e: None is WGS 84 of unknown realisation, "same" is the target's own datum.
+
+    Raises MappingError for what is no datum of positions, and for datums on another ellipsoid than WGS 84's: latitudes,
+    longitudes and heights of receivers and files are taken to e on that one.
+    """
     if datum is None:
         return CRS.from_user_input(WGS84)
+    if datum == SAME:
+        source = _geocentric(target.horizontal)
+        _refuse_ellipsoid(datum, source)
+        return source
     crs = _unbound(_read(datum, "datum"))
     if not (crs.is_geographic or crs.is_geocentric):
         geodetic = crs.geodetic_crs
         base = "" if geodetic is None else f', "{":".join(geodetic.to_authority() or (geodetic.name,))}"'
         raise MappingError(f'datum = "{datum}" ({crs.name}) is no datum of positions: name its geodetic CRS{base}')
+    _refuse_ellipsoid(datum, crs)
     return _geocentric(crs)
 
 
@@ -257,10 +267,10 @@ def _refusal(flat: _Candidates, judged: list[_Judgement], target: Target, datum:
     if flat.missing:
         return f'PROJ\'s best operation, "{_short(flat.best_name)}", lacks {_how_to_get(flat.missing)}'
     first = judged[0]
-    same = _SAME.format(datum=target.datum_name)
+    same = f", or {_SAME.format(datum=target.datum_name)}" if _has_our_ellipsoid(target.horizontal) else ""
     if datum is None:
-        return f"the positions are in WGS 84 of unknown realisation, and {first.fault}: {_NAMED}, or {same}"
-    fault = f'the positions are in "{datum}", and {first.fault}: name another datum, or {same}'
+        return f"the positions are in WGS 84 of unknown realisation, and {first.fault}: {_NAMED}{same}"
+    fault = f'the positions are in "{datum}", and {first.fault}: name another datum{same}'
     if first.operation is None:
         return fault
     return f"{fault}; or take it with output.datum_accuracy_m = {first.operation.accuracy_m:g}"
@@ -337,6 +347,24 @@ def _read(text: str, key: str) -> CRS:
 
 def _unbound(crs: CRS) -> CRS:
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+
+
+def _has_our_ellipsoid(crs: CRS) -> bool:
+    """Whether geodetic coordinates on it mean what they mean on the ellipsoid of `georef.earth`."""
+    ellipsoid = crs.ellipsoid
+    if ellipsoid is None:
+        return False
+    apart_m = max(abs(ellipsoid.semi_major_metre - A_M), abs(ellipsoid.semi_minor_metre - B_M))
+    return bool(apart_m < ELLIPSOID_M)
+
+
+def _refuse_ellipsoid(datum: str, crs: CRS) -> None:
+    if not _has_our_ellipsoid(crs):
+        ellipsoid = "unknown" if crs.ellipsoid is None else crs.ellipsoid.name
+        raise MappingError(
+            f'datum = "{datum}": {crs.name} is on the ellipsoid {ellipsoid}, positions are read on that of WGS 84 and '
+            f'GRS 1980: name the datum that the receiver or its corrections were in, such as "EPSG:7912"'
+        )
 
 
 def _geocentric(crs: CRS) -> CRS:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from georef.kernels.motion import PLACE, REACH, TRAIN, cut, rates
 from georef.records import RETURN_DTYPE, Int64Array, StructArray
+from georef.stream_rows import joined, words
 
 FloatArray = NDArray[np.float64]
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
@@ -59,8 +60,8 @@ class EncoderMotion:
         Returns:
             rows, time_ns: (m,) in the same order; rate: rad/s; acceleration: rad/s².
         """
-        self._rows = np.concatenate([self._rows, rows])
-        self._time_ns = np.concatenate([self._time_ns, time_ns])
+        self._rows = joined([self._rows, rows], rows)
+        self._time_ns = joined([self._time_ns, time_ns], time_ns)
         return self._give(everything=False)
 
     def flush(self) -> Moving:
@@ -102,5 +103,6 @@ class EncoderMotion:
         next_piece = pieces[done]
         needed = (pieces[:, TRAIN] == next_piece[TRAIN]) & (next_piece[PLACE] - pieces[:, PLACE] <= REACH)
         keep = int(starts[int(np.argmax(needed))])
-        self._rows, self._time_ns = self._rows[keep:].copy(), self._time_ns[keep:].copy()
+        self._rows = words(self._rows[keep:]).copy().view(RETURN_DTYPE).reshape(-1)
+        self._time_ns = self._time_ns[keep:].copy()
         self._given = int(starts[done]) - keep

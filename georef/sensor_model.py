@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from georef.atmosphere import Air
 from georef.beams import Geometry
 from georef.calibration import Calibration
-from georef.kernels.beam import FIXED_ANGLE, SPINNING
-from georef.kernels.rays import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, cast
+from georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
+from georef.kernels.rays import cast
 from georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
 from georef.mount import Mount
 from georef.points import Fate, Rays, contiguous

@@ -19,7 +19,7 @@ from georef.points import FATE_NAMES, ByteArray, Fate, Points
 from georef.records import RETURN_DTYPE, Int64Array, StructArray
 from georef.stream_clocks import StreamClocks
 from georef.stream_path import CompletePath, GrowingPath, Path
-from georef.stream_rows import any_has, compact, joined, taken
+from georef.stream_rows import Held, any_has, beyond, compact, joined, split, taken
 
 if TYPE_CHECKING:
     from georef.trajectory import Trajectory
@@ -100,8 +100,13 @@ class GivenMotion:
         del rows, time_ns
         return self.rate, self.acceleration
 
+    def keep(self, which: NDArray[np.bool_]) -> None:
+        """Of those rows only the masked ones are georeferenced next."""
+        self.rate, self.acceleration = self.rate[which], self.acceleration[which]
+
 
 Predict = Callable[[StructArray, Int64Array, "Trajectory"], NDArray[np.float64]]
+LeftOut = Callable[[StructArray, Int64Array, ByteArray, "Trajectory | None"], None]
 
 
 @dataclass(slots=True)
@@ -116,6 +121,8 @@ class ScannerChain:
         reach_ns: how much later than its stamp a return may ask the trajectory.
         motion: tells how the encoder moved, where the calibration asks for it; holds back what it cannot tell yet.
         given: where the georeferencer finds that; goes with ``motion``.
+        left_out: takes the returns that gave no point: rows, GPS times (-1: unknown), fates, and the trajectory where
+            one was asked. Those that the resolver drops it only counts.
     """
 
     name: str
@@ -125,15 +132,7 @@ class ScannerChain:
     reach_ns: int = 0
     motion: Motion | None = None
     given: GivenMotion | None = None
-
-
-@dataclass(slots=True)
-class _Held:
-    """Returns that came to wait at one tick; their times where those are known."""
-
-    rows: StructArray
-    since_ns: int
-    time_ns: Int64Array
+    left_out: LeftOut | None = None
 
 
 class _Lane:
@@ -144,8 +143,8 @@ class _Lane:
         self.new: list[StructArray] = []
         self.fates: Int64Array = np.zeros(len(Fate), np.int64)
         self._settings = settings
-        self._untimed: deque[_Held] = deque()
-        self._timed: deque[_Held] = deque()
+        self._untimed: deque[Held] = deque()
+        self._timed: deque[Held] = deque()
         self._resolves = False  # a return of unknown zone has come
         self._held_back = 0  # by resolver and motion
 
@@ -172,8 +171,8 @@ class _Lane:
     def _take(self, tick_ns: int) -> None:
         pieces, self.new = [rows for rows in self.new if len(rows)], []
         if pieces:
-            self._untimed.append(_Held(compact(joined(pieces, NO_ROWS)), tick_ns, NO_TIMES))
-        for held in _beyond(self._untimed, self._settings.max_rows):
+            self._untimed.append(Held(compact(joined(pieces, NO_ROWS)), tick_ns, NO_TIMES))
+        for held in beyond(self._untimed, self._settings.max_rows):
             self._give_up(held.rows, Fate.NO_TIME)
 
     def _place(self, tick_ns: int, clocks: StreamClocks, *, last: bool) -> None:
@@ -190,23 +189,23 @@ class _Lane:
                 self._untimed.append(held)
                 continue
             good, time_ns = self._times(held.rows, clocks)
-            timed, rest = _split(_Held(held.rows, tick_ns, time_ns), good)
+            timed, rest = split(Held(held.rows, tick_ns, time_ns), good)
             self._timed += timed
             for untimed in rest:
                 if overdue:
                     self._give_up(untimed.rows, Fate.NO_TIME)
                 else:
-                    self._untimed.append(_Held(untimed.rows, held.since_ns, held.time_ns))
-        for held in _beyond(self._timed, self._settings.max_rows):
-            self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY)
+                    self._untimed.append(Held(untimed.rows, held.since_ns, held.time_ns))
+        for held in beyond(self._timed, self._settings.max_rows):
+            self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
     def _times(self, rows: StructArray, clocks: StreamClocks) -> tuple[NDArray[np.bool_], Int64Array]:
         return clocks.place(f"scanner/{self.chain.name}", rows, self._settings.max_time_sigma_ns)
 
-    def _was_asked(self, held: _Held, tick_ns: int) -> bool:
+    def _was_asked(self, held: Held, tick_ns: int) -> bool:
         return (tick_ns - held.since_ns) / SECOND_NS > self._settings.settle_s
 
-    def _is_worth_asking(self, waiting: deque[_Held], tick_ns: int, clocks: StreamClocks) -> bool:
+    def _is_worth_asking(self, waiting: deque[Held], tick_ns: int, clocks: StreamClocks) -> bool:
         """Whether the first or the last return that was asked in vain has a time by now, so that all are asked."""
         asked = [held for held in waiting if self._was_asked(held, tick_ns)]
         if not asked:
@@ -214,23 +213,24 @@ class _Lane:
         ends = np.concatenate([asked[0].rows[:1], asked[-1].rows[-1:]])
         return bool(self._times(ends, clocks)[0].any())
 
-    def _is_overdue(self, held: _Held, tick_ns: int) -> bool:
+    def _is_overdue(self, held: Held, tick_ns: int) -> bool:
         return (tick_ns - held.since_ns) / SECOND_NS >= self._settings.trajectory_wait_s
 
     def _give_up_unseen(self, tick_ns: int, *, last: bool) -> None:
         """Nothing is known of where the aircraft was."""
         while self._timed and (last or self._is_overdue(self._timed[0], tick_ns)):
-            self._give_up(self._timed.popleft().rows, Fate.OUTSIDE_TRAJECTORY)
+            held = self._timed.popleft()
+            self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
-    def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[_Held]:
+    def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[Held]:
         """Taken from the queue: what the trajectory covers, and what has waited for it for too long."""
-        ready: list[_Held] = []
+        ready: list[Held] = []
         waiting, self._timed = self._timed, deque()
         for held in waiting:
             if last or self._is_overdue(held, tick_ns):
                 ready.append(held)
                 continue
-            covered, rest = _split(held, held.time_ns <= covered_ns - self.chain.reach_ns)
+            covered, rest = split(held, held.time_ns <= covered_ns - self.chain.reach_ns)
             ready += covered
             self._timed += rest
         return ready
@@ -272,12 +272,17 @@ class _Lane:
         if any_has(rows, "flags", CONTEXT_FLAG):
             own = rows["flags"] & CONTEXT_FLAG == 0
             rows, time_ns = taken(rows, own), time_ns[own]
-            if chain.motion is not None and chain.given is not None:
-                chain.given.rate, chain.given.acceleration = chain.given.rate[own], chain.given.acceleration[own]
+            if chain.given is not None:
+                chain.given.keep(own)
         if not len(rows):
             return None
         points, fates = chain.georeferencer.georeference(rows, time_ns, trajectory)
         self.fates += np.bincount(fates, minlength=len(self.fates))
+        if chain.left_out is not None and fates.any():
+            lost = fates != Fate.GEOREFERENCED
+            if chain.given is not None:
+                chain.given.keep(lost)
+            chain.left_out(taken(rows, lost), time_ns[lost], fates[lost], trajectory)
         return points if len(points) else None
 
     def _moving(self, motion: Motion, rows: StructArray, time_ns: Int64Array, *, last: bool) -> Moving:
@@ -294,32 +299,14 @@ class _Lane:
         self._held_back += len(rows) - len(moving[0])
         return moving
 
-    def _give_up(self, rows: StructArray, fate: Fate) -> None:
-        self.fates[fate] += int(np.count_nonzero(rows["flags"] & CONTEXT_FLAG == 0))
-
-
-def _split(held: _Held, mask: NDArray[np.bool_]) -> tuple[list[_Held], list[_Held]]:
-    """Those of the mask, and the others, each in order; nothing is copied where the others follow in one piece."""
-    count = int(np.count_nonzero(mask))
-    if count == len(mask):
-        return [held], []
-    if not count:
-        return [], [held]
-    if mask[:count].all():
-        parts = [(held.rows[part], held.time_ns[part]) for part in (slice(count), slice(count, None))]
-    else:
-        parts = [(taken(held.rows, part), held.time_ns[part]) for part in (mask, ~mask)]
-    one, other = (_Held(rows, held.since_ns, time_ns) for rows, time_ns in parts)
-    return [one], [other]
-
-
-def _beyond(queue: deque[_Held], max_rows: int) -> list[_Held]:
-    """Taken from the queue: the oldest, until no more than so many rows are left."""
-    rows, oldest = sum(len(held.rows) for held in queue), []
-    while rows > max_rows:
-        oldest.append(queue.popleft())
-        rows -= len(oldest[-1].rows)
-    return oldest
+    def _give_up(self, rows: StructArray, fate: Fate, time_ns: Int64Array | None = None) -> None:
+        """Count returns without a point, but for those of the margin; pulses that gave none are no returns."""
+        own = (rows["flags"] & CONTEXT_FLAG == 0) & (rows["number_of_returns"] > 0)
+        count = int(np.count_nonzero(own))
+        self.fates[fate] += count
+        if self.chain.left_out is not None and count:
+            times = np.full(count, -1) if time_ns is None else time_ns[own]
+            self.chain.left_out(taken(rows, own), times, np.full(count, fate, np.uint8), None)
 
 
 class Stream:

@@ -1,13 +1,15 @@
-"""Returns copied and looked at as numbers of 64 bits: NumPy takes a structure with gaps field by field otherwise."""
+"""Returns that wait, copied and looked at as numbers of 64 bits: NumPy takes a structure with gaps field by field."""
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import RETURN_DTYPE, StructArray
+from georef.records import RETURN_DTYPE, Int64Array, StructArray
 
 WORDS = RETURN_DTYPE.itemsize // 8
 _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).items()}
@@ -48,3 +50,36 @@ def compact(rows: StructArray) -> StructArray:
     """Rows that may wait for long, without what lies beside them in memory: parsers make room for every slot."""
     spare = isinstance(rows.base, np.ndarray) and rows.base.nbytes > rows.nbytes + rows.nbytes // 4
     return words(rows).copy().view(RETURN_DTYPE).reshape(-1) if spare else rows
+
+
+@dataclass(slots=True)
+class Held:
+    """Returns that came to wait at one tick; their times where those are known."""
+
+    rows: StructArray
+    since_ns: int
+    time_ns: Int64Array
+
+
+def split(held: Held, mask: NDArray[np.bool_]) -> tuple[list[Held], list[Held]]:
+    """Those of the mask, and the others, each in order; nothing is copied where the others follow in one piece."""
+    count = int(np.count_nonzero(mask))
+    if count == len(mask):
+        return [held], []
+    if not count:
+        return [], [held]
+    if mask[:count].all():
+        parts = [(held.rows[part], held.time_ns[part]) for part in (slice(count), slice(count, None))]
+    else:
+        parts = [(taken(held.rows, part), held.time_ns[part]) for part in (mask, ~mask)]
+    one, other = (Held(rows, held.since_ns, time_ns) for rows, time_ns in parts)
+    return [one], [other]
+
+
+def beyond(queue: deque[Held], max_rows: int) -> list[Held]:
+    """Taken from the queue: the oldest, until no more than so many rows are left."""
+    rows, oldest = sum(len(held.rows) for held in queue), []
+    while rows > max_rows:
+        oldest.append(queue.popleft())
+        rows -= len(oldest[-1].rows)
+    return oldest

@@ -109,14 +109,16 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     trajectory.require_attitude()
     if len(trajectory) < 2 or len(imu_time_ns) < 2:
         raise TrajectoryError(f"trajectory {trajectory.name}: too few epochs or inertial samples to compare")
-    felt = _turning(imu_time_ns, imu_rate_b[1:], 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS)
-    told = _turning(trajectory.time_ns, trajectory.turn_rates_b("i"), trajectory.max_gap_ns)
+    steps = -(-int(imu_time_ns[0]) // STEP_NS), int(imu_time_ns[-1]) // STEP_NS
+    felt = _turning(imu_time_ns, imu_rate_b[1:], 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS, steps)
     first_ns, last_ns = trajectory.span
     apart_days = round((int(imu_time_ns[0] + imu_time_ns[-1]) - first_ns - last_ns) / (2 * DAY_NS))
     day, _ = utc_from_gps(int(imu_time_ns[0]), 0)
     best = TimeShift(0.0, np.nan, np.nan, np.nan, table_leap_seconds(day)[0])
     for days in sorted({0, apart_days - 1, apart_days, apart_days + 1}, key=abs):
-        found = _best_shift(told, felt, days * (DAY_NS // STEP_NS))
+        coarse = days * (DAY_NS // STEP_NS)
+        told = _told_near(trajectory, felt, coarse)
+        found = None if told is None else _best_shift(told, felt, coarse)
         if found is None:
             continue
         shift_s, correlation, sigma, unshifted = found
@@ -126,12 +128,27 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     return best
 
 
-def _turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int) -> _Turning:
-    """Of rates (n − 1, 3) over the intervals between times (n,): what was turned, at the ends of steps, differenced."""
-    first, last = -(-int(time_ns[0]) // STEP_NS), int(time_ns[-1]) // STEP_NS
+def _told_near(trajectory: Trajectory, felt: _Turning, coarse: int) -> _Turning | None:
+    """What a trajectory tells, some steps away, of the time that was felt and what is looked at around it."""
+    first = felt.first - REACH_STEPS - coarse
+    last = felt.first + len(felt.rate_b) + REACH_STEPS - coarse
+    part = trajectory.between(first * STEP_NS, last * STEP_NS)
+    if len(part) < 2:
+        return None
+    begin, end = -(-part.span[0] // STEP_NS), part.span[1] // STEP_NS  # beyond a gap, these may be years away
+    steps = max(first, begin), min(last, end)
+    return None if steps[1] <= steps[0] else _turning(part.time_ns, part.turn_rates_b("i"), part.max_gap_ns, steps)
+
+
+def _turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tuple[int, int]) -> _Turning:
+    """Of rates (n − 1, 3) over the intervals between times (n,): what was turned, at the ends of steps, differenced.
+
+    Gaps are unknown, and so is what has no number.
+    """
+    first, last = steps
     since_s = (time_ns - first * STEP_NS) / SECOND_NS
     length_s = np.diff(since_s)[:, np.newaxis]
-    gap = length_s[:, 0] * SECOND_NS > max_gap_ns
+    gap = (length_s[:, 0] * SECOND_NS > max_gap_ns) | ~np.isfinite(rate_b).all(axis=1)
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(gap[:, np.newaxis], 0.0, rate_b) * length_s, axis=0)])
     unknown_s = np.r_[0.0, np.cumsum(np.where(gap, length_s[:, 0], 0.0))]
     ends_s = np.arange(last - first + 1) * (STEP_NS / SECOND_NS)

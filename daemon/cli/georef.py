@@ -45,6 +45,10 @@ def command(
     scale: Annotated[
         float, typer.Option(help="Of the coordinates in the files, in their unit.", min=1e-9, max=1.0)
     ] = 0.001,
+    write_dropped: Annotated[
+        bool,
+        typer.Option("--write-dropped", help="Also returns left out: beyond the range gate flagged, others listed."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
 ) -> None:
@@ -78,6 +82,7 @@ def command(
         copc=copc,
         scale=scale,
         overwrite=overwrite,
+        write_dropped=write_dropped,
     )
     with progress_bar() as tell:
         report = georeference(wish, tell)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +21,7 @@ from daemon.processing.models import connect
 from daemon.processing.setup import Setup
 from daemon.replay import source_of_topic
 from drivers.core.parser import Parser
+from georef.mount import AngleSeries, MountError
 from georef.points import Points
 from georef.records import (
     IMU_DTYPE,
@@ -34,8 +36,9 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.stream import CONTEXT_FLAG, Stream
+from georef.stream import CONTEXT_FLAG, Stream, StreamSettings
 from georef.stream_clocks import FrozenClocks, HostClocks
+from georef.trajectory_buffer import SOLUTION_STATUS
 
 TICK_NS = 100_000_000
 TICK_BYTES = 32 << 20
@@ -107,24 +110,25 @@ class LogFeed:
                 and their returns give no points.
         """
         if context != self._context:
-            self._flush()
+            self.flush()
             self._context = context
         placed: Placed = []
         for first, last, tick_ns in self._pieces(batch):
             if first < last:
                 self._feed(batch.between(first, last))
             if tick_ns is not None:
-                self._flush()
+                self.flush()
                 placed += self.stream.advance(tick_ns)
         return placed
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Decode what is held to be decoded together."""
         for run in self._runs.values():
             run.flush()
 
     def close(self) -> Placed:
         """The log is over."""
-        self._flush()
+        self.flush()
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
         return self.stream.close()
@@ -266,6 +270,7 @@ class LogClocks:
         ins_rows: solutions of the device's INS, `INS_DTYPE`, attitude of b.
         imu_gps_ns: (n,) GPS time of the samples' arrival; imu_rate_b: (n, 3) rad/s, axes of b. To check that a
             trajectory's motion is this flight's.
+        angles: of gimbals, by the source that told them.
         counts: records by source.
     """
 
@@ -273,6 +278,7 @@ class LogClocks:
     ins_rows: StructArray
     imu_gps_ns: np.ndarray[Any, np.dtype[np.int64]]
     imu_rate_b: np.ndarray[Any, np.dtype[np.float64]]
+    angles: dict[str, AngleSeries] = field(default_factory=dict)
     counts: dict[str, Counter[str]] = field(default_factory=dict)
 
 
@@ -283,6 +289,7 @@ class _ClockReader:
         self.host = HostClocks(setup.clock_plan(session.info), keep_history=True)
         self.ins: list[StructArray] = []
         self.imu: list[StructArray] = []
+        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.gimbal_sources}
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
         self._parsers = setup.parsers(("gnss", "imu"))
@@ -311,6 +318,18 @@ class _ClockReader:
             self.take_records(name, parser.close())
         self.host.update()
 
+    def angles(self) -> dict[str, AngleSeries]:
+        """Of gimbals, from the sources that told some."""
+        found: dict[str, AngleSeries] = {}
+        for source, pieces in sorted(self.gimbals.items()):
+            rows = np.concatenate(pieces) if pieces else np.empty(0, INS_DTYPE)
+            is_solution = SOLUTION_STATUS.get(self._setup.protocol(source))
+            with suppress(MountError):  # fewer than two: who needs them says so
+                found[source] = AngleSeries.of_solutions(
+                    rows if is_solution is None else rows[is_solution(rows["status"])]
+                )
+        return found
+
     def take_records(self, source: str, records: list[Record]) -> None:
         """Of a parser."""
         counts = self.counts.setdefault(source, Counter())
@@ -321,6 +340,8 @@ class _ClockReader:
                 self.host.add_message(source, record)
             elif isinstance(record, InsSolution) and source == self._setup.ins_source:
                 self.ins.append(self._setup.ins_rows(record.rows))
+            elif isinstance(record, InsSolution) and source in self.gimbals:
+                self.gimbals[source].append(record.rows)
             elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
                 self.imu.append(record.rows)
 
@@ -340,6 +361,6 @@ def read_clocks(session: Session, setup: Setup) -> LogClocks:
     clock = setup.clock_of_imu
     if len(imu) and clock is not None:
         gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
-        known = np.isfinite(sigma_ns)
+        known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock says nothing of a trajectory's
         gps_ns, rate_b = gps_ns[known], setup.imu_rates_b(imu["angular_rate_b"][known])
-    return LogClocks(FrozenClocks(reader.host), ins, gps_ns, rate_b, reader.counts)
+    return LogClocks(FrozenClocks(reader.host), ins, gps_ns, rate_b, reader.angles(), reader.counts)

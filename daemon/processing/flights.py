@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ConfigError, ExitCode, UserError
 from daemon.log.reader import Session, open_logs
 from daemon.processing import refusals
 from daemon.processing.feed import LogClocks, read_clocks
@@ -47,6 +47,7 @@ class Wish:
         copc: COPC files.
         scale: of the coordinates, in the coordinate system's units.
         overwrite: products of an earlier run are replaced.
+        write_dropped: returns that are left out are written too, flagged or in a list.
     """
 
     logs: Sequence[Path]
@@ -62,6 +63,7 @@ class Wish:
     copc: bool = False
     scale: float = 0.001
     overwrite: bool = False
+    write_dropped: bool = False
 
     def record(self) -> dict[str, Any]:
         """For the sidecar: what it was, but for what does not matter to the points."""
@@ -77,6 +79,7 @@ class Wish:
             "sigmas": self.sigmas,
             "copc": self.copc,
             "scale": self.scale,
+            "write_dropped": self.write_dropped,
             "intensity_factors": dict.fromkeys(EIGHT_BIT, INTENSITY_FACTOR),
         }
 
@@ -88,6 +91,7 @@ class Flight:
     Attributes:
         span: GPS time of its first and last return; host_span likewise in log time.
         trajectory: the body's.
+        solutions: of the device's INS that it is made of, by what became of them.
         strips: spans of log time, and the number of the first.
         lost: units that the recorder lost, by source.
         troubles: with time or trajectory, a line each.
@@ -101,6 +105,7 @@ class Flight:
     span: tuple[int, int]
     host_span: tuple[int, int]
     trajectory: Trajectory | None = None
+    solutions: dict[str, int] = field(default_factory=dict)
     strips: list[Span] = field(default_factory=list)
     first_number: int = 1
     lost: dict[str, int] = field(default_factory=dict)
@@ -171,8 +176,10 @@ def _setup(wish: Wish, session: Session) -> Setup:
             raise UserError("\n".join(lines), error.exit_code) from error
     else:
         setup = Setup.of_config(wish.config, wish.options)
-    if setup.mapping is None:
+    crs = wish.options.crs or setup.config.output.crs
+    if crs is None:
         raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
+    refusals.refuse_geocentric(crs)
     return setup
 
 
@@ -181,6 +188,10 @@ def _read(session: Session, setup: Setup) -> Flight:
     listening = Listening(session)
     clocks = read_clocks(listening, setup)
     session.growing = listening.growing
+    try:
+        setup.take_angles(clocks.angles)
+    except ConfigError as error:
+        raise UserError("\n".join(f"{log}: {line}" for line in error.lines)) from error
     index = index_log(session)
     first, last = index.spans()
     if not len(first):
@@ -195,9 +206,11 @@ def _read(session: Session, setup: Setup) -> Flight:
 
 def _choose(wish: Wish, flight: Flight) -> None:
     """The flight's trajectory; the mapping's operation for where it was."""
-    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, flight.log)
-    flight.trajectory, doubts = chosen
-    flight.troubles += doubts
+    status = flight.status(flight.host_span[1])
+    leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
+    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, leap_seconds, flight.log)
+    flight.trajectory, flight.solutions = chosen.trajectory, chosen.solutions
+    flight.troubles += chosen.doubts
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)
     flight.setup.mapping.settle(within.position_e[:: max(1, len(within) // 100)])

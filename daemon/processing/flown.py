@@ -37,39 +37,58 @@ class TrajectoryWish:
     at: str = "body"
 
 
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The body's trajectory of a session.
+
+    Attributes:
+        trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
+        doubts: about it, a line each.
+        solutions: of the device's INS, by what became of them (`georef.trajectory_buffer`); none of a file.
+    """
+
+    trajectory: Trajectory
+    doubts: list[str]
+    solutions: dict[str, int]
+
+
 def choose_trajectory(
-    wish: TrajectoryWish, setup: Setup, clocks: LogClocks, span: tuple[int, int], log: Path
-) -> tuple[Trajectory, list[str]]:
-    """The body's trajectory of a session, whose returns lie in a span of GPS time; and doubts about it, a line each.
+    wish: TrajectoryWish, setup: Setup, clocks: LogClocks, span: tuple[int, int], leap_seconds: int | None, log: Path
+) -> Chosen:
+    """For a session whose returns lie in a span of GPS time; ``leap_seconds``, as the log knows them, for files in UTC.
 
     Raises:
         UserError: there is none, it cannot be read, or it is of another time.
     """
     doubts: list[str] = []
+    solutions: dict[str, int] = {}
     try:
         if wish.file is None:
-            trajectory = _from_log(setup, clocks, log)
+            trajectory, solutions = _from_log(setup, clocks, log)
         else:
-            trajectory = _from_file(wish, wish.file, span)
+            trajectory = _from_file(wish, wish.file, span, leap_seconds)
             doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
         refuse_no_overlap(trajectory, str(wish.file or FROM_LOG), span, log)
         trajectory.require_attitude()
+        if setup.deflection_rad is not None:
+            trajectory = trajectory.with_deflection(*setup.deflection_rad)
         offset = offset_of(wish.at, setup.config)
         if offset is not None:
             trajectory = trajectory.at_body(offset)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
-    return trajectory, doubts
+    return Chosen(trajectory, doubts, solutions)
 
 
-def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int]) -> Trajectory:
+def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
     smrmsg = _smrmsg_beside(file)
     return read_trajectory(
         file.read_bytes(),
         str(file),
         span_ns=span,
         week=wish.week,
+        leap_seconds=leap_seconds,
         smrmsg=None if smrmsg is None else smrmsg.read_bytes(),
     )
 
@@ -82,18 +101,16 @@ def _smrmsg_beside(file: Path) -> Path | None:
     return next((name for name in names if name.exists()), None)
 
 
-def _from_log(setup: Setup, clocks: LogClocks, log: Path) -> Trajectory:
+def _from_log(setup: Setup, clocks: LogClocks, log: Path) -> tuple[Trajectory, dict[str, int]]:
     source = setup.ins_source
     if source is None or not len(clocks.ins_rows):
         raise UserError(f"{log}: no INS solution in the log; want --trajectory FILE", ExitCode.USAGE)
-    kind, _, name = source.partition("/")
-    protocol = (setup.config.imu if kind == "imu" else setup.config.gnss)[name].protocol
-    buffer = TrajectoryBuffer(protocol, name=FROM_LOG)
+    buffer = TrajectoryBuffer(setup.protocol(source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
     trajectory = buffer.snapshot()
     if len(trajectory) < 2:
         raise UserError(f"{log}: {source}: its INS had no solution; want --trajectory FILE")
-    return trajectory
+    return trajectory, {what: count for what, count in sorted(buffer.counts.items()) if count}
 
 
 def offset_of(at: str, config: Config) -> Vector | None:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -21,6 +22,7 @@ import numpy as np
 
 from daemon.log.chunks import LogBatch
 from daemon.log.reader import PartDamage
+from daemon.processing.dropped import Dropped
 from daemon.processing.feed import LogFeed
 from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
 from daemon.processing.setup import Setup
@@ -78,6 +80,7 @@ class Job:
         places: its chunks, and those of the margin.
         trajectory: as much as it needs; None between strips, where returns are only counted.
         path: file to be written; None: none.
+        dropped: list of the returns that get no place, which go into no file otherwise; None: they are only counted.
     """
 
     session: int
@@ -85,6 +88,7 @@ class Job:
     places: list[ChunkPlace]
     trajectory: Trajectory | None = None
     path: Path | None = None
+    dropped: Path | None = None
 
     @property
     def size(self) -> int:
@@ -105,6 +109,7 @@ class JobResult:
         edges: by scanner, of the points seen farthest from nadir among some: the angle, rad, the height of the scanner
             above the point, m, and the point's ellipsoidal height, m.
         file_bytes: of the file written.
+        withheld, listed: returns left out that are withheld points of the file, and that are rows of the list.
         failed: why it could not be done; empty: it was.
         seconds: CPU time.
     """
@@ -118,6 +123,8 @@ class JobResult:
     unread: dict[str, Counter[str]] = field(default_factory=dict)
     clipped: Clipped = field(default_factory=Clipped)
     points: int = 0
+    withheld: int = 0
+    listed: int = 0
     first_gps_ns: int | None = None
     last_gps_ns: int | None = None
     bounds: list[list[float]] = field(default_factory=list)
@@ -135,7 +142,7 @@ class PointSink(Protocol):
     def clipped(self) -> Clipped:
         """What did not fit."""
 
-    def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0) -> None:
+    def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
         """Append points."""
 
     def close(self) -> None:
@@ -158,38 +165,61 @@ def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobR
             with ExitStack() as opened:
                 stream = opened.enter_context(job.path.open("x+b"))
                 sink = _sink(plan, job, stream, opened)
-                _write(plan, job, job.trajectory, result, sink, tell)
+                _write(plan, job, job.trajectory, result, sink, opened, tell)
                 result.file_bytes = stream.tell()
         except (LasError, MappingError) as error:
             raise JobError(f"{job.path.name}: {error}") from error
         except lazrs.LazrsError as error:  # which does not say what the file system said
             raise OSError(errno.EIO, "cannot be written; is the disk full?", str(job.path)) from error
         finally:
-            if not result.points:
+            if not result.points and not result.withheld:
                 job.path.unlink(missing_ok=True)
     result.seconds = time.process_time() - began
     return result
 
 
-def _write(plan: SessionPlan, job: Job, trajectory: Trajectory, result: JobResult, sink: PointSink, tell: Tell) -> None:
+def _write(
+    plan: SessionPlan,
+    job: Job,
+    trajectory: Trajectory,
+    result: JobResult,
+    sink: PointSink,
+    opened: ExitStack,
+    tell: Tell,
+) -> None:
     setup, names = plan.setup, plan.setup.scanners
     georeferenced = setup.office_stream(plan.clocks, trajectory)
     feed = LogFeed(setup, georeferenced)
     numbers = {name: number for number, name in enumerate(names)}
 
+    def put(name: str, points: Points, *, withheld: bool = False) -> None:
+        factor = plan.intensity_factors.get(name, 1.0)
+        sink.write(points, scanner=numbers[name], intensity_factor=factor, withheld=withheld)
+
     def write(placed: list[tuple[str, Points]]) -> None:
         for name, points in placed:
-            sink.write(points, scanner=numbers[name], intensity_factor=plan.intensity_factors.get(name, 1.0))
+            put(name, points)
             _note_span(result, points)
             _note_edge(result, name, points, setup, trajectory)
 
+    dropped = None
+    if job.dropped is not None:
+        dropped = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
+        opened.callback(dropped.close)
     unread = Unread({name: feed.parser(f"scanner/{name}") for name in names})
+    was_own = False
     for batch, own in _messages(plan, job, result, tell):
+        if own is not was_own:
+            feed.flush()  # what is held is decoded, and so counted, as what it was when it came
+            unread.note(own=was_own)
+            was_own = own
         write(feed.take(batch, context=not own))
-        unread.note(own=own)
     write(feed.close())
+    unread.note(own=was_own)
     sink.close()
     result.clipped, result.unread = sink.clipped, unread.counts
+    if dropped is not None:
+        result.withheld, result.listed = dropped.withheld, dropped.rows
     for name in names:
         fates = georeferenced.fates(name)
         result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from daemon.config.config import Config
-from daemon.config.tables import GimbalConfig, ScannerConfig
+from daemon.config.tables import AtmosphereConfig, GimbalConfig, ScannerConfig
 from drivers.core.parser import Parser
 from drivers.core.registry import find_driver
 from drivers.scanner.beams import BeamTable
@@ -34,6 +34,7 @@ from georef.uncertainty import Noise, Uncertainty
 # of the makers' data sheets; airborne scanners mostly 1064
 WAVELENGTH_NM = {"velodyne": 903.0, "hesai": 905.0, "ouster": 865.0}
 USUAL_WAVELENGTH_NM = 1064.0
+INSTALLATION_TOLERANCE = 1e-6
 FAR_M = 1000.0  # along a beam, to tell its direction
 NO_ANGLES = AngleSeries(np.array([-2, -1]), np.zeros((2, 3)))  # at no time there is
 
@@ -216,3 +217,37 @@ class TerrainRanges:
         ranges_m = np.full(len(rows), np.nan)
         ranges_m[asked[known]] = self._terrain.predicted_m(rays.origin_e[known], along_e)
         return ranges_m
+
+
+def calibration_mistakes(
+    calibration: Calibration, name: str, table: ScannerConfig, air: AtmosphereConfig
+) -> Iterator[str]:
+    """Why a calibration is not this scanner's, or was estimated under other settings than those in use."""
+    if calibration.scanner != name:
+        yield f'calibration.scanner: is of scanner "{calibration.scanner}", want "{name}"'
+    for key in ("model", "serial"):
+        theirs, ours = calibration.header.get(f"scanner_{key}", ""), getattr(table, key)
+        if theirs and ours and theirs != ours:
+            yield f'calibration.scanner_{key}: of another head: "{theirs}", the configuration says "{ours}"'
+    for key, theirs, ours in (
+        ("ranges", calibration.ranges, air.ranges),
+        ("refraction", calibration.refraction, air.refraction),
+    ):
+        if theirs is not None and theirs != ours:
+            yield (
+                f'calibration.{key}: was estimated with {key} = "{theirs}", [atmosphere] says "{ours}"; '
+                "set that alike, or calibrate anew"
+            )
+    ours_factor = table.mirror_factor
+    if None not in (calibration.mirror_factor, ours_factor) and calibration.mirror_factor != ours_factor:
+        yield (
+            f"calibration.mirror_factor: was estimated with {calibration.mirror_factor:g}, "
+            f"the configuration says {ours_factor:g}"
+        )
+    if table.installation is not None:
+        apart = np.abs(calibration.installation_matrix - np.array(table.installation)).max()
+        if apart > INSTALLATION_TOLERANCE:
+            yield (
+                "calibration.installation_matrix: is not the configuration's installation; "
+                "make both the same, or leave the configuration's out"
+            )

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,15 +32,10 @@ from georef.formats.las import LasSettings
 from georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from georef.formats.trajectory_csv import csv_text
 from georef.mapping import MappingError
-from georef.strips import (
-    Segment,
-    StripError,
-    segments,
-)
+from georef.strips import Segment, StripError, segments
 
-if TYPE_CHECKING:
-    pass
-
+DROPPED = ".dropped.csv.gz"
+ENDINGS = (".laz", DROPPED)  # of a strip's files
 OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
 TRAJECTORY_MARGIN_NS = 2_000_000_000
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -62,9 +57,9 @@ def georeference(wish: Wish, tell: Tell) -> Report:
     """
     try:
         flights = read_flights(wish, tell)
-        name = flights[0].session.session_id
-        with _out_of_sight(wish, name) as (partial, into_place):
-            return _make(wish, flights, name, partial, into_place, tell)
+        names = [flight.session.session_id for flight in flights]
+        with _out_of_sight(wish, names) as (partial, into_place):
+            return _make(wish, flights, names[0], partial, into_place, tell)
     except (StripError, JobError, MappingError) as error:
         raise UserError(str(error)) from error
     except LogError as error:
@@ -76,12 +71,12 @@ def georeference(wish: Wish, tell: Tell) -> Report:
 # ---------------------------------------------------------------------- jobs
 
 
-def _jobs(flight: Flight, number: int, partial: Path, ending: str) -> list[Job]:
+def _jobs(wish: Wish, flight: Flight, number: int, partial: Path) -> list[Job]:
     tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
-    return [_job(flight, number, tile, partial, ending) for tile in tiles]
+    return [_job(wish, flight, number, tile, partial) for tile in tiles]
 
 
-def _job(flight: Flight, number: int, tile: Segment, partial: Path, ending: str) -> Job:
+def _job(wish: Wish, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
     places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
     if not tile.strip:
         return Job(number, tile, places)
@@ -89,8 +84,10 @@ def _job(flight: Flight, number: int, tile: Segment, partial: Path, ending: str)
     begin, end = flight.gps_from_host([tile.start_ns, tile.end_ns]).tolist()
     reach = MARGIN_NS + TRAJECTORY_MARGIN_NS
     trajectory = flight.trajectory.between(begin - reach, end + reach)
-    path = partial / f"{flight.session.session_id}_strip{tile.strip:02d}{ending}"
-    return Job(number, tile, places, trajectory, path)
+    name = f"{flight.session.session_id}_strip{tile.strip:02d}"
+    path = partial / (name + (".copc.laz" if wish.copc else ".laz"))
+    dropped = partial / f"{name}{DROPPED}" if wish.write_dropped else None
+    return Job(number, tile, places, trajectory, path, dropped)
 
 
 def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> SessionPlan:
@@ -133,9 +130,9 @@ def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
 
 
 @contextmanager
-def _out_of_sight(wish: Wish, name: str) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
-    """A folder for what is not finished, and what puts it in its place; it goes whatever happens."""
-    output = wish.output
+def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
+    """A folder for what is not finished, and what puts it in its place; it goes whatever happens. Names of sessions."""
+    output, name = wish.output, names[0]
     sidecar = output / f"{name}.json"
     if sidecar.exists() and not wish.overwrite:
         raise UserError(f"{sidecar}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE)
@@ -146,7 +143,7 @@ def _out_of_sight(wish: Wish, name: str) -> Iterator[tuple[Path, Callable[[list[
 
     def into_place(files: list[Path]) -> None:
         sidecar.unlink(missing_ok=True)
-        for old in output.glob(f"{name}_strip*.laz"):
+        for old in [file for one in names for file in output.glob(f"{one}_strip*") if file.name.endswith(ENDINGS)]:
             old.unlink()
         for file in files:
             file.replace(output / file.name)
@@ -167,8 +164,7 @@ def _make(
 ) -> Report:
     origin = _origin(flights)
     plans = [_plan(wish, flight, origin) for flight in flights]
-    ending = ".copc.laz" if wish.copc else ".laz"
-    jobs = [job for number, flight in enumerate(flights) for job in _jobs(flight, number, partial, ending)]
+    jobs = [job for number, flight in enumerate(flights) for job in _jobs(wish, flight, number, partial)]
     total = sum(job.size for job in jobs)
     with ThreadPoolExecutor(1) as hasher:
         paths = [part.path for flight in flights for part in flight.session.parts]
@@ -182,10 +178,10 @@ def _make(
         )
         logs = [{"name": path.name, "sha256": digest} for path, digest in zip(paths, hashes, strict=True)]
     _note_troubles(flights, results)
-    files = {job.segment.strip: job.path for job in jobs if job.path is not None}
-    done = [path for job, result in zip(jobs, results, strict=True) if (path := job.path) and _is_done(result)]
+    files = {job.segment.strip: _files(job, result) for job, result in zip(jobs, results, strict=True)}
+    done = [path for made in files.values() for path in made if path is not None]
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
-    record = run_record(flights, results, {strip: path.name for strip, path in files.items()})
+    record = run_record(flights, results, files)
     record |= {"logs": logs, "files": [path.name for path in trajectories], "options": wish.record()}
     into_place([*done, *trajectories])
     sidecar = wish.output / f"{name}.json"
@@ -193,8 +189,11 @@ def _make(
     return Report(record, sidecar)
 
 
-def _is_done(result: JobResult) -> bool:
-    return result.points > 0 and not result.failed
+def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
+    """What a job made: points, and the list of what has no place."""
+    if result.failed:
+        return None, None
+    return job.path if result.points or result.withheld else None, job.dropped if result.listed else None
 
 
 def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
@@ -220,6 +219,9 @@ def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
     """As much of it as the returns needed: CSV, and SBET with smrmsg."""
     assert flight.trajectory is not None
     used = flight.trajectory.between(*flight.span)
+    if flight.setup.deflection_rad is not None:  # to what its own attitude referred to: it may be used again
+        xi, eta = flight.setup.deflection_rad
+        used = used.with_deflection(-xi, -eta)
     name = flight.session.session_id
     contents = {
         f"{name}_trajectory.csv": csv_text(used).encode(),

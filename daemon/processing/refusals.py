@@ -7,6 +7,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from pyproj import CRS
+
 from daemon.errors import ExitCode, UserError
 from georef.points import Fate
 from georef.timescales import TimeState
@@ -52,6 +54,21 @@ def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -
                 "another antenna; georeference them one by one",
                 ExitCode.USAGE,
             )
+
+
+def refuse_geocentric(crs: str) -> None:
+    """Files of points hold eastings, northings and heights; ``crs`` is one that PROJ reads.
+
+    Raises:
+        UserError: its coordinates are not those.
+    """
+    read = CRS.from_user_input(crs)
+    if read.is_geocentric:
+        raise UserError(
+            f'output.crs = "{crs}" ({read.name}) is geocentric: files of points want a projected one, such as '
+            '"EPSG:326ZZ" for UTM zone ZZ north on WGS 84',
+            ExitCode.USAGE,
+        )
 
 
 def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:

@@ -6,7 +6,7 @@ What a configuration cannot mean is one line of a `ConfigError` before anything 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,15 @@ from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from daemon.errors import ConfigError, UserError
 from daemon.log.format import LogError, SessionInfo
 from daemon.log_parsers import stored_config
-from daemon.processing.models import TerrainRanges, make_georeferencer, make_motion, make_resolver
+from daemon.processing.models import (
+    TerrainRanges,
+    calibration_mistakes,
+    gimbal_sources,
+    make_georeferencer,
+    make_motion,
+    make_resolver,
+    refuse_logged_gimbals,
+)
 from daemon.processing.terrain import read_terrain
 from drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
 from drivers.core.registry import UnknownProtocolError, find_driver
@@ -27,6 +35,7 @@ from georef.calibration import Calibration, CalibrationError, nominal, read_cali
 from georef.coarse_terrain import CoarseTerrain
 from georef.mapping import Mapping as MappingFrame
 from georef.mapping import MappingError
+from georef.mount import AngleSeries
 from georef.records import InsSolution, NamesEdge, StructArray
 from georef.rotations import attitude_of, rot_l_from_b
 from georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
@@ -37,7 +46,6 @@ from georef.trajectory_buffer import TrajectoryBuffer
 SECOND_NS = 1_000_000_000
 ARCSEC = math.pi / 648_000
 REACH_NS = 1_000_000  # beyond its own stamp, of a return whose calibration shifts no times
-INSTALLATION_TOLERANCE = 1e-6
 OFFICE = StreamSettings(settle_s=2.0)  # so that a latched edge on either side of a return is known
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig
 
@@ -72,6 +80,7 @@ class Setup:
         config: of the log, or another one.
         calibrations: by scanner, those in use.
         mapping: frame of the points; None: they are in e.
+        gimbal_sources: who tells the angles of gimbals, `take_angles`; they do not tell where the aircraft is.
         ins_source: whose INS gives the growing trajectory: the first IMU whose protocol tells one, else the first
             receiver; None: nobody's.
     """
@@ -85,14 +94,13 @@ class Setup:
         self.config = config
         self.options = options or Options()
         self._attachments = dict(attachments)
-        self.ins_source = self._ins_source()
         self.scanners = self._chosen()
+        self.gimbal_sources = {source for name in self.scanners for _, source in gimbal_sources(config, name)}
+        self.ins_source = self._ins_source()
         self.calibrations = {name: self._calibration(name) for name in self.scanners}
         self.mapping = self._mapping()
         self.terrain = self.options.terrain or self._terrain()
-        self._parsers = self.parsers(("scanner",))  # their tables of beams; and their settings' mistakes are told now
-        self._georeferencers = {name: self._georeferencer(name) for name in self.scanners}
-        del self._parsers
+        self._georeferencers = self._made(None)
 
     @classmethod
     def of_log(cls, attachments: Mapping[str, bytes], options: Options | None = None) -> Setup:
@@ -119,26 +127,34 @@ class Setup:
     def _ins_source(self) -> str | None:
         for wanted in ("imu", "gnss"):
             for kind, name, table in self.config.device_tables():
-                if kind == wanted and InsSolution in self._driver(kind, name, table).yields:
-                    return f"{kind}/{name}"
+                source = f"{kind}/{name}"
+                if kind != wanted or source in self.gimbal_sources:
+                    continue
+                if InsSolution in self._driver(kind, name, table).yields:
+                    return source
         return None
 
     @property
     def ins_protocol(self) -> str:
-        """Protocol of `ins_source`; empty where there is none."""
-        kind, _, name = (self.ins_source or "").partition("/")
+        """Of `ins_source`; empty where there is none."""
+        return self.protocol(self.ins_source)
+
+    def protocol(self, source: str | None) -> str:
+        """Of ``gnss/name`` or ``imu/name``; empty of None."""
+        kind, _, name = (source or "").partition("/")
         tables: Mapping[str, GnssConfig | ImuConfig] = self.config.imu if kind == "imu" else self.config.gnss
         return tables[name].protocol if name else ""
 
     @property
     def imu_source(self) -> str | None:
-        """The first IMU."""
-        return next((f"imu/{name}" for name in self.config.imu), None)
+        """The first IMU of the aircraft."""
+        return next((source for name in self.config.imu if (source := f"imu/{name}") not in self.gimbal_sources), None)
 
     @property
     def clock_of_imu(self) -> str | None:
-        """The source that shows the host's time beside the first IMU."""
-        return next((self._clock_of(imu.pps) for imu in self.config.imu.values()), None)
+        """The source that shows the host's time beside that IMU."""
+        source = self.imu_source
+        return None if source is None else self._clock_of(self.config.imu[source.removeprefix("imu/")].pps)
 
     def edge_of(self, source: str) -> str | None:
         """Polarity of the edges of ``pps/name``; None: no such source."""
@@ -164,7 +180,8 @@ class Setup:
             source = f"{kind}/{name}"
             driver = self._driver(kind, name, table)
             make = driver.make_parser
-            if kind == "gnss" and source != self.ins_source and driver.make_time_parser is not None:
+            wanted = source == self.ins_source or source in self.gimbal_sources
+            if kind == "gnss" and not wanted and driver.make_time_parser is not None:
                 make = driver.make_time_parser
             try:
                 made[source] = make(DeviceSettings(source, plain_table(table), self._files(name, table), compiled=True))
@@ -238,8 +255,18 @@ class Setup:
     # ------------------------------------------------------------------ streams
 
     def live_stream(self, info: SessionInfo, settings: StreamSettings | None = None) -> Stream:
-        """A stream whose clocks and trajectory grow with the log: the same live and in replay."""
-        path = GrowingPath(TrajectoryBuffer(self.ins_protocol, name=self.ins_source or ""), self.deflection_rad)
+        """A stream whose clocks and trajectory grow with the log: the same live and in replay.
+
+        Raises:
+            ConfigError: a gimbal's angles are logged.
+        """
+        try:
+            refuse_logged_gimbals(self.config, self.scanners)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        path = GrowingPath(
+            TrajectoryBuffer(self.protocol(self.ins_source), name=self.ins_source or ""), self.deflection_rad
+        )
         return Stream(self._chains(), StreamClocks.growing(self.clock_plan(info)), path, settings)
 
     def office_stream(self, clocks: FrozenClocks, trajectory: Trajectory, settings: StreamSettings = OFFICE) -> Stream:
@@ -296,16 +323,30 @@ class Setup:
         """A scanner's `Georeferencer`."""
         return self._georeferencers[name]
 
-    def _georeferencer(self, name: str) -> Any:
+    def take_angles(self, angles: Mapping[str, AngleSeries]) -> None:
+        """What the sources of gimbals' angles told; before, returns of such a gimbal have no place.
+
+        Raises:
+            ConfigError: one of them told none.
+        """
+        if self.gimbal_sources:
+            self._georeferencers = self._made(angles)
+
+    def _made(self, angles: Mapping[str, AngleSeries] | None) -> dict[str, Any]:
+        parsers = self.parsers(("scanner",))  # their tables of beams; and their settings' mistakes are told now
+        return {name: self._georeferencer(name, parsers[f"scanner/{name}"], angles) for name in self.scanners}
+
+    def _georeferencer(self, name: str, parser: Parser, angles: Mapping[str, AngleSeries] | None) -> Any:
         try:
             return make_georeferencer(
                 self.config,
                 name,
                 self.calibrations[name],
-                self._parsers[f"scanner/{name}"],
+                parser,
                 self._files(name, self.config.scanner[name]).get("geometry"),
                 self.mapping,
                 uncertainty=self.options.uncertainty,
+                angles=angles,
             )
         except ValueError as error:
             raise ConfigError(f"scanner.{name}: {error}") from error
@@ -343,7 +384,9 @@ class Setup:
             raise ConfigError(str(error).splitlines()) from error
         if table.installation is not None and "installation_matrix" not in calibration.header:
             calibration = replace(calibration, installation_matrix=installation)
-        mistakes = [f"{file}: {line}" for line in self._mistakes(calibration, name, table)]
+        mistakes = [
+            f"{file}: {line}" for line in calibration_mistakes(calibration, name, table, self.config.atmosphere)
+        ]
         if mistakes:
             raise ConfigError(mistakes)
         return calibration
@@ -355,35 +398,3 @@ class Setup:
         if stored is None:
             raise ConfigError(f"scanner.{name}.calibration: {table.calibration} is not in the log; give it by hand")
         return stored.decode("utf-8", "replace"), table.calibration
-
-    def _mistakes(self, calibration: Calibration, name: str, table: ScannerConfig) -> Iterator[str]:
-        """Why a calibration is not this scanner's, or was estimated under other settings than those in use."""
-        air = self.config.atmosphere
-        if calibration.scanner != name:
-            yield f'calibration.scanner: is of scanner "{calibration.scanner}", want "{name}"'
-        for key in ("model", "serial"):
-            theirs, ours = calibration.header.get(f"scanner_{key}", ""), getattr(table, key)
-            if theirs and ours and theirs != ours:
-                yield f'calibration.scanner_{key}: of another head: "{theirs}", the configuration says "{ours}"'
-        for key, theirs, ours in (
-            ("ranges", calibration.ranges, air.ranges),
-            ("refraction", calibration.refraction, air.refraction),
-        ):
-            if theirs is not None and theirs != ours:
-                yield (
-                    f'calibration.{key}: was estimated with {key} = "{theirs}", [atmosphere] says "{ours}"; '
-                    "set that alike, or calibrate anew"
-                )
-        ours_factor = table.mirror_factor
-        if None not in (calibration.mirror_factor, ours_factor) and calibration.mirror_factor != ours_factor:
-            yield (
-                f"calibration.mirror_factor: was estimated with {calibration.mirror_factor:g}, "
-                f"the configuration says {ours_factor:g}"
-            )
-        if table.installation is not None:
-            apart = np.abs(calibration.installation_matrix - np.array(table.installation)).max()
-            if apart > INSTALLATION_TOLERANCE:
-                yield (
-                    "calibration.installation_matrix: is not the configuration's installation; "
-                    "make both the same, or leave the configuration's out"
-                )

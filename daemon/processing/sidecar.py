@@ -97,12 +97,15 @@ def counts_entry(fates: Counter[str]) -> dict[str, Any]:
     return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
 
 
-def strip_entry(result: JobResult, file: str) -> dict[str, Any]:
-    """A strip: its file, its times, what is in it."""
+def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:
+    """A strip: its files, its times, what is in it."""
     entry: dict[str, Any] = {
         "number": result.strip,
-        "file": file if result.points and not result.failed else None,
+        "file": None if file is None else file.name,
         "points": result.points,
+        "withheld": result.withheld,
+        "dropped_file": None if dropped is None else dropped.name,
+        "dropped_rows": result.listed,
         "first_gps_ns": result.first_gps_ns,
         "last_gps_ns": result.last_gps_ns,
         "bounds": result.bounds,
@@ -117,17 +120,19 @@ def strip_entry(result: JobResult, file: str) -> dict[str, Any]:
     return entry | ({"failed": result.failed} if result.failed else {})
 
 
-def run_record(flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, str]) -> dict[str, Any]:
+def run_record(
+    flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, tuple[Path | None, Path | None]]
+) -> dict[str, Any]:
     """What the sidecar says of the run, but for the user's wishes.
 
     Args:
         flights: of the run.
         results: of all segments.
-        files: names by strip.
+        files: by strip, of its points and of what has no place.
     """
     warnings = [line for flight in flights for line in _warnings(flight, _of(results, flight, flights))]
     holes = [line for flight in flights for line in _holes(flight, _of(results, flight, flights))]
-    strips = [strip_entry(result, files[result.strip]) for result in results if result.strip]
+    strips = [strip_entry(result, *files[result.strip]) for result in results if result.strip]
     mapping = flights[0].setup.mapping
     assert mapping is not None
     return {
@@ -162,6 +167,7 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
         "trajectory": {
             "name": trajectory.name,
             "epochs": len(trajectory),
+            "solutions": flight.solutions,
             "first_gps_ns": first_ns,
             "last_gps_ns": last_ns,
             "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
@@ -238,7 +244,8 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
             lines.append(f"strip {result.strip}: {result.failed}" if result.strip else f"a turn: {result.failed}")
         elif result.strip and not result.points:
             why = reasons_text(result.fates.values())
-            lines.append(f"strip {result.strip}: no return of it could be georeferenced ({why}); it has no file")
+            file = "" if result.withheld else "; it has no file"
+            lines.append(f"strip {result.strip}: no return of it could be georeferenced ({why}){file}")
         elif result.strip:
             lines += [
                 f"strip {result.strip}: {count:,} returns of {name} {UNCOVERED[reason]}"

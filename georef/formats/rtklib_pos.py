@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on
+from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on, weeks_ns
 from georef.formats.trajectory_columns import TrajectoryColumns, unsaid
 from georef.records import Int64Array
-from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS
+from georef.timescales.gps_time import DAY_NS, SECOND_NS
 from georef.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +42,8 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
     rows = [line.replace(separator, " ").split() if separator else line.split() for line in body.splitlines()]
     first_line = text[: found.end()].count("\n") + 1
     numbered = [(number, row) for number, row in enumerate(rows, first_line) if row and not row[0].startswith("%")]
+    if not numbered:
+        raise TrajectoryError(f"{name}: has no positions")
     table = _columns(numbered, titles, name)
     days_or_weeks, clocks = [row[0] for _, row in numbered], [row[1] for _, row in numbered]
     time_ns = _gps_ns(system, days_or_weeks, clocks, name, leap_seconds)
@@ -52,7 +54,7 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
         *(nothing, nothing, nothing),
         *(position_sigma_l, unsaid(len(time_ns))),
         "line",
-        numbered[0][0] if numbered else 1,
+        numbered[0][0],
     )
 
 
@@ -87,13 +89,10 @@ def degrees_of(dms: FloatArray) -> FloatArray:
 def _gps_ns(system: str, dates: list[str], clocks: list[str], name: str, leap_seconds: int | None) -> Int64Array:
     if system == "JST":
         raise TrajectoryError(f"{name}: its time is Japan Standard Time; export it in GPST")
-    if not dates:
-        return np.empty(0, np.int64)
     if "/" in dates[0]:
         gps_ns = gps_ns_of_day(gps_days(dates, "YMD", name), clock_ns(clocks, name))
     else:
-        weeks = np.array(dates, dtype=np.float64).astype(np.int64)
-        gps_ns = weeks * WEEK_NS + np.rint(np.array(clocks, dtype=np.float64) * SECOND_NS).astype(np.int64)
+        gps_ns = weeks_ns(dates, clocks, name)
     if system == "UTC":
         gps_ns = gps_ns + leap_seconds_on(int(gps_ns[0]) // DAY_NS, leap_seconds, name) * SECOND_NS
     return gps_ns

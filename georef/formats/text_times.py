@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,11 +15,15 @@ from georef.timescales.gps_time import (
     GPS_EPOCH,
     LEAP_TABLE_VALID_UNTIL,
     SECOND_NS,
+    WEEK_NS,
     table_leap_seconds,
 )
 from georef.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
+
+CLOCK = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)")
+WEEK, SECONDS = re.compile(r"\d{1,5}"), re.compile(r"\d{1,7}(\.\d*)?")
 
 
 def gps_days(texts: Sequence[str], order: str, name: str) -> Int64Array:
@@ -30,12 +35,19 @@ def gps_days(texts: Sequence[str], order: str, name: str) -> Int64Array:
 
 def clock_ns(texts: Sequence[str], name: str) -> Int64Array:
     """(n,) nanoseconds of the day of times like ``19:34:18.499``."""
-    try:
-        parts = [text.split(":") for text in texts]
-        return np.array([(int(h) * 60 + int(m)) * 60 * SECOND_NS + _ns(s) for h, m, s in parts], dtype=np.int64)
-    except ValueError:
-        bad = next((text for text in texts if text.count(":") != 2), texts[0])
-        raise TrajectoryError(f"{name}: {bad!r} is no time of day; hh:mm:ss is expected") from None
+    return np.array([_of_day_ns(text, name) for text in texts], dtype=np.int64)
+
+
+def weeks_ns(weeks: Sequence[str], seconds: Sequence[str], name: str) -> Int64Array:
+    """(n,) GPS time of weeks and seconds of the week."""
+    for week, second in zip(weeks, seconds, strict=True):
+        if not (WEEK.fullmatch(week) and SECONDS.fullmatch(second)):
+            raise TrajectoryError(
+                f"{name}: '{week} {second}' is no date and clock time, nor a GPS week and its seconds"
+            )
+    of_week = np.rint(np.array(seconds, dtype=np.float64) * SECOND_NS).astype(np.int64)
+    gps_ns: Int64Array = np.array(weeks, dtype=np.int64) * WEEK_NS + of_week
+    return gps_ns
 
 
 def gps_ns_of_day(days: Int64Array, of_day_ns: Int64Array) -> Int64Array:
@@ -68,5 +80,8 @@ def _date(text: str, order: str, name: str) -> dt.date:
         raise TrajectoryError(f"{name}: {text!r} is no date in the order {order}") from None
 
 
-def _ns(seconds: str) -> int:
-    return round(float(seconds) * SECOND_NS)
+def _of_day_ns(text: str, name: str) -> int:
+    said = CLOCK.fullmatch(text)
+    if said is None:
+        raise TrajectoryError(f"{name}: {text!r} is no time of day; hh:mm:ss is expected")
+    return (int(said[1]) * 60 + int(said[2])) * 60 * SECOND_NS + round(float(said[3]) * SECOND_NS)

@@ -66,7 +66,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
     """The trajectory of a file's rows; TrajectoryError where they cannot be meant."""
     if len(columns.time_ns) < 2:
         raise TrajectoryError(f"{name}: has {len(columns.time_ns)} epochs; a trajectory needs two")
-    for check in (_check_finite, _check_position, _check_attitude, _check_time, _check_course):
+    for check in (_check_finite, _check_sigmas, _check_position, _check_attitude, _check_time, _check_course):
         check(columns, name)
     return Trajectory.from_geodetic(
         columns.time_ns,
@@ -142,6 +142,13 @@ def _check_finite(columns: TrajectoryColumns, name: str) -> None:
     missing = np.asarray(~np.isfinite(attitude).all(axis=1))
     if missing.any() and not np.isnan(attitude).all():
         raise TrajectoryError(f"{name}: no number for roll, pitch or heading at {columns.at(missing)}")
+
+
+def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
+    for what, sigma in (("position", columns.position_sigma_l), ("attitude", columns.attitude_sigma_rad)):
+        bad = np.logical_or.reduce(sigma < 0.0, axis=1)  # nan: unsaid
+        if bad.any():
+            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is negative")
 
 
 def _check_position(columns: TrajectoryColumns, name: str) -> None:
@@ -233,8 +240,8 @@ def _check_heading_unit(columns: TrajectoryColumns, name: str, pieces: Int64Arra
 
 def course_pieces(time_ns: Int64Array) -> Int64Array:
     """(k, 2) rows at the ends of pieces of some second, none over a gap."""
-    wanted = np.arange(time_ns[0], time_ns[-1], COURSE_PIECE_NS)
-    rows = np.unique(np.r_[np.searchsorted(time_ns, wanted), len(time_ns) - 1])
+    begun = np.unique((time_ns - time_ns[0]) // COURSE_PIECE_NS, return_index=True)[1]
+    rows = np.unique(np.r_[begun, len(time_ns) - 1])
     pieces = np.stack([rows[:-1], rows[1:]], axis=1)
     short: Int64Array = pieces[np.diff(time_ns[rows]) <= LONGEST_PIECE_NS]
     return short

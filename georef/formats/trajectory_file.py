@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
 from georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, read_smrmsg
 from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
 from georef.formats.trajectory_csv import is_csv, read_csv
 from georef.formats.waypoint import is_waypoint, read_waypoint
+from georef.timescales.gps_time import SECOND_NS
 from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
 
 LOOKED_AT = 65_536  # bytes that tell text from numbers
@@ -53,7 +56,18 @@ def read_trajectory(
     trajectory = trajectory_of(columns, name, max_gap_ns)
     if needs_attitude:
         trajectory.require_attitude()
+        _refuse_sparse(trajectory)
     return trajectory
+
+
+def _refuse_sparse(trajectory: Trajectory) -> None:
+    """A trajectory that is all gaps; TrajectoryError."""
+    step_ns = int(np.median(np.diff(trajectory.time_ns)))
+    if step_ns > trajectory.max_gap_ns:
+        raise TrajectoryError(
+            f"{trajectory.name}: its epochs are {step_ns / SECOND_NS:.3f} s apart, and what lies more than "
+            f"{trajectory.max_gap_ns / SECOND_NS:.3f} s apart is a gap: export it at 10 Hz or more"
+        )
 
 
 def _text_of(data: bytes) -> str | None:

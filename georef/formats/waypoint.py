@@ -3,8 +3,9 @@
     Week     GPSTime       Latitude      Longitude      H-Ell         Roll        Pitch      Heading
                (sec)     (+/-D M S)     (+/-D M S)        (m)        (deg)        (deg)        (deg)
 
-Attitude is that of a body whose y axis points forward: roll, pitch and heading mean the same as here. Time is GPS time
-by week and second of the week, or by date; UTC needs the offset which the header may say.
+Attitude is that of a body whose y axis points forward: roll, pitch and heading mean the same as here. Its yaw counts
+the other way round (Inertial Explorer User Guide 8.50, 3.2.3) and is not taken for a heading. Time is GPS time by week
+and second of the week, or by date; UTC needs the offset which the header may say.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ NAMES = {
     **{f"v{name}": f"v_{name}" for name in ("north", "east", "up")},
     **dict.fromkeys(("roll",), "roll"),
     **dict.fromkeys(("pitch",), "pitch"),
-    **dict.fromkeys(("heading", "azimuth", "yaw"), "heading"),
+    **dict.fromkeys(("heading", "azimuth"), "heading"),
     **dict.fromkeys(("sdnorth",), "sigma_n"),
     **dict.fromkeys(("sdeast",), "sigma_e"),
     **dict.fromkeys(("sdheight", "sdup", "sdhell"), "sigma_d"),
@@ -52,7 +53,7 @@ TOKEN = re.compile(r"\([^)]*\)|\S+")
 UTC_OFFSET = re.compile(r"^\s*UTC Offset:\s*-?(\d+)(?:\.0*)?\s*s?\s*$", re.MULTILINE | re.IGNORECASE)
 SCALING = re.compile(r"^\s*(Position|Attitude):\s*(\d+(?:\.\d+)?)\s*$", re.MULTILINE)
 DATE_ORDERS = {"(MDY)": "MDY", "(YMD)": "YMD", "(DMY)": "DMY"}
-RADIANS = {"(deg)": np.pi / 180, "(rad)": 1.0}
+RADIANS, METRES, METRES_PER_SECOND = {"(deg)": np.pi / 180, "(rad)": 1.0}, {"(m)": 1.0}, {"(m/s)": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +100,21 @@ class Sheet:
             raise TrajectoryError(f"{self.name}: {error}, counted from line {self.first_line}") from None
         return table[:, 0] if column.words == 1 else table
 
+    def quantity(self, what: str, units: dict[str, float]) -> FloatArray:
+        """(n,) of a column in SI units, of those that are taken; one that stands below no unit is in the first."""
+        column = self.columns.get(what)
+        unit = column.unit.lower() if column is not None and column.unit else next(iter(units))
+        if unit not in units:
+            title = what.replace("_", " ")
+            raise TrajectoryError(f"{self.name}: its {title} is in {unit}; export it in {' or '.join(units)}")
+        return self.numbers(what) * units[unit]
+
     def angle_rad(self, what: str) -> FloatArray:
         """(n,) of a column in degrees, in degrees, minutes and seconds, or in radians."""
         column = self.columns.get(what)
         if column is not None and column.words == 3:
             return np.radians(degrees_of(self.numbers(what)))
-        factor = RADIANS.get(column.unit.lower(), RADIANS["(deg)"]) if column is not None else 1.0
-        return self.numbers(what) * factor
+        return self.quantity(what, RADIANS)
 
 
 def is_waypoint(text: str) -> bool:
@@ -137,12 +146,12 @@ def read_waypoint(
         raise TrajectoryError(f"{name}: has no column {absent[0].title()}; export roll, pitch and heading")
     scale = {what.lower(): float(factor) for what, factor in SCALING.findall(sheet.header)}
     up = np.array([1.0, 1.0, -1.0])
-    sigmas = [sheet.numbers(f"sigma_{axis}") / scale.get("position", 1.0) for axis in "ned"]
+    sigmas = [sheet.quantity(f"sigma_{axis}", METRES) / scale.get("position", 1.0) for axis in "ned"]
     angle_sigmas = [sheet.angle_rad(f"sigma_{angle}") / scale.get("attitude", 1.0) for angle in angles]
     return TrajectoryColumns(
         _gps_ns(sheet, span_ns, week, leap_seconds),
-        *(sheet.angle_rad("lat"), sheet.angle_rad("lon"), sheet.numbers("height")),
-        np.stack([sheet.numbers(f"v_{axis}") for axis in ("north", "east", "up")], axis=1) * up,
+        *(sheet.angle_rad("lat"), sheet.angle_rad("lon"), sheet.quantity("height", METRES)),
+        np.stack([sheet.quantity(f"v_{axis}", METRES_PER_SECOND) for axis in ("north", "east", "up")], axis=1) * up,
         *(sheet.angle_rad("roll"), sheet.angle_rad("pitch"), sheet.angle_rad("heading")),
         *(np.stack(sigmas, axis=1), np.stack(angle_sigmas, axis=1)),
         "line",
@@ -187,13 +196,7 @@ def _sheet(text: str, name: str) -> Sheet:
 def _layout(titles: str, units: str) -> tuple[dict[str, Column], int]:
     """Columns, and the number of words in a line. A unit belongs to the name above it."""
     names, below = list(TOKEN.finditer(titles)), list(TOKEN.finditer(units))
-    unit_of = {}
-    if len(names) == len(below):
-        unit_of = {i: mark[0] for i, mark in enumerate(below)}
-    else:
-        for mark in below:
-            distance = [abs(title.start() + title.end() - mark.start() - mark.end()) for title in names]
-            unit_of[int(np.argmin(distance))] = mark[0]
+    unit_of = _unit_of(names, below[: len(names)])
     columns: dict[str, Column] = {}
     first = 0
     for i, title in enumerate(names):
@@ -202,6 +205,24 @@ def _layout(titles: str, units: str) -> tuple[dict[str, Column], int]:
         columns.setdefault(NAMES.get(_plain(title[0]), title[0]), Column(unit, first, words))
         first += words
     return columns, first
+
+
+def _unit_of(names: list[re.Match[str]], units: list[re.Match[str]]) -> dict[int, str]:
+    """The unit of names by their number: in their order, each below one name, all together as near as can be."""
+    cost = np.full((len(units) + 1, len(names) + 1), np.inf)  # of so many units below so many names
+    cost[0] = 0.0
+    for j, unit in enumerate(units):
+        for i in range(j, len(names)):
+            apart = abs(sum(names[i].span()) - sum(unit.span()))
+            cost[j + 1, i + 1] = min(cost[j + 1, i], cost[j, i] + apart)
+    found: dict[int, str] = {}
+    i = len(names)
+    for j in reversed(range(len(units))):
+        while cost[j + 1, i - 1] == cost[j + 1, i]:
+            i -= 1
+        i -= 1
+        found[i] = units[j][0]
+    return found
 
 
 # --- time ---

@@ -18,6 +18,7 @@ from georef.compiled import kernel
 from georef.kernels.types import Eight, Three, Two
 
 LINE, NUTATING, RISLEY, SPINNING = 0, 1, 2, 3
+ONE, BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER = 0, 1, 2, 3  # how a return chooses its row
 COLUMNS = 8
 FIXED_ANGLE, RANGE = 4, 7
 _EIGHTH = 0.25 * math.pi

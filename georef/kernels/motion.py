@@ -1,9 +1,13 @@
-"""How fast an encoder turns: local polynomials by least squares, piece by piece of the time."""
+"""How fast an encoder turns: local polynomials by least squares, piece by piece of the time.
+
+Pieces that follow each other are taken side by side, a column each of small tables, so that they are computed several
+at once. What comes of a piece depends on its own window alone, bit by bit.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +16,7 @@ from georef.compiled import kept, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Tile: TypeAlias = tuple[FloatArray, FloatArray]
 
 PIECE_NS = 50_000  # pieces begin at whole multiples of it, whatever the batches
 TIERS = (3, 6, 12, 24)  # pieces to either side of a window: 0.175 to 1.225 ms
@@ -19,10 +24,14 @@ REACH = TIERS[-1]
 JUMP_RAD = 1.0
 ENOUGH, FOR_QUARTIC, FOR_SQUARE = 24, 10, 6  # pulses in a window
 SPAN_NS = 260_000  # between its first and last, for anything but a line
-ORDER = 5
+ORDER, LINE = 5, 2  # coefficients of the longest polynomial, and of a line
+LANES, TILE = 16, 64  # pieces side by side; pulses of each that are taken at once
+SUMS, RIGHT = 14, 9  # rows of sums: of x^0 to x^8, then of y to x^4 y
 
 # Columns of `pieces`: first pulse, train, place in time
 FIRST, TRAIN, PLACE = range(3)
+# Columns of windows: pulses from and to, the middle of the piece in ns
+FROM, TO, MIDDLE = range(3)
 
 
 @kept
@@ -46,25 +55,26 @@ def cut(
     Returns:
         Numbers of pulses and of pieces.
     """
-    n, m = 0, 0
-    before = rows[0]
+    n, m, train = 0, 0, 0
     begins_ns, ends_ns = 0, 0
+    last_ns, last_rad, last_id, last_channel = time_ns[0], rows[0].encoder_rad, rows[0].pulse_id, rows[0].channel
     for i in range(len(rows)):
         row, now_ns = rows[i], time_ns[i]
+        encoder_rad, channel = row.encoder_rad, row.channel
         broken = n == 0
         if n:
-            if now_ns == pulse_ns[n - 1] and row.pulse_id == before.pulse_id:
+            if now_ns == last_ns and row.pulse_id == last_id:
                 continue
-            facet = facets and row.channel != before.channel
-            broken = facet or abs(row.encoder_rad - angle[n - 1]) > JUMP_RAD or now_ns < pulse_ns[n - 1]
+            facet = facets and channel != last_channel
+            broken = facet or abs(encoder_rad - last_rad) > JUMP_RAD or now_ns < last_ns
         if broken or now_ns < begins_ns or now_ns >= ends_ns:
             place = now_ns // PIECE_NS
             begins_ns, ends_ns = place * PIECE_NS, (place + 1) * PIECE_NS
-            pieces[m, FIRST], pieces[m, PLACE] = n, place
-            pieces[m, TRAIN] = 0 if m == 0 else pieces[m - 1, TRAIN] + (1 if broken else 0)
+            train += 1 if broken and m else 0
+            pieces[m, FIRST], pieces[m, TRAIN], pieces[m, PLACE] = n, train, place
             m += 1
-        pulses[n], pulse_ns[n], angle[n] = i, now_ns, row.encoder_rad
-        before = row
+        pulses[n], pulse_ns[n], angle[n] = i, now_ns, encoder_rad
+        last_ns, last_rad, last_id, last_channel = now_ns, encoder_rad, row.pulse_id, channel
         n += 1
     return n, m
 
@@ -109,40 +119,81 @@ def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
 
 
 @kernel
-def add_up(
-    pulse_ns: IntArray, angle: FloatArray, first: int, last: int, middle_ns: int, unit_ns: float, work: FloatArray
-) -> None:
-    """Sums of x^k into row 1 of ``work`` and of x^k y into row 0; written out, which makes it three times as fast."""
-    origin, share = angle[first], 1.0 / unit_ns
-    s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = r0 = r1 = r2 = r3 = r4 = 0.0
-    for i in range(first, last):
-        x, y = (pulse_ns[i] - middle_ns) * share, angle[i] - origin
-        x2 = x * x
-        x3, x4 = x2 * x, x2 * x2
-        s1, s2, s3, s4 = s1 + x, s2 + x2, s3 + x3, s4 + x4
-        s5, s6, s7, s8 = s5 + x4 * x, s6 + x4 * x2, s7 + x4 * x3, s8 + x4 * x4
-        r0, r1, r2, r3, r4 = r0 + y, r1 + x * y, r2 + x2 * y, r3 + x3 * y, r4 + x4 * y
-    work[0, 0], work[0, 1], work[0, 2], work[0, 3], work[0, 4] = r0, r1, r2, r3, r4
-    work[1, 0], work[1, 1], work[1, 2], work[1, 3], work[1, 4] = float(last - first), s1, s2, s3, s4
-    work[1, 5], work[1, 6], work[1, 7], work[1, 8] = s5, s6, s7, s8
+def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatArray, begin: int, tile: Tile) -> int:
+    """Times and readings from pulse ``begin`` of each window on into the tile, a column each, zeros behind its end.
+
+    Returns:
+        How many rows of the tile are filled: an even number.
+    """
+    x_of, y_of = tile
+    rows = 0
+    for lane in range(LANES):
+        rows = max(rows, min(TILE, windows[lane, TO] - windows[lane, FROM] - begin))
+    rows += rows & 1
+    for lane in range(LANES):
+        first, middle_ns, share = windows[lane, FROM], windows[lane, MIDDLE], scale[lane]
+        count = min(rows, max(windows[lane, TO] - first - begin, 0))
+        for i in range(count):
+            x_of[i, lane] = (pulse_ns[first + begin + i] - middle_ns) * share
+            y_of[i, lane] = angle[first + begin + i] - angle[first]
+        for i in range(count, rows):
+            x_of[i, lane], y_of[i, lane] = 0.0, 0.0
+    return rows
 
 
 @kernel
-def fit(
+def add_up(tile: Tile, rows: int, sums: FloatArray) -> None:
+    """Sums of x^k, k from 1 to 8, and of x^k y, k from 0 to 4; two rows at a time, one after the other."""
+    x_of, y_of = tile
+    for i in range(0, rows, 2):
+        for lane in range(LANES):
+            x, y, u, v = x_of[i, lane], y_of[i, lane], x_of[i + 1, lane], y_of[i + 1, lane]
+            x2, u2 = x * x, u * u
+            x3, x4, u3, u4 = x2 * x, x2 * x2, u2 * u, u2 * u2
+            sums[1, lane] = sums[1, lane] + x + u
+            sums[2, lane] = sums[2, lane] + x2 + u2
+            sums[3, lane] = sums[3, lane] + x3 + u3
+            sums[4, lane] = sums[4, lane] + x4 + u4
+            sums[5, lane] = sums[5, lane] + x4 * x + u4 * u
+            sums[6, lane] = sums[6, lane] + x4 * x2 + u4 * u2
+            sums[7, lane] = sums[7, lane] + x4 * x3 + u4 * u3
+            sums[8, lane] = sums[8, lane] + x4 * x4 + u4 * u4
+            sums[RIGHT, lane] = sums[RIGHT, lane] + y + v
+            sums[RIGHT + 1, lane] = sums[RIGHT + 1, lane] + x * y + u * v
+            sums[RIGHT + 2, lane] = sums[RIGHT + 2, lane] + x2 * y + u2 * v
+            sums[RIGHT + 3, lane] = sums[RIGHT + 3, lane] + x3 * y + u3 * v
+            sums[RIGHT + 4, lane] = sums[RIGHT + 4, lane] + x4 * y + u4 * v
+
+
+@kernel
+def sum_up(
     pulse_ns: IntArray,
     angle: FloatArray,
-    window: tuple[int, int],
-    middle_ns: int,
-    unit_ns: float,
-    work: FloatArray,
-    size: int,
-) -> bool:
-    """Coefficients of the polynomial through a window's pulses, in (t − middle) / unit, into row 0 of ``work``."""
-    add_up(pulse_ns, angle, window[0], window[1], middle_ns, unit_ns, work)
+    windows: IntArray,
+    scale: FloatArray,
+    tile: Tile,
+    sums: FloatArray,
+) -> None:
+    """Sums over the windows' pulses, a column each, in (t − middle) · scale and from the first reading on."""
+    longest = 0
+    for lane in range(LANES):
+        count = windows[lane, TO] - windows[lane, FROM]
+        longest = max(longest, count)
+        sums[:, lane] = 0.0
+        sums[0, lane] = float(count)
+    for begin in range(0, longest, TILE):
+        add_up(tile, take(pulse_ns, angle, windows, scale, begin, tile), sums)
+
+
+@kernel
+def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
+    """Coefficients of the polynomial with these sums, in its window's unit, into row 0 of ``work``, zeros behind."""
+    work[0] = 0.0
     for j in range(size):
-        for k in range(size):
-            work[2 + j, k] = work[1, j + k]
-    return solve(work[2:], work[0], size)
+        work[0, j] = sums[RIGHT + j, lane]
+        for k in range(j + 1):
+            work[1 + j, k] = sums[j + k, lane]
+    return solve(work[1:], work[0], ORDER) if size == ORDER else solve(work[1:], work[0], size)
 
 
 @kernel
@@ -158,8 +209,35 @@ def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tu
     if count < 2:
         return first, last, reach, 0
     if steady or not wide or count < FOR_SQUARE:
-        return first, last, reach, 2
+        return first, last, reach, LINE
     return first, last, reach, ORDER if count >= FOR_QUARTIC else 3
+
+
+@kernel
+def pulses_of(pieces: IntArray, piece: int, n: int) -> tuple[int, int]:
+    """Pulses from, to of a piece."""
+    return pieces[piece, FIRST], pieces[piece + 1, FIRST] if piece + 1 < len(pieces) else n
+
+
+@kernel
+def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: float, slope: Any, bend: Any) -> None:
+    """Rates and accelerations at times by the polynomial in row 0 of ``work``; 0 where nothing tells."""
+    c1, c2, c3, c4 = work[0, 1], 2.0 * work[0, 2], 3.0 * work[0, 3], 4.0 * work[0, 4]
+    per_s, per_s2 = 1e9 / unit_ns, 1e18 / (unit_ns * unit_ns)
+    for i in range(len(pulse_ns)):
+        x = (pulse_ns[i] - middle_ns) / unit_ns
+        slope[i] = (c1 + x * (c2 + x * (c3 + x * c4))) * per_s
+        bend[i] = (c2 + x * (2.0 * c3 + x * 3.0 * c4)) * per_s2
+        if not told:
+            slope[i], bend[i] = 0.0, 0.0
+
+
+@kernel
+def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: FloatArray, rate: Any, more: Any) -> None:
+    """From pulses first to last to their rows, of which a pulse may have several."""
+    for i in range(first, last):
+        for row in range(pulses[i], pulses[i + 1] if i + 1 < len(pulses) else len(rate)):
+            rate[row], more[row] = slope[i - first], bend[i - first]
 
 
 @kept
@@ -185,25 +263,28 @@ def rates(
     Returns:
         How many pulses nothing tells about.
     """
-    n, m = len(pulses), len(pieces)
-    work = np.zeros((2 + ORDER, 2 * ORDER))
+    n = len(pulses)
+    tile, sums, work = (np.empty((TILE, LANES)), np.empty((TILE, LANES))), np.empty((SUMS, LANES)), np.zeros((6, ORDER))
+    windows, unit_ns, size = np.zeros((LANES, 3), np.int64), np.ones(LANES), np.zeros(LANES, np.int64)
+    slope, bend = np.empty(n), np.empty(n)
     lonely = 0
-    for piece in range(first_piece, last_piece):
-        middle_ns = pieces[piece, PLACE] * PIECE_NS + PIECE_NS // 2
-        first, last, reach, size = choose(pulse_ns, pieces, piece, steady)
-        unit_ns = reach * float(PIECE_NS)
-        told = size > 0 and fit(pulse_ns, angle, (first, last), middle_ns, unit_ns, work, size)
-        work[0, size:] = 0.0
-        c1, c2, c3, c4 = work[0, 1], 2.0 * work[0, 2], 3.0 * work[0, 3], 4.0 * work[0, 4]
-        end = pieces[piece + 1, FIRST] if piece + 1 < m else n
-        for i in range(pieces[piece, FIRST], end):
-            slope, bend = 0.0, 0.0
-            if told:
-                x = (pulse_ns[i] - middle_ns) / unit_ns
-                slope = (c1 + x * (c2 + x * (c3 + x * c4))) * (1e9 / unit_ns)
-                bend = (c2 + x * (2.0 * c3 + x * 3.0 * c4)) * (1e18 / (unit_ns * unit_ns))
+    for begin in range(first_piece, last_piece, LANES):
+        count = min(LANES, last_piece - begin)
+        for lane in range(count):
+            first, last, reach, size[lane] = choose(pulse_ns, pieces, begin + lane, steady)
+            windows[lane, FROM], windows[lane, TO] = first, last
+            windows[lane, MIDDLE] = pieces[begin + lane, PLACE] * PIECE_NS + PIECE_NS // 2
+            unit_ns[lane] = reach * float(PIECE_NS)
+        sum_up(pulse_ns, angle, windows, 1.0 / unit_ns, tile, sums)
+        for lane in range(count):
+            told = size[lane] > 0 and fit(sums, lane, size[lane], work)
+            first, last = pulses_of(pieces, begin + lane, n)
+            lonely += 0 if told else last - first
+            part_ns, middle_ns = pulse_ns[first:last], windows[lane, MIDDLE]
+            rows = slice(pulses[first], pulses[last] if last < n else len(rate))
+            if rows.stop - rows.start == last - first:
+                give(work, told, part_ns, middle_ns, unit_ns[lane], rate[rows], acceleration[rows])
             else:
-                lonely += 1
-            for row in range(pulses[i], pulses[i + 1] if i + 1 < n else len(rate)):
-                rate[row], acceleration[row] = slope, bend
+                give(work, told, part_ns, middle_ns, unit_ns[lane], slope, bend)
+                spread(pulses, first, last, slope, bend, rate, acceleration)
     return lonely

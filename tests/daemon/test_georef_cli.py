@@ -106,6 +106,44 @@ class TestProducts:
         one, other = (laspy.read(next(path.glob("*_strip01.laz"))) for path in (products, tmp_path / "again"))
         assert np.abs(one.xyz - other.xyz).max() <= 0.001 + 1e-9
 
+    def test_an_attitude_from_the_plumb_line_is_turned_to_the_ellipsoid(self, flown: Flown, tmp_path: Path) -> None:
+        """By FORMULAS 1.8's matrix (headings are geodetic), about the true body."""
+        xi, eta = np.radians(np.array([100.0, -70.0]) / 3600)
+        config = tmp_path / "plumb.toml"
+        text = (flown.folder / "swath.toml").read_text()
+        config.write_text(f'{text}\n[attitude]\nvertical = "plumb"\nxi_arcsec = 100.0\neta_arcsec = -70.0\n')
+        for name in ("main.dbc", "left.nominal.toml"):
+            (tmp_path / name).write_bytes((flown.folder / name).read_bytes())
+        assert run_app(flown.arguments(tmp_path / "out", "--config", str(config), "--no-sigma")) == 0
+        las, truth = laspy.read(next((tmp_path / "out").glob("*_strip01.laz"))), flown.truth
+        at_ns, of_ns = truth["trajectory.gps_ns"] - truth["left.gps_ns"][0], truth["left.gps_ns"]
+        lat, lon, height_m = (truth[f"trajectory.{name}"] for name in ("lat_rad", "lon_rad", "height_m"))
+        to_e = Transformer.from_crs(4979, 4978, always_xy=True)
+        places_e = np.stack(to_e.transform(np.degrees(lon), np.degrees(lat), height_m), axis=1)
+        body_e = np.stack([np.interp(of_ns - of_ns[0], at_ns, column) for column in places_e.T], axis=1)
+        middle = len(lat) // 2
+        (sin_lat, cos_lat), (sin_lon, cos_lon) = ((np.sin(x[middle]), np.cos(x[middle])) for x in (lat, lon))
+        ned = np.array(
+            [
+                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+                [-sin_lon, cos_lon, 0.0],
+                [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
+            ]
+        )
+        turn = np.array([[1.0, 0.0, -xi], [0.0, 1.0, -eta], [xi, eta, 1.0]])
+        tilted_e = body_e + (truth["left.point_e"] - body_e) @ (ned.T @ turn @ ned).T
+        to_map = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True)
+        expected = np.stack(to_map.transform(*tilted_e.T), axis=1)
+        of_time = np.lexsort((truth["left.return_number"], of_ns))
+        mine = np.lexsort((np.asarray(las.return_number), np.asarray(las.gps_time)))
+        assert np.abs(las.xyz[mine] - expected[of_time]).max() < 0.002
+        assert np.abs(tilted_e - truth["left.point_e"]).max() > 0.1
+        again = flown.arguments(tmp_path / "again", "--config", str(config), "--no-sigma")
+        again[again.index("--trajectory") + 1] = str(tmp_path / "out" / f"{flown.name}_trajectory.sbet")
+        assert run_app(again) == 0
+        twice = laspy.read(next((tmp_path / "again").glob("*_strip01.laz")))
+        assert np.abs(las.xyz - twice.xyz).max() <= 0.001 + 1e-9  # what is written refers to the plumb line again
+
     def test_without_a_trajectory_the_log_says_what_is_wanted(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -278,6 +316,29 @@ class TestRefusals:
             line = refused(capsys, tmp_path / "out", arguments)
             assert "other.toml" in line
             assert words in line
+
+    def test_a_clock_by_messages_alone_is_named_and_not_the_trajectory(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        lines = (flown.folder / "swath.toml").read_text().replace('[pps.main]\nsource = "/dev/pps0"\n', "").splitlines()
+        config = flown.folder / "no_pps.toml"
+        config.write_text("\n".join(line for line in lines if line != 'pps = "main"'))
+        output = tmp_path / "out"
+        capsys.readouterr()
+        assert run_app(flown.arguments(output, "--config", str(config))) == 1
+        line = capsys.readouterr().err
+        assert line.startswith(f"swath: {flown.log}: scanner/left: ")
+        assert "want PPS edges and time messages all through" in line
+        assert not list(output.glob("*"))
+
+    def test_earth_centred_coordinates_are_no_map(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("daemon.processing.flights.read_clocks", None)  # before any work
+        arguments = flown.arguments(tmp_path / "out")
+        arguments[arguments.index("--crs") + 1] = "EPSG:4978"
+        line = refused(capsys, tmp_path / "out", arguments)
+        assert line.startswith('swath: output.crs = "EPSG:4978" (WGS 84) is geocentric: ')
 
     def test_two_recordings_of_one_time(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         log = flown.copy_of_log(tmp_path / "second")

@@ -12,6 +12,7 @@ Messages: a delay with its own jitter, a share of stalls up to 1.5 s; in order (
 
 from __future__ import annotations
 
+import bisect
 import datetime as dt
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -103,7 +104,7 @@ class Simulation:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        self._host = self.oscillator.host_seconds()
+        self._host: list[float] = self.oscillator.host_seconds().tolist()
 
     @property
     def seconds(self) -> int:
@@ -114,14 +115,14 @@ class Simulation:
         """Host time at a true second since the start."""
         whole = min(int(true_s), self.seconds - 1)
         part = true_s - whole
-        return HOST_START_NS + round(float(self._host[whole] * (1.0 - part) + self._host[whole + 1] * part))
+        return HOST_START_NS + round(self._host[whole] * (1.0 - part) + self._host[whole + 1] * part)
 
     def true_gps_ns(self, host_ns: int) -> int:
         """True GPS time of a host time."""
         since = float(host_ns - HOST_START_NS)
-        whole = int(np.clip(np.searchsorted(self._host, since, side="right") - 1, 0, self.seconds - 1))
+        whole = min(max(bisect.bisect_right(self._host, since) - 1, 0), self.seconds - 1)
         part = (since - self._host[whole]) / (self._host[whole + 1] - self._host[whole])
-        return (self.start_gps_s + whole) * NS + round(float(part) * NS)
+        return (self.start_gps_s + whole) * NS + round(part * NS)
 
     def __iter__(self) -> Iterator[tuple[int, str, str, TimeMessage | None]]:
         """(host ns, "edge" or "message", source, message) in order of host time."""

@@ -93,6 +93,29 @@ def test_same_is_the_users_word() -> None:
     assert "ETRS89" in mapping.description()["datum"]
 
 
+@pytest.mark.parametrize(
+    ("crs", "datum", "ellipsoid"),
+    [
+        ("EPSG:2056", "same", "Bessel 1841"),
+        ("EPSG:2056", "EPSG:4150", "Bessel 1841"),
+        ("EPSG:31467", "EPSG:4314", "Bessel 1841"),
+        ("EPSG:26717", "same", "Clarke 1866"),
+        ("EPSG:32632", "EPSG:7677", "PZ-90"),
+    ],
+)
+def test_a_datum_on_another_ellipsoid_is_refused(crs: str, datum: str, ellipsoid: str) -> None:
+    """Latitudes on Bessel's read as those on WGS 84's would be 67 m and 700 m of height off in Switzerland."""
+    line = refusal(crs, datum=datum, accuracy_m=1000.0)
+    assert line.startswith(f'datum = "{datum}": ')
+    assert f"is on the ellipsoid {ellipsoid}, positions are read on that of WGS 84 and GRS 1980" in line
+
+
+def test_same_is_no_advice_where_it_would_be_refused() -> None:
+    assert '"same"' not in refusal("EPSG:2056")
+    assert '"same"' not in refusal("EPSG:2056", datum="EPSG:4932")
+    assert '"same"' in refusal("EPSG:25832")
+
+
 def test_an_accuracy_of_a_decimetre_is_taken_when_the_user_allows_it() -> None:
     """EPSG gives CHTRS95 → CH1903+ as good to 0.1 m; heights stay on the ellipsoid of the positions, as in PROJ."""
     line = refusal("EPSG:2056", datum="EPSG:4932")

@@ -92,9 +92,11 @@ def test_facets_jump_and_windows_do_not(facets: int, turns_hz: float) -> None:
         np.testing.assert_array_equal(blind, rate)
 
 
-def test_shafts_that_turn_on_through_zero() -> None:
-    rows, time_ns, rate_rps, _ = read(turning(80.0), 100_000.0, 0.05, BITS_17)
+@pytest.mark.parametrize("turns_hz", [80.0, -80.0])
+def test_shafts_that_turn_on_through_zero(turns_hz: float) -> None:
+    rows, time_ns, rate_rps, _ = read(turning(turns_hz), 100_000.0, 0.05, BITS_17)
     _, rate, _ = run(rows, time_ns, steady=True)
+    assert np.abs(np.diff(rows["encoder_rad"])).max() > 6.0  # it went through zero
     assert np.abs(rate / rate_rps - 1.0).max() < 2e-3
 
 

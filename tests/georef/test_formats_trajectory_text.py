@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,29 @@ def test_csv_that_is_wrong_is_refused() -> None:
     assert "has 0 epochs" in refusal(lines[0])
     assert "look like radians" in refusal(degrees_as_radians(good))
     assert "no number for height at line 3" in refusal(good.replace(lines[2].split(",")[3], "nan", 1))
+    negative = [*lines[:5], lines[5].replace("0.00500", "-0.00500", 1), *lines[6:]]
+    assert "a sigma of the attitude at line 6 is negative" in refusal("\n".join(negative))
+
+
+def test_a_gap_takes_no_memory() -> None:
+    """A first row of another month: 2.6 million pieces of a second, of which five are flown."""
+    lines = csv_text(flown(100)).splitlines()
+    alone_ns = START_NS - 30 * 86_400 * 10**9
+    lines[1] = f"{alone_ns},{lines[1].partition(',')[2]}"
+    read("\n".join(lines))
+    tracemalloc.start()
+    trajectory = read("\n".join(lines))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert trajectory.gaps().tolist() == [[alone_ns, START_NS + 50_000_000]]
+    assert most < 2_000_000
+
+
+def test_a_trajectory_that_is_all_gaps_is_refused() -> None:
+    lines = csv_text(flown(100)).splitlines()
+    line = refusal("\n".join([lines[0], *lines[1::4]]))
+    assert "its epochs are 0.200 s apart, and what lies more than 0.150 s apart is a gap: export it at 10 Hz" in line
+    assert len(read("\n".join([lines[0], *lines[1::2]]))) == 50
 
 
 # -------------------------------------------------------------------------------------------------- Waypoint
@@ -241,8 +265,42 @@ def test_waypoint_that_is_wrong_is_refused() -> None:
     turned = [*lines[:first], lines[first + 1], lines[first], *lines[first + 2 :]]
     assert f"time goes back by 0.050 s at line {first + 2}" in refusal("\n".join(turned))
     assert "has no column Roll; export roll, pitch and heading" in refusal(good.replace(" Roll ", " Rool "))
-    none = good.replace(" Roll ", " R ").replace(" Pitch ", " P ").replace(" Heading ", " H ")
+    none = good.replace(" Roll ", "    R ").replace(" Pitch ", "     P ").replace(" Heading ", "       H ")
     assert "no attitude; georeferencing needs roll, pitch and heading" in refusal(none)
+
+
+@pytest.mark.parametrize(
+    ("units", "others", "says"),
+    [
+        ("S)       (m)    (m/s)", "S)      (ft)    (m/s)", "its height is in (ft); export it in (m)"),
+        ("(m/s)     (deg)", "(kph)     (deg)", "its v up is in (kph); export it in (m/s)"),
+        ("(deg)      (m)", "(deg)     (ft)", "its sigma n is in (ft); export it in (m)"),
+        ("(m)    (deg)", "(m)   (amin)", "its sigma roll is in (amin); export it in (deg) or (rad)"),
+    ],
+)
+def test_waypoint_in_other_units_is_refused(units: str, others: str, says: str) -> None:
+    """900 ft are not 900 m, and nothing else in the file would tell."""
+    trajectory = flown(100)
+    text = export(trajectory, weeks(trajectory), *WEEKS)
+    assert text.count(units) == 1
+    assert says in refusal(text.replace(units, others))
+
+
+def test_waypoint_yaw_is_no_heading() -> None:
+    """It counts from north to west: 350° of it is a heading of 10°."""
+    trajectory = flown(100)
+    text = export(trajectory, weeks(trajectory), *WEEKS)
+    assert "has no column Heading; export roll, pitch and heading" in refusal(text.replace(" Heading ", "     Yaw "))
+    both = text.replace("   Heading     Pitch      Roll  SDNorth ", "   Yaw   Heading     Pitch      Roll  ")
+    units = both.replace("     (deg)     (deg)     (deg)      (m) ", "     (deg)     (deg)     (deg)     (deg)")
+    turned = [" ".join(move(line.split())) for line in units.splitlines() if line.startswith(str(WEEK))]
+    lines = [line for line in units.splitlines() if not line.startswith(str(WEEK))]
+    same(read("\n".join([*lines[:-2], *turned])), trajectory, 2e-5, 1e-10)
+
+
+def move(words: list[str]) -> list[str]:
+    """A line's heading twice, the first as yaw, instead of its first sigma."""
+    return [*words[:12], str(-float(words[12])), *words[12:15], *words[16:]]
 
 
 # ---------------------------------------------------------------------------------------------------- RTKLIB
@@ -330,6 +388,11 @@ def test_rtklib_that_is_wrong_is_refused() -> None:
     )
     assert "Japan Standard Time; export it in GPST" in refusal(DRIVE.replace("GPST", "JST "))
     assert "'19-34-18.499' is no time of day" in refusal(DRIVE.replace("19:34:18.499", "19-34-18.499"))
+    assert "'19:34:inf' is no time of day" in refusal(DRIVE.replace("19:34:18.749", "19:34:inf"))
+    for date in ("2025-07-08 19:34:18.499", "237x 243258.499", "2374 nan"):
+        said = f"'{date}' is no date and clock time, nor a GPS week and its seconds"
+        assert said in refusal(DRIVE.replace("2025/07/08 19:34:18.499", date))
+    assert "has no positions" in refusal(DRIVE.splitlines()[0] + "\n")
     assert "line 3: 24 fields are expected, 23 are there" in refusal(DRIVE.replace("-0.0060000 ", ""))
     baseline = DRIVE.replace("latitude(deg) longitude(deg) height(m)", "e-baseline(m) n-baseline(m) u-baseline(m)")
     assert "has neither latitude, longitude and height nor ECEF" in refusal(baseline)

@@ -102,7 +102,7 @@ class Shots:
         time_ns = flights.time_ns[::2] + rng.integers(4_000_000, 14_000_000, count)
         return cls(rows, time_ns, rng.uniform(-80.0, 80.0, count), rng.uniform(-2e4, 2e4, count))
 
-    def rays(self, model: SensorModel, trajectory: Trajectory, **options: bool) -> Rays:
+    def rays(self, model: SensorModel, trajectory: Trajectory, *, with_axes: bool = False) -> Rays:
         """By the model."""
         return model.rays(
             self.rows,
@@ -110,7 +110,7 @@ class Shots:
             trajectory,
             encoder_rate=self.rate,
             encoder_acceleration=self.acceleration,
-            **options,
+            with_axes=with_axes,
         )
 
 

@@ -154,6 +154,7 @@ def return_rows(times_s: np.ndarray[Any, Any]) -> StructArray:
     rows["host_time_ns"] = HOST_0 + np.rint(times_s * 1e9).astype(np.int64) + 1_000_000
     rows["device_time_ns"] = device_ns(times_s)
     rows["range_m"] = times_s
+    rows["return_number"] = rows["number_of_returns"] = 1
     return rows
 
 
@@ -291,6 +292,27 @@ def test_context_gives_no_points_and_is_counted_nowhere() -> None:
     rig.stream.add_returns("left", rows)
     rig.stream.close()
     assert sum(rig.fates().values()) == sum(before.values()) + waiting
+
+
+def test_what_is_left_out_is_handed_over_with_its_fate_and_what_is_known_of_its_time() -> None:
+    """Pulses without a return are none, and the margin's are not this piece's."""
+    rig = Rig(pps_s=(3.0, 1e9), ins_s=(4.0, 12.0))
+    taken: list[tuple[StructArray, Int64Array, ByteArray]] = []
+    rig.stream.chain("left").left_out = lambda rows, time_ns, fates, _: taken.append((rows, time_ns, fates))
+    for flag, returns in ((0, 0), (CONTEXT_FLAG, 1)):
+        early = return_rows(np.arange(10) / 100)
+        early["flags"], early["number_of_returns"] = flag, returns
+        rig.stream.add_returns("left", early)
+    rig.run(20.0)
+    rig.stream.close()
+    rows, time_ns, fates = (np.concatenate(column) for column in zip(*taken, strict=True))
+    counts = rig.fates()
+    assert sum(counts.values()) == rig.given
+    assert set(fates.tolist()) == {Fate.NO_TIME, Fate.OUTSIDE_TRAJECTORY}
+    assert all(np.count_nonzero(fates == fate) == counts[fate] for fate in set(fates.tolist()))
+    assert (time_ns[fates == Fate.NO_TIME] == -1).all()
+    outside = fates == Fate.OUTSIDE_TRAJECTORY
+    assert np.abs(time_ns[outside] - GPS_0 - rows["range_m"][outside] * 1e9).max() < 5_000
 
 
 def test_the_order_in_which_a_tick_is_fed_does_not_matter() -> None:

@@ -17,6 +17,8 @@ from georef.timescales import PpsClock, TimeState
 from tests.georef.clock_run import rms, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, week_tag
 
+pytestmark = pytest.mark.xdist_group("sigma")  # the same oscillators are looked at in several ways
+
 START = 1_479_297_618
 SECONDS = 5400
 LEARNING_S = 900
