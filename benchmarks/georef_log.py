@@ -161,6 +161,12 @@ class Bench:
         """All of the log through the live georeferencer."""
         replay(self.session, self.setup, self.folder / "live", LiveConfig(), None)
 
+    def live_points(self) -> int:
+        """The same without what is shown and told; how many."""
+        feed = LogFeed(self.setup, self.setup.live_stream(self.session.info))
+        count = sum(len(points) for batch in self.session.batches() for _, points in feed.take(batch))
+        return count + sum(len(points) for _, points in feed.close())
+
 
 class _Nothing:
     """Takes returns where points would be made of them."""
@@ -272,8 +278,10 @@ def measure(log: Path, folder: Path, repeats: int) -> dict[str, list[Figure]]:
         name = "with three sigmas" if sigmas else "without sigmas"
         tables[name] = [*blocks(bench, repeats), *wall_rates(log, folder, bench, sigmas=sigmas)]
         if not sigmas:
-            live = cost(bench.replay, bench.returns, repeats)
+            points, live = (cost(work, bench.returns, repeats) for work in (bench.live_points, bench.replay))
             tables["live, by replay"] = [
+                Figure("log to points", points, "ns"),
+                Figure("grid, thinning, live.mcap, status", live - points, "ns", 40.0),
                 Figure("all of it", live, "ns", 300.0),
                 Figure("of a core, at 1 M points/s", live / 10.0, "%", 30.0),
             ]

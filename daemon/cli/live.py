@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -100,7 +100,7 @@ def _follow(
     from daemon.config.tables import LiveConfig
     from daemon.processing.live import Live, be_humble
     from daemon.processing.setup import Options, Setup
-    from daemon.processing.warm_up import warm_setup, warm_up
+    from daemon.processing.warm_up import get_ready, warm_up
     from daemon.sd_notify import ServiceManager
 
     directory = log_directory(where)
@@ -111,14 +111,10 @@ def _follow(
     warmed = warm_up([] if config is None else [Setup.of_config(config, Options(uncertainty=False))])
     with _teller(Console(), manager, as_json=as_json) as tell:
         if warmed.cache is None or warmed.compiled:
-            _log(warmed.text())
+            print(one_line(warmed.text()), file=sys.stderr, flush=True)
         manager.notify(READY="1", STATUS="waiting for a recording to begin")
         live = LiveConfig() if config is None else config.tables.live
-        return Live(directory, live, tell, from_start=from_start, points=points, prepare=warm_setup).run(stopped)
-
-
-def _log(text: str) -> None:
-    logging.getLogger("swath").info(one_line(text))
+        return Live(directory, live, tell, from_start=from_start, points=points, prepare=get_ready).run(stopped)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,8 @@ from daemon.log.format import SessionInfo
 from daemon.log.reader import Session
 from daemon.processing.feed import LogFeed, Placed
 from daemon.processing.live_follow import LiveFollower, Skipped
-from daemon.processing.live_products import LiveProducts, PointsFile
+from daemon.processing.live_points import PointsFile
+from daemon.processing.live_products import LiveProducts, Room
 from daemon.processing.live_status import LiveStatus, sentence, write_status
 from daemon.processing.setup import Options, Setup
 from daemon.run import read_boot_id
@@ -65,7 +66,16 @@ class LiveSession:
         now_ns: host time as far as the log has been read; `live` reads the clock instead.
     """
 
-    def __init__(self, setup: Setup, info: SessionInfo, folder: Path, live: LiveConfig, points: Path | None) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        info: SessionInfo,
+        folder: Path,
+        live: LiveConfig,
+        points: Path | None,
+        *,
+        beside_recorder: bool = False,
+    ) -> None:
         """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
         if setup.ins_source is None:
             raise UserError(
@@ -83,15 +93,19 @@ class LiveSession:
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
         self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about)
         self.status = LiveStatus(setup, self._stream, self.products)
-        self._points = None if points is None else PointsFile(points, self._stream.scanners)
+        self.points: PointsFile | None = None
+        if points is not None:
+            room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None
+            self.points = PointsFile(points, self._stream.scanners, room)
         self._is_own = info.boot_id == read_boot_id()
 
     def take(self, batch: LogBatch, *, live: bool) -> None:
         """The next messages."""
         self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
         self.status.note_batch(batch, self.host_now_ns(live=live))
-        self._give(self._feed.take(batch), live=live)
-        self.products.begin(self._path.trajectory)
+        placed = self._feed.take(batch)
+        if placed:
+            self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)
 
     def host_now_ns(self, *, live: bool) -> int:
@@ -102,18 +116,24 @@ class LiveSession:
 
     def _give(self, placed: Placed, *, live: bool) -> None:
         for name, points in placed:
-            if self._points is not None:
-                self._points.add(name, points)
+            if self.points is not None:
+                self.points.add(name, points)
             self.products.take(name, points, self._path.trajectory, self.now_ns)
             self.status.note_points(name, points.time_ns, self.host_now_ns(live=live))
 
     def close(self, *, live: bool) -> None:
         """The log is over: what still waits comes out, and files get their ends."""
         self._give(self._feed.close(), live=live)
-        self.products.look_for_room()
+        self.look_for_room()
         self.products.close()
-        if self._points is not None:
-            self._points.close()
+        if self.points is not None:
+            self.points.close()
+
+    def look_for_room(self) -> None:
+        """Once a second: may there be written?"""
+        self.products.look_for_room()
+        if self.points is not None:
+            self.points.look_for_room()
 
 
 class Live:
@@ -171,7 +191,9 @@ class Live:
             setup = Setup.of_log(part.attachments, Options(uncertainty=False))
             if self._prepare is not None:
                 self._prepare(setup)
-            self._session = made_session(setup, part.info, self._directory / FOLDER, self._live, self._points)
+            self._session = made_session(
+                setup, part.info, self._directory / FOLDER, self._live, self._points, beside_recorder=True
+            )
         self._session.take(item, live=True)
 
     def _look_at_clock(self) -> None:
@@ -181,7 +203,7 @@ class Live:
             return
         self._told_s = now_s
         if self._session is not None:
-            self._session.products.look_for_room()
+            self._session.look_for_room()
             if now_s - self._covered_s > COVERAGE_S:
                 self._covered_s = now_s
                 self._session.products.save_coverage(self._about())
@@ -196,6 +218,8 @@ class Live:
         if self._session is not None:
             now_ns = self._session.host_now_ns(live=True)
             found |= {"time_ns": now_ns} | self._session.status.plain(self._follower, now_ns)
+            if self._session.points is not None and self._session.points.trouble:
+                found["points_file"] = self._session.points.trouble
         found["sentence"] = one_line(sentence(found))
         if self._session is not None:
             with contextlib.suppress(OSError):  # the sentence is told all the same
@@ -210,11 +234,19 @@ class Live:
         return self._say(f"ended ({self._follower.ended or 'stopped'})")
 
 
-def made_session(setup: Setup, info: SessionInfo, folder: Path, live: LiveConfig, points: Path | None) -> LiveSession:
+def made_session(
+    setup: Setup,
+    info: SessionInfo,
+    folder: Path,
+    live: LiveConfig,
+    points: Path | None,
+    *,
+    beside_recorder: bool = False,
+) -> LiveSession:
     """A session; UserError where its folder cannot be written to."""
     try:
-        session = LiveSession(setup, info, folder, live, points)
-        session.products.look_for_room()
+        session = LiveSession(setup, info, folder, live, points, beside_recorder=beside_recorder)
+        session.look_for_room()
         return session
     except OSError as error:
         text = f"{error.filename or folder}: {error.strerror or error}; swath live writes what it shows there"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from georef.compiled import kept
 
 TILE = 256  # cells along a side
+_TILE_BITS = 8
 TILES = 256  # held at most: 64 MiB
 _SLOTS = 1024  # of the table in which tiles are looked up
 _FREQUENCIES = 1 << 16  # points in a cell that quantiles tell apart
@@ -36,21 +37,22 @@ class CountGrid:
         self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile that is held
         self._state = np.zeros(2, dtype=np.int64)  # tiles held, points refused
 
-    def add(self, points: NDArray[np.float64], east_m: float = 0.0, north_m: float = 0.0) -> None:
+    def add(self, points: NDArray[np.float64], east: float = 0.0, north: float = 0.0, unit_m: float = 1.0) -> None:
         """Count points (n, 3): east, north, up, the last of which is not looked at. Blocks may be cut anywhere.
 
         Args:
             points: from anywhere.
-            east_m, north_m: of the grid's origin in their coordinates.
+            east, north: of the grid's origin in their coordinates.
+            unit_m: metres in a unit of those.
         """
         done = 0
         while done < len(points):
             done = count_points(
                 points,
-                east_m,
-                north_m,
+                east,
+                north,
                 done,
-                1.0 / self.cell_m,
+                unit_m / self.cell_m,
                 self._counts,
                 self._keys,
                 self._slots,
@@ -151,10 +153,10 @@ _take_tile = kept(_find_tile)
 
 def _count_points(
     points: Any,
-    east_m: float,
-    north_m: float,
+    east: float,
+    north: float,
     first: int,
-    per_metre: float,
+    per_unit: float,
     counts: Any,
     keys: Any,
     slots: Any,
@@ -164,18 +166,18 @@ def _count_points(
     """Count points from ``first`` on; how far it came: less than all where a tile found no room."""
     column_before, row_before, tile = _FAR + 1, 0, -1
     for i in range(first, len(points)):
-        x, y = (points[i, 0] - east_m) * per_metre, (points[i, 1] - north_m) * per_metre
+        x, y = (points[i, 0] - east) * per_unit, (points[i, 1] - north) * per_unit
         if not (abs(x) < _FAR * TILE and abs(y) < _FAR * TILE):
             state[1] += 1
             continue
         x_cell, y_cell = math.floor(x), math.floor(y)
-        column, row = x_cell // TILE, y_cell // TILE
+        column, row = x_cell >> _TILE_BITS, y_cell >> _TILE_BITS
         if column != column_before or row != row_before:
             tile = _take_tile(column, row, keys, slots, places, state)
             if tile < 0:
                 return i
             column_before, row_before = column, row
-        counts[tile, y_cell - row * TILE, x_cell - column * TILE] += np.uint32(1)
+        counts[tile, y_cell & (TILE - 1), x_cell & (TILE - 1)] += np.uint32(1)
     return len(points)
 
 

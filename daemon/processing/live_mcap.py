@@ -62,8 +62,9 @@ class LiveMcap:
         path = folder / NAME
         with contextlib.suppress(FileNotFoundError):
             path.rename(self._previous)
+        self._previous_bytes = _size_of(self._previous)
         self._file = path.open("wb")
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="", library="swath")
         self._writer.add_metadata("swath.live", metadata)
         self._schemas: dict[str, int] = {}
@@ -102,10 +103,11 @@ class LiveMcap:
         stamp = _stamp(pose.time_ns)
         w, *xyz = pose.q_local_from_b.tolist()
         turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
-        place = fox.Vector3(**dict(zip("xyz", pose.position.tolist(), strict=True)))
+        x, y, z = pose.position.tolist()
+        place = fox.Vector3(x=x, y=y, z=z)
         known = bool(np.isfinite(pose.sigma_l).all())
         kinds = fox.LocationFixPositionCovarianceType
-        north, east, down = (np.nan_to_num(pose.sigma_l) ** 2).tolist()
+        north, east, down = (pose.sigma_l**2).tolist() if known else (0.0, 0.0, 0.0)
         fix = fox.LocationFix(
             timestamp=stamp,
             frame_id=BODY,
@@ -142,8 +144,9 @@ class LiveMcap:
         if self.is_full:
             return True
         size = self.size + length + 64
-        if size + _size_of(self._previous) > self._quota_bytes:
+        if size + self._previous_bytes > self._quota_bytes and self._previous_bytes:
             self._previous.unlink(missing_ok=True)
+            self._previous_bytes = 0
         self.is_full = size > self._quota_bytes
         return self.is_full
 

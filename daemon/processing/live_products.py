@@ -6,31 +6,30 @@ Counts and grids take every point; only what live.mcap shows is thinned. Nothing
 from __future__ import annotations
 
 import datetime as dt
+import functools
 import json
+import math
 import os
 import struct
 import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.config.tables import LiveConfig
+from daemon.processing.live_frame import LocalFrame, Maps
 from daemon.processing.live_grid import CountGrid
-from daemon.processing.live_mcap import CLOUD_DTYPE, NAME, LiveMcap, LivePose
+from daemon.processing.live_mcap import NAME, LiveMcap, LivePose
 from georef.compiled import kept
-from georef.earth import geodetic_from_e, rot_e_from_l
+from georef.earth import geodetic_from_e
 from georef.points import Points
-from georef.rotations import quaternion_from_rot, rot_from_quaternion
 from georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
 from georef.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
-
-ORIGIN_STEP_M = 100.0  # the origin's coordinates are whole hundreds, so that people can add them in their heads
 POSE_NS = 100_000_000  # between two poses
 ROOM_AGAIN = 1.05  # of the free space at which writing stopped: where it begins again
 IMAGE_CELLS = 2048
@@ -39,50 +38,6 @@ FIRST_STRIDE = 16  # of the thinning, until a second of points has been counted
 # Points a square metre, and the colour from there on; nothing is transparent.
 _COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
             (32.0, 0x1F5F8B))  # fmt: skip
-
-
-class Maps(Protocol):
-    """`georef.mapping.Mapping`, as far as it is wanted here."""
-
-    def map_from_e(self, points_e: FloatArray) -> FloatArray:
-        """(n, 3) east, north, height."""
-
-
-class LocalFrame:
-    """East, north, up in metres from an origin near the first position: of the mapping frame, or without one of e.
-
-    Attributes:
-        origin: (3,) in the coordinates of the points: map, or e.
-    """
-
-    def __init__(self, position_e: FloatArray, mapping: Maps | None) -> None:
-        """``position_e``: (3,) the first position."""
-        self._mapping = mapping
-        if mapping is not None:
-            self.origin: FloatArray = np.floor(mapping.map_from_e(position_e[np.newaxis])[0] / ORIGIN_STEP_M)
-            self.origin *= ORIGIN_STEP_M
-            return
-        self.origin = position_e.copy()
-        lat, lon, _ = geodetic_from_e(position_e)
-        rot_e_from_l_ = rot_e_from_l(np.asarray(lat), np.asarray(lon))
-        self._rot_e_from_enu = np.ascontiguousarray(rot_e_from_l_[:, [1, 0, 2]] * [1.0, 1.0, -1.0])
-
-    def of_points(self, points: FloatArray) -> FloatArray:
-        """(n, 3) of points as the georeferencer gives them."""
-        away: FloatArray = points - self.origin
-        return away if self._mapping is not None else away @ self._rot_e_from_enu
-
-    def pose_of(self, position_e: FloatArray, q_e_from_b: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Position (3,) and quaternion (4,) of the body.
-
-        The axes are those of the mapping frame where the body is: three steps along b, mapped, made perpendicular.
-        """
-        step_m = 10.0
-        rot_e_from_b = rot_from_quaternion(q_e_from_b)
-        places = np.vstack([position_e, position_e + step_m * rot_e_from_b.T])
-        mapped = self.of_points(places if self._mapping is None else self._mapping.map_from_e(places))
-        u, _, vt = np.linalg.svd((mapped[1:] - mapped[0]).T / step_m)
-        return mapped[0], quaternion_from_rot(u @ vt)
 
 
 class Thinning:
@@ -95,16 +50,19 @@ class Thinning:
         self._limit = points_per_s
         self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
 
-    def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(n,) of points in the order in which they came."""
-        kept_ones = np.zeros(len(time_ns), dtype=np.bool_)
-        _thin(time_ns, self._limit, self._state, kept_ones)
-        return kept_ones
+    def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which (k,) of points in the order in which they came."""
+        kept_ones = np.empty(len(time_ns), dtype=np.int64)
+        return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
 
 
 @kept
-def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> None:
-    """state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept."""
+def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
+    """How many are kept.
+
+    state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept.
+    """
+    count = 0
     end, points, shown, stride, until = state[0], state[1], state[2], state[3], state[4]
     for i in range(len(time_ns)):
         if time_ns[i] >= end:
@@ -114,11 +72,13 @@ def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> None:
         if until == 0:
             until = stride
             if shown < limit:
-                keep[i] = True
+                keep[count] = i
+                count += 1
                 shown += 1
         until -= 1
         points += 1
     state[0], state[1], state[2], state[3], state[4] = end, points, shown, stride, until
+    return count
 
 
 @dataclass(slots=True)
@@ -176,24 +136,26 @@ class LiveProducts:
         self.begin(trajectory)
         if self.frame is None:
             return
-        if self._mapping is None:
+        if self.frame.is_level:
             self.grid.add(self.frame.of_points(points.points_map))
         else:
-            self.grid.add(points.points_map, *self.frame.origin[:2].tolist())
-        keep = np.flatnonzero(self._thinning.keep(points.time_ns))
+            east, north, _ = self.frame.origin.tolist()
+            self.grid.add(points.points_map, east, north, float(self.frame.unit_m[0]))
+        keep = self._thinning.keep(points.time_ns)
         count = len(keep)
         if count:
-            cloud = np.empty(count, dtype=CLOUD_DTYPE)
-            cloud["x"], cloud["y"], cloud["z"] = self.frame.of_points(points.points_map.take(keep, axis=0)).T
-            cloud["intensity"] = points.intensity[keep]
+            cloud = self.frame.cloud_of(points, keep)
             time_ns = unix_from_gps(int(points.time_ns[keep[0]]))
             written = self._write(lambda mcap: mcap.add_cloud(f"/points/{name}", cloud, time_ns, log_time_ns))
             self.shown += count * written
             self.unwritten += count * (not written)
 
     def take_pose(self, trajectory: Trajectory | None, log_time_ns: int) -> None:
-        """The newest pose, ten times a second of the log at most."""
-        if self.frame is None or trajectory is None or log_time_ns < self._pose_ns + POSE_NS:
+        """The newest pose, ten times a second of the log at most; the first one lays the frame."""
+        if trajectory is None or log_time_ns < self._pose_ns + POSE_NS:
+            return
+        self.begin(trajectory)
+        if self.frame is None:
             return
         self._pose_ns = log_time_ns
         position_e = trajectory.position_e[-1]
@@ -201,8 +163,8 @@ class LiveProducts:
         lat, lon, height = geodetic_from_e(position_e)
         pose = LivePose(
             unix_from_gps(int(trajectory.time_ns[-1])),
-            float(np.degrees(lat)),
-            float(np.degrees(lon)),
+            math.degrees(lat),
+            math.degrees(lon),
             float(height),
             position,
             q_local_from_b,
@@ -212,7 +174,12 @@ class LiveProducts:
 
     def look_for_room(self) -> None:
         """Once a second: may there be written?"""
-        if self.room.look():
+        try:
+            is_enough = self.room.look()
+        except OSError as error:
+            self.trouble = f"{self._folder}: {error.strerror or error}: nothing is written any more"
+            return
+        if is_enough:
             if self.trouble.startswith("free space"):
                 self.trouble = ""
             return
@@ -238,9 +205,11 @@ class LiveProducts:
 
     def origin(self) -> dict[str, Any]:
         """What the coordinates of the products mean."""
-        frame = "e" if self._mapping is None else "map"
-        where = None if self.frame is None else [round(value, 4) for value in self.frame.origin.tolist()]
-        return {"frame": frame, "crs": self._about, f"origin_{frame}_m": where, "axes": "east, north, up, metres"}
+        said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
+        if self.frame is not None:
+            said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
+            said["origin_unit_m"] = self.frame.unit_m.tolist()
+        return said
 
     def save_coverage(self, latest: dict[str, Any]) -> None:
         """The grid as numbers and as a picture, each replaced at once; nothing where there is no room."""
@@ -258,7 +227,7 @@ class LiveProducts:
             "colours_from_points_per_m2": {f"#{colour:06x}": density for density, colour in _COLOURS},
         }
         try:
-            replace_file(self._folder / PICTURE, picture(counts / cell_m**2))
+            replace_file(self._folder / PICTURE, picture(counts, cell_m))
             replace_file(self._folder / COVERAGE, (json.dumps(numbers, indent=2) + "\n").encode())
         except OSError as error:
             self.trouble = f"{COVERAGE}: {error.strerror or error}: nothing is written any more"
@@ -273,57 +242,15 @@ class LiveProducts:
                 self.trouble = f"{NAME}: {error.strerror or error}: it has no index"
 
 
-POINT_DTYPE = np.dtype(
-    [
-        ("time_ns", "<i8"),
-        ("points_map", "<f8", (3,)),
-        ("scan_angle_rad", "<f4"),
-        ("range_m", "<f4"),
-        ("intensity", "<f4"),
-        ("channel", "<u2"),
-        ("return_number", "u1"),
-        ("number_of_returns", "u1"),
-        ("mta_zone", "u1"),
-        ("scanner", "u1"),
-    ]
-)
-
-
-class PointsFile:
-    """All points of all scanners as one ``.npy`` array of `POINT_DTYPE`, in the order in which they came.
-
-    ``scanner`` counts the names in alphabetical order. The length in the file's head is written at the end.
-    """
-
-    def __init__(self, path: Path, scanners: list[str]) -> None:
-        """Raises OSError."""
-        self.count = 0
-        self._number = {name: number for number, name in enumerate(sorted(scanners))}
-        self._file: IO[bytes] = path.open("wb")
-        self._write_head(self._file)
-
-    def _write_head(self, file: IO[bytes]) -> None:
-        descr = np.lib.format.dtype_to_descr(POINT_DTYPE)
-        text = repr({"descr": descr, "fortran_order": False, "shape": (self.count,)})
-        file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", 502) + text.ljust(501).encode() + b"\n")
-
-    def add(self, name: str, points: Points) -> None:
-        """Points of a scanner."""
-        rows = np.zeros(len(points), dtype=POINT_DTYPE)
-        for column in POINT_DTYPE.names or ():
-            rows[column] = self._number[name] if column == "scanner" else getattr(points, column)
-        self._file.write(rows.tobytes())
-        self.count += len(rows)
-
-    def close(self) -> None:
-        """Say in the head how many there are."""
-        self._file.seek(0)
-        self._write_head(self._file)
-        self._file.close()
-
-
 def unix_from_gps(gps_ns: int) -> int:
     """POSIX nanoseconds of a GPS time, for stamps that people see: leap seconds by the built-in table."""
+    second, rest_ns = divmod(gps_ns, SECOND_NS)
+    return _unix_of_second(second) + rest_ns
+
+
+@functools.lru_cache(maxsize=16)
+def _unix_of_second(gps_s: int) -> int:
+    gps_ns = gps_s * SECOND_NS
     date: dt.date = utc_from_gps(gps_ns, 18)[0]
     return max(0, unix_ns_from_gps(gps_ns, table_leap_seconds(date)[0]))
 
@@ -335,10 +262,11 @@ def replace_file(path: Path, data: bytes) -> None:
     new.replace(path)
 
 
-def picture(density: FloatArray) -> bytes:
-    """A PNG (ISO/IEC 15948) of densities (rows, columns), a pixel a cell, by the table of colours; 0 is transparent."""
-    index = np.searchsorted([limit for limit, _ in _COLOURS], density, side="right").astype(np.uint8)
-    index[density <= 0] = 0
+def picture(counts: NDArray[Any], cell_m: float) -> bytes:
+    """A PNG (ISO/IEC 15948) of points in cells (rows, columns), a pixel each, coloured by density; none is clear."""
+    index: NDArray[np.uint8] = np.zeros(counts.shape, dtype=np.uint8)
+    for density, _ in _COLOURS:
+        index += counts >= max(1, math.ceil(density * cell_m**2))
     rows, columns = index.shape
     lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # before each line the number of its filter: none
     lines[:, 1:] = index

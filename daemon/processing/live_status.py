@@ -23,6 +23,7 @@ STATUS = "live.json"
 WINDOW_S = 10.0  # of which latencies are told
 EVERY = 97  # of a block's points, whose latency is looked at
 LATE_S = 1.0
+ASK_NS = 1_000_000_000
 LATENCIES = ("p50", "p95", "max")
 
 
@@ -30,10 +31,10 @@ class Latencies:
     """Seconds between two things, those of the last moments."""
 
     def __init__(self) -> None:
-        self._blocks: deque[tuple[float, NDArray[np.float64]]] = deque()
+        self._blocks: deque[tuple[float, NDArray[np.float64] | float]] = deque()
 
-    def add(self, seconds: NDArray[np.float64]) -> None:
-        """Some more, now."""
+    def add(self, seconds: NDArray[np.float64] | float) -> None:
+        """Some more, or one, now."""
         now_s = time.monotonic()
         self._blocks.append((now_s, seconds))
         while self._blocks and now_s - self._blocks[0][0] > WINDOW_S:
@@ -42,10 +43,10 @@ class Latencies:
     def plain(self) -> dict[str, float] | None:
         """p50, p95 and max; None: there are none."""
         now_s = time.monotonic()
-        latest = [seconds for at_s, seconds in self._blocks if now_s - at_s <= WINDOW_S and len(seconds)]
+        latest = [seconds for at_s, seconds in self._blocks if now_s - at_s <= WINDOW_S]
         if not latest:
             return None
-        values = np.quantile(np.concatenate(latest), [0.5, 0.95, 1.0])
+        values = np.quantile(np.hstack(latest), [0.5, 0.95, 1.0])
         return dict(zip(LATENCIES, np.round(values, 4).tolist(), strict=True))
 
 
@@ -57,31 +58,45 @@ class LiveStatus:
         self._pulse: dict[str, Latencies] = {}
         self._log: dict[str, Latencies] = {}
         self._newest_ns: dict[str, int] = {}  # log time of a source's newest unit
+        self._sources: dict[str, str | None] = {}  # by topic
+        self._offsets: dict[str, tuple[int, int | None]] = {}  # by scanner: host time, GPS time less that
         self._points_before: Counter[str] = Counter()
         self._told_s = time.monotonic()
 
     def note_batch(self, batch: LogBatch, now_ns: int) -> None:
         """Messages have been read, at a host time."""
-        source = source_of_topic(batch.channel.topic)
-        if source is not None:
-            newest_ns = int(batch.log_time_ns[-1])
-            self._newest_ns[source] = max(self._newest_ns.get(source, 0), newest_ns)
-            self._log.setdefault(source, Latencies()).add(np.array([(now_ns - newest_ns) * 1e-9]))
+        topic = batch.channel.topic
+        if topic not in self._sources:
+            self._sources[topic] = source_of_topic(topic)
+        source = self._sources[topic]
+        if source is None:
+            return
+        newest_ns = int(batch.log_time_ns[-1])
+        if source not in self._log:
+            self._log[source], self._newest_ns[source] = Latencies(), newest_ns
+        self._newest_ns[source] = max(self._newest_ns[source], newest_ns)
+        self._log[source].add((now_ns - newest_ns) * 1e-9)
 
     def note_points(self, name: str, time_ns: NDArray[np.int64], now_ns: int) -> None:
         """Points have come out, at a host time; time_ns (n,) is their pulses'."""
-        gps_now_ns = self._gps_from_host(name, now_ns)
-        if gps_now_ns is not None:
-            latest: NDArray[np.float64] = (gps_now_ns - time_ns[::EVERY]) / 1e9
+        offset_ns = self._gps_minus_host_ns(name, now_ns)
+        if offset_ns is not None:
+            latest: NDArray[np.float64] = (now_ns + offset_ns - time_ns[::EVERY]) / 1e9
             self._pulse.setdefault(f"scanner/{name}", Latencies()).add(latest)
 
-    def _gps_from_host(self, name: str, host_ns: int) -> int | None:
+    def _gps_minus_host_ns(self, name: str, host_ns: int) -> int | None:
+        """By the scanner's clock, asked once a second: none drifts so fast that a latency would show it."""
+        asked_ns, offset_ns = self._offsets.get(name, (0, None))
+        if offset_ns is not None and abs(host_ns - asked_ns) < ASK_NS:
+            return offset_ns
         host = self._stream.clocks.host
         device = host.plan.devices.get(f"scanner/{name}")
         if device is None:
             return None
         gps_ns, sigma_ns = host.gps_from_host(device.clock, np.array([host_ns]))
-        return int(gps_ns[0]) if np.isfinite(sigma_ns[0]) else None
+        offset_ns = int(gps_ns[0]) - host_ns if np.isfinite(sigma_ns[0]) else None
+        self._offsets[name] = host_ns, offset_ns
+        return offset_ns
 
     def plain(self, follower: LiveFollower | None, now_ns: int) -> dict[str, Any]:
         """How things are, at a host time; without a follower finished logs are read."""
@@ -151,8 +166,7 @@ def sentence(found: dict[str, Any]) -> str:
         parts.append(f"{found['live_skipped_s']:.1f} s SKIPPED, more than {BEHIND_NS / 1e9:.0f} s behind")
     not_locked = [f"{source} {one['state']}" for source, one in found["time"].items() if one["state"] != "LOCKED"]
     parts += not_locked[:3]
-    if found["trouble"]:
-        parts.append(str(found["trouble"]))
+    parts += [str(found[key]) for key in ("trouble", "points_file") if found.get(key)]
     return "; ".join(parts)
 
 

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import laspy
-import lazrs
 import numpy as np
 from laspy.errors import LaspyException
 from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from daemon.processing.quicklook_sidecar import sidecar_of
+from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, sample_of
+from daemon.processing.quicklook_sidecar import height_unit_in, sidecar_of
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -29,7 +29,6 @@ SAMPLE_A_CELL = 8.0
 SIGMA_NAMES = ("sigma_easting", "sigma_northing", "sigma_height")
 NOISE_CLASSES = (7, 18)  # LAS 1.4 R15, table 17: low and high noise
 METRES_PER_DEGREE = 111_320.0  # of the equator; good to 0.5 % anywhere, for pictures only
-Selection = laspy.DecompressionSelection
 WANTED = (  # layers of LAZ that are decoded: all others would cost time and show nothing
     Selection.XY_RETURNS_CHANNEL
     | Selection.Z
@@ -39,7 +38,6 @@ WANTED = (  # layers of LAZ that are decoded: all others would cost time and sho
     | Selection.POINT_SOURCE_ID
     | Selection.ALL_EXTRA_BYTES
 )
-UNREADABLE = (LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error)
 BAD_CRS = (CRSError, LaspyException, ValueError, KeyError, IndexError, TypeError, struct.error)
 
 
@@ -228,11 +226,15 @@ def units_of(sources: Sequence[Source]) -> Units:
         return Units(east_m, north_m, up_m, "°", "coordinates in degrees: lengths and areas are good to 1 % only")
     if not axes:
         return Units(note="the CRS names no unit: coordinates taken for metres")
-    across_m = axes[0].unit_conversion_factor
+    across_m, name = axes[0].unit_conversion_factor, axes[0].unit_name.replace("metre", "m")
     if len(axes) > 2:
-        return Units(across_m, across_m, axes[2].unit_conversion_factor, axes[0].unit_name)
-    note = f"no vertical CRS: heights taken for {axes[0].unit_name}" if across_m != 1.0 else ""
-    return Units(across_m, across_m, across_m, axes[0].unit_name.replace("metre", "m"), note)
+        return Units(across_m, across_m, axes[2].unit_conversion_factor, name)
+    if across_m == 1.0:
+        return Units(name=name)
+    said_m = height_unit_in(known[0].sidecar)
+    if said_m is not None:
+        return Units(across_m, across_m, said_m, name)
+    return Units(across_m, across_m, across_m, name, f"no vertical CRS: heights taken for {name}")
 
 
 def check_one_crs(sources: Sequence[Source]) -> None:
@@ -265,13 +267,12 @@ def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[
     numbers = range(-(-source.point_count // BLOCK_POINTS)) if wanted is None else wanted
     begin = 0
     try:
-        with laspy.open(source.path, decompression_selection=WANTED) as reader:
+        with PointReader(source.path, WANTED) as reader:
             for number in numbers:
                 begin = number * BLOCK_POINTS
-                if wanted is not None:
-                    reader.seek(begin)
+                reader.go_to(begin)
                 asked = min(BLOCK_POINTS, source.point_count - begin)
-                points = reader.read_points(asked)
+                points = reader.read(asked)
                 if len(points) < asked:
                     raise EOFError("the file ends too early")
                 block = _block(points, source, units, book)
@@ -285,10 +286,10 @@ def read_blocks(source: Source, units: Units, book: StripBook, wanted: Sequence[
 def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: str) -> Iterator[Block]:
     """Behind a block that cannot be read as a whole: as many points as can, in small pieces."""
     try:
-        with laspy.open(source.path, decompression_selection=WANTED) as reader:
-            reader.seek(begin)
+        with PointReader(source.path, WANTED) as reader:
+            reader.go_to(begin)
             while begin < source.point_count:
-                points = reader.read_points(min(SALVAGED_POINTS, source.point_count - begin))
+                points = reader.read(min(SALVAGED_POINTS, source.point_count - begin))
                 if not len(points):
                     break
                 block = _block(points, source, units, book)
@@ -300,15 +301,12 @@ def _salvaged(source: Source, units: Units, book: StripBook, begin: int, why: st
 
 
 def density_near(source: Source, units: Units) -> float:
-    """Returns a square metre, roughly, by a piece from a file's middle: its header cannot tell, a strip lies askew.
+    """Returns a square metre, roughly, by some of a file's points: its header cannot tell, a strip lies askew.
 
     Gives 0 where it cannot be read.
     """
-    size = min(SAMPLE_POINTS, source.point_count)
     try:
-        with laspy.open(source.path, decompression_selection=Selection.XY_RETURNS_CHANNEL) as reader:
-            reader.seek((source.point_count - size) // 2)
-            points = reader.read_points(size)
+        points = sample_of(source.path, SAMPLE_POINTS)
         places_m = np.stack([np.asarray(points.x) * units.east_m, np.asarray(points.y) * units.north_m], axis=1)
     except UNREADABLE:
         return 0.0
@@ -325,7 +323,7 @@ def density_near(source: Source, units: Units) -> float:
             break
         side_m *= math.sqrt(SAMPLE_A_CELL / found)
     whole_m = np.maximum((source.high - source.low)[:2] * [units.east_m, units.north_m], 1.0)
-    shuffled = len(points) and source.point_count / len(points) * float(extent_m.prod() / whole_m.prod())
+    shuffled = source.point_count / len(points) * float(extent_m.prod() / whole_m.prod())
     return found / side_m**2 * (shuffled if np.isfinite(shuffled) and shuffled > 2.0 else 1.0)
 
 
@@ -335,8 +333,8 @@ def _box(block: Block) -> FloatArray:
     return np.array([block.x_m.min(), block.y_m.min(), block.x_m.max(), block.y_m.max()])
 
 
-def _sigma(points: laspy.ScaleAwarePointRecord, name: str) -> NDArray[np.float32]:
-    """(n,) in the file's unit; the largest integer says that a sigma is larger than it, or not known."""
+def _sigma(points: Points, name: str) -> NDArray[np.float32]:
+    """(n,) metres, as in files of ours; the largest integer says that a sigma is larger than it, or not known."""
     kind = points.array.dtype[name]
     values = np.array(points[name], np.float32)
     if kind.kind in "iu":
@@ -344,7 +342,7 @@ def _sigma(points: laspy.ScaleAwarePointRecord, name: str) -> NDArray[np.float32
     return values
 
 
-def _block(points: laspy.ScaleAwarePointRecord, source: Source, units: Units, book: StripBook) -> Block:
+def _block(points: Points, source: Source, units: Units, book: StripBook) -> Block:
     noise = np.isin(np.asarray(points["classification"]), NOISE_CLASSES) | (np.asarray(points["withheld"]) != 0)
     skipped = int(noise.sum())
     if skipped:
@@ -352,10 +350,7 @@ def _block(points: laspy.ScaleAwarePointRecord, source: Source, units: Units, bo
     number, count = np.asarray(points["return_number"]), np.asarray(points["number_of_returns"])
     sigma_m = np.empty((0, 3), np.float32)
     if source.sigmas:
-        scale = (units.east_m, units.north_m, units.up_m)
-        sigma_m = np.stack(
-            [_sigma(points, name) * np.float32(m) for name, m in zip(SIGMA_NAMES, scale, strict=True)], axis=1
-        )
+        sigma_m = np.stack([_sigma(points, name) for name in SIGMA_NAMES], axis=1)
     return Block(
         x_m=np.asarray(points.x, np.float64) * units.east_m,
         y_m=np.asarray(points.y, np.float64) * units.north_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,15 @@ def calibrations_in(sidecar: Json) -> list[str]:
         values = find_key(sidecar, "calibration")
         told = [_text(value.get("id", "")) if isinstance(value, dict) else _text(value) for value in values]
     return list(dict.fromkeys(line for line in told if line))
+
+
+def height_unit_in(sidecar: Json) -> float | None:
+    """Metres in a unit of the heights, which a CRS without a vertical one cannot say; None: it does not say so."""
+    crs = sidecar.get("crs")
+    units = crs.get("units") if isinstance(crs, dict) else None
+    metres = units.get("metres") if isinstance(units, dict) else None
+    up_m = metres[2] if isinstance(metres, list) and len(metres) == 3 else None
+    return float(up_m) if isinstance(up_m, int | float) and 0.0 < up_m < math.inf else None
 
 
 def rows_of(sidecar: Json) -> list[tuple[str, str]]:

@@ -30,7 +30,7 @@ STEEPEST_DEG = 10.0  # USGS Lidar Base Specification: overlap is judged where sl
 ROUGHEST_M = 0.10
 PULSES_TO_COVER = 6.0
 NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a strip's returns in it, in every direction
-HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 1000
+HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
 
 
 @kept

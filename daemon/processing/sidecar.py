@@ -208,6 +208,7 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         for name, (angle_rad, above_m, ground_m) in _widest(results).items()
         if (line := air_of(config, config.scanner[name]).warning(above_m, angle_rad, ground_m)) is not None
     ]
+    lines += unit_doubts(flight)
     lines += [f"{flight.log}: the recorder lost {count:,} units of {source}" for source, count in flight.lost.items()]
     lines += flight.troubles
     lines += unread_lines(str(flight.log), count_unread(results))[1]
@@ -224,6 +225,20 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
     if intensity:
         lines.append(f"{intensity:,} points have an intensity above 65535, which stands in the file as 65535")
     return lines
+
+
+def unit_doubts(flight: Flight) -> list[str]:
+    """Where coordinates are feet and heights, of which the CRS says nothing, are metres."""
+    assert flight.setup.mapping is not None
+    frame = flight.setup.mapping.description()
+    unit, _, unit_of_height = frame["units"]["names"]
+    if unit == unit_of_height or not frame["heights"].startswith("ellipsoidal"):
+        return []
+    return [
+        f"easting and northing are in {unit}, heights in {unit_of_height} above the ellipsoid: {frame['crs']} says "
+        f"nothing of heights, and other programs may take them for {unit}; want output.crs with a vertical CRS, "
+        f"such as EPSG:6529+5703"
+    ]
 
 
 def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:

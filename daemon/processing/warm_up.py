@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import gc
 import io
 import math
 import pickle
@@ -26,6 +27,7 @@ import pyproj
 from daemon.config.config import Config
 from daemon.config.tables import Tables
 from daemon.log.format import SessionInfo
+from daemon.processing.live_frame import LocalFrame, Maps
 from daemon.processing.live_grid import CountGrid, count_points
 from daemon.processing.live_products import Thinning
 from daemon.processing.setup import Options, Setup
@@ -54,6 +56,7 @@ from georef.records import (
     TimeTag,
 )
 from georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
+from georef.trajectory import Trajectory
 
 COMPILE_EVENT = "numba:compile"
 ROWS = 500
@@ -151,6 +154,17 @@ def _setup(plan: str, uncertainty: bool) -> Setup:
     return Setup(config, {}, Options(uncertainty=uncertainty))
 
 
+def get_ready(setup: Setup) -> None:
+    """Before the first message of a recording: compile what its configuration needs, and clean up.
+
+    What has been loaded by now stays. The garbage collector would go through all of it in the midst of the flight, for
+    a tenth of a second.
+    """
+    warm_setup(setup)
+    gc.collect()
+    gc.freeze()
+
+
 def warm_setup(setup: Setup) -> None:
     """Run once what one configuration needs; the setup itself is left as it is."""
     copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
@@ -160,13 +174,21 @@ def warm_setup(setup: Setup) -> None:
         for packets in _packets_for(parser, copy.config.scanner[name].protocol):
             _decoded(parser, packets)
     with contextlib.suppress(ValueError):  # what such a place or such returns are refused for is no matter here
-        for _, points in _placed(copy):
+        placed, trajectory = _placed(copy)
+        for _, points in placed:
             _warm_products(points)
+            _warm_frame(points, trajectory, copy.mapping)
+
+
+def _warm_frame(points: Points, trajectory: Trajectory | None, mapping: Maps | None) -> None:
+    if trajectory is not None:
+        frame = LocalFrame(trajectory.position_e[-1], mapping)
+        frame.cloud_of(points, Thinning(1000).keep(points.time_ns))
+        frame.pose_of(trajectory.position_e[-1], trajectory.q_e_from_b[-1])
 
 
 def _warm_products(points: Points) -> None:
     points = Points.concatenate([points, points])
-    Thinning(1000).keep(points.time_ns)
     grid = CountGrid(1.0)
     grid.add(points.points_map - points.points_map[:1] if len(points) else np.zeros((1, 3)))
     grid.add(np.zeros((1, 3)))
@@ -182,8 +204,8 @@ def _warm_products(points: Points) -> None:
 # ---------------------------------------------------------------------- made-up flight
 
 
-def _placed(setup: Setup) -> list[tuple[str, Points]]:
-    """Points of a quarter of a minute of level flight, whose clocks have locked by then."""
+def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
+    """Points of a quarter of a minute of level flight, whose clocks have locked by then, and the flight."""
     unix_ns = unix_ns_from_gps(START_NS, LEAP_SECONDS)
     stream = setup.live_stream(SessionInfo("warm-up", "swath", "", "", unix_ns, 0))
     clocks = stream.clocks
@@ -204,7 +226,7 @@ def _placed(setup: Setup) -> list[tuple[str, Points]]:
         for name in stream.scanners:
             stream.add_returns(name, _returns(host_ns, passed_ns))
         placed += stream.advance(host_ns + SECOND_NS)
-    return placed + stream.close()
+    return placed + stream.close(), stream.path.update()
 
 
 def _device_clock(host_ns: int, passed_ns: int, second: int) -> StructArray:

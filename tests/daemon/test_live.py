@@ -6,10 +6,15 @@ import json
 import random
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from daemon.cli.main import run_app
 from daemon.config import Config, load_config
 from daemon.config.tables import LiveConfig
 from daemon.errors import UserError
@@ -19,10 +24,12 @@ from daemon.parts import RECORDING_SIGN
 from daemon.processing import live as live_module
 from daemon.processing import live_follow
 from daemon.processing.live import Live, Told, replay
-from daemon.processing.live_products import POINT_DTYPE
-from daemon.processing.live_status import sentence
+from daemon.processing.live_points import POINT_DTYPE
+from daemon.processing.live_status import LiveStatus, sentence
 from daemon.processing.setup import Options, Setup
+from daemon.processing.warm_up import WarmUp
 from daemon.sim_log import fly_into_log
+from georef.stream_clocks import DevicePlan
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight
 from sim.plan import parse_plan
@@ -231,6 +238,30 @@ class TestStatus:
         assert "7.2 s SKIPPED, more than 5 s behind" in told
         assert told.endswith("; free space is down")
         assert "3 no time" in told
+        assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
+
+    def test_a_latency_is_by_the_scanners_clock_as_it_is_now(self) -> None:
+        """Which is asked once a second, and says something else each time here."""
+        asked: list[int] = []
+
+        def gps_from_host(clock: str, host_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+            asked.append(int(host_ns[0]))
+            return host_ns + 100_000_000 * len(asked), np.array([np.inf if len(asked) == 1 else 1.0])
+
+        host = SimpleNamespace(
+            plan=SimpleNamespace(devices={"scanner/left": DevicePlan("pps/main")}), gps_from_host=gps_from_host
+        )
+        stream: Any = SimpleNamespace(clocks=SimpleNamespace(host=host))
+        status = LiveStatus(Mock(), stream, Mock())
+        found: list[float | None] = []
+        for tenths in (0, 1, 2, 10, 11, 12):  # no time yet, 0.2 s, and after a second 0.3 s
+            now_ns = 5_000_000_000 + tenths * 100_000_000
+            status._pulse.clear()
+            status.note_points("left", np.array([now_ns]), now_ns)
+            told = status._pulse["scanner/left"].plain() if status._pulse else None
+            found.append(told["max"] if told else None)
+        assert found == [None, 0.2, 0.2, 0.2, 0.3, 0.3]
+        assert len(asked) == 3
 
     def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
@@ -263,3 +294,23 @@ class TestCommand:
         assert (done.returncode, done.stdout) == (2, "")
         assert told in done.stderr
         assert done.stderr.count("\n") == 1
+
+    def test_says_where_nothing_compiled_can_be_kept(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        """A service's journal has what stands on standard error."""
+
+        class Nothing:
+            def __init__(self, *_: object, **__: object) -> None:
+                pass
+
+            def run(self, stopped: object) -> Told:
+                return {"state": "ended (stopped)"}
+
+        monkeypatch.setattr("daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
+        monkeypatch.setattr("daemon.processing.live.be_humble", lambda: None)
+        monkeypatch.setattr("daemon.processing.live.Live", Nothing)
+        assert run_app(["live", str(tmp_path)]) == 0
+        told = capfd.readouterr()
+        assert told.out == ""
+        assert told.err == WarmUp(12, 3.25, None).text() + "\n"

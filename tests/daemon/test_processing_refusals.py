@@ -16,8 +16,10 @@ from daemon.errors import UserError
 from daemon.processing import refusals
 from daemon.processing.feed import LogClocks
 from daemon.processing.setup import Options
+from daemon.processing.sidecar import unit_doubts
 from daemon.processing.unread import Unread, unread_lines
 from drivers.core.parser import Parser, ParserCounters
+from georef.mapping import Mapping
 from georef.records import INS_DTYPE
 from georef.timescales import ClockStatus, TimeState
 from georef.trajectory import Trajectory
@@ -195,3 +197,11 @@ def test_only_the_own_messages_of_a_piece_count() -> None:
         parser.counters.errors["duplicate"] += 100
         unread.note(own=own)
     assert unread.counts == {"left": {"bad_checksum": 2, "bad_version": 20}}
+
+
+@pytest.mark.parametrize(("crs", "doubts"), [("EPSG:32632", 0), ("EPSG:6529", 1)])
+def test_heights_in_another_unit_than_the_plane_are_warned_of(crs: str, doubts: int) -> None:
+    flight = SimpleNamespace(setup=SimpleNamespace(mapping=Mapping(crs, datum="same")))
+    lines = unit_doubts(cast(Any, flight))
+    assert len(lines) == doubts
+    assert all("in US survey foot, heights in metre above the ellipsoid: EPSG:6529" in line for line in lines)

@@ -32,18 +32,20 @@ FLY = (
     + """
 from daemon.config.tables import LiveConfig
 from daemon.processing.live import replay
-from daemon.processing.warm_up import compilations, warm_setup, warm_up
+from daemon.processing.warm_up import compilations, get_ready, warm_up
 from tests.daemon.test_live import Flown
 
 folder = Path(sys.argv[1])
 flown = Flown(folder)
 warm_up()
 setup = flown.setup()
-warm_setup(setup)
+get_ready(setup)
+kept = gc.get_freeze_count()
+gc.unfreeze()  # else they are listed no more
 before = signatures()
 with compilations() as names:
     found = replay(flown.session(), setup, folder / "live", LiveConfig(), None)
-print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "known": len(before),
+print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "known": len(before), "kept": kept,
                   "points": sum(found["points"].values())}))
 """
 )
@@ -78,6 +80,7 @@ def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path
     assert found["new"] == []
     assert found["compiled"] == []
     assert found["known"] > 15
+    assert found["kept"] > 100_000, "what the garbage collector would go through while points are made"
     assert found["points"] > 20_000
 
 
