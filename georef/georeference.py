@@ -29,7 +29,7 @@ from georef.sensor_model import SensorModel
 from georef.trajectory import Trajectory
 from georef.uncertainty import Uncertainty
 
-BLOCK_ROWS = 4096
+BLOCK_ROWS = 8192
 
 
 class Georeferencer:

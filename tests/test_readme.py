@@ -15,7 +15,7 @@ from typer.main import get_command
 
 from daemon.cli.main import app
 from daemon.config import load_config
-from tests.daemon.rig import Recorder, session_table
+from tests.daemon.rig import HANGS_S, Recorder, session_table
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -38,7 +38,7 @@ def commands() -> list[str]:
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
     """A command in the project's folder, which must succeed."""
     words = [str(word) for word in command]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, f"{words}: {done.stderr}"
     return done
 
@@ -80,7 +80,7 @@ def run_check_offline(folder: Path) -> None:
 def run_check(folder: Path) -> None:
     """The aircraft's devices are not here, nor its clock: each is said to be wrong, and that is exit status 1."""
     command = [sys.executable, "-m", "daemon.cli.main", "check", "--seconds", "0.2", str(aircraft_of_readme(folder))]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 1, done.stderr
     assert "/dev/pps0" in done.stdout
     assert "/dev/ttyUSB0" in done.stdout
@@ -113,7 +113,7 @@ def run_setup(folder: Path) -> None:
 def run_doctor(folder: Path) -> None:
     """This computer may well be found wanting: exit status 1, with what mends it."""
     command = [sys.executable, "-m", "daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode in (0, 1), done.stderr
     assert "receive buffers" in done.stdout
 

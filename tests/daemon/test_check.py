@@ -29,7 +29,7 @@ from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
 from georef.records import ChunkBatch, TimeScale, TimeTag
-from tests.daemon.rig import free_udp_port
+from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender
 
 ROOT = Path(__file__).parents[2]
@@ -458,7 +458,7 @@ class TestComputer:
                 env=os.environ | {"COLUMNS": "100"},
                 capture_output=True,
                 text=True,
-                timeout=60,
+                timeout=HANGS_S,
                 check=False,
             )
         assert run.returncode == 1
@@ -481,6 +481,6 @@ def _unprivileged(*arguments: str) -> subprocess.CompletedProcess[str]:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANGS_S,
         check=False,
     )

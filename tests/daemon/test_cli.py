@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from daemon.cli.main import COMMANDS, app
 from daemon.errors import ExitCode
 from drivers.core.registry import KINDS, all_drivers
+from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).parents[2]
 AIRCRAFT = ROOT / "fixtures/config/aircraft.toml"
@@ -31,7 +32,7 @@ def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
         env=os.environ | {"COLUMNS": "100", "NO_COLOR": "1"} | environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANGS_S,
         check=False,
     )
 
@@ -45,7 +46,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
         env=os.environ | environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANGS_S,
         check=False,
     )
 
@@ -154,7 +155,7 @@ class TestErrors:
                 stdout=full,
                 stderr=subprocess.PIPE,
                 text=True,
-                timeout=60,
+                timeout=HANGS_S,
                 check=False,
             )
         assert run.returncode == ExitCode.IO
@@ -173,7 +174,7 @@ class TestErrors:
         assert process.stderr is not None
         with process, process.stderr:
             assert process.stderr.read() == b""
-            assert process.wait(timeout=60) == PIPE_CLOSED
+            assert process.wait(timeout=HANGS_S) == PIPE_CLOSED
 
     def test_ctrl_c_ends_it_quietly_and_at_once(self, tmp_path: Path) -> None:
         config = tmp_path / "swath.toml"
@@ -188,11 +189,11 @@ class TestErrors:
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job's is ignored
         )
         with process:
-            deadline_s = time.monotonic() + 30
+            deadline_s = time.monotonic() + HANGS_S
             while not _has_open(process.pid, tmp_path / "edges") and time.monotonic() < deadline_s:
                 time.sleep(0.05)
             process.send_signal(signal.SIGINT)
-            _, stderr = process.communicate(timeout=30)
+            _, stderr = process.communicate(timeout=HANGS_S)
         assert process.returncode == INTERRUPTED
         assert "Traceback" not in stderr
 

@@ -30,7 +30,7 @@ from georef.records import ChunkBatch, DeviceClockSamples, Record
 from georef.timescales import DeviceClock, PpsClock
 from tests.daemon import faulty_can
 from tests.daemon.log_check import read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,7 +43,7 @@ def logs(tmp_path: Path) -> Path:
 def info(logs: Path) -> dict[str, Any]:
     """What ``swath info`` says of the one session in a directory; nothing unaccounted, nothing damaged."""
     command = [sys.executable, "-m", "daemon.cli.main", "info", "--json", str(logs)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=True)
     (session,) = json.loads(done.stdout)["sessions"]
     sources: dict[str, Any] = session["sources"]
     return sources

@@ -14,6 +14,7 @@ from pyubx2 import SET, UBXReader
 from daemon.config import parse_config
 from daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
 from daemon.errors import ExitCode, UserError
+from tests.daemon.commands import swath
 from tests.daemon.receivers import (
     novatel_replies,
     receiver,
@@ -24,14 +25,13 @@ from tests.daemon.receivers import (
     udp_receiver,
 )
 from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
-from tests.daemon.test_cli import swath
 
 ROOT = Path(__file__).parents[2]
 UBX_DATA = gzip.decompress((ROOT / "fixtures/ubx/pygpsdata-NAVHPPOS.log.gz").read_bytes())
 NOVATEL_DATA = (ROOT / "fixtures/novatel/time.gps").read_bytes()
 SBF_DATA = gzip.decompress((ROOT / "fixtures/sbf/pygpsdata_x5_time.log.gz").read_bytes())
 TIMEOUT_S = 10.0  # a device that answers does so at once; the computer may be busy
-SILENT_S = 1.5
+SILENT_S = 4.0
 
 
 def gnss(path: str, protocol: str, options: str = "", more: str = "") -> str:

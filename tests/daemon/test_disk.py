@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, disk_of, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, one_processor, session_table, wait_until
 
 SIZE_MB = 24
 
@@ -50,7 +50,7 @@ class Flood:
                     self.sent += 1
                 time.sleep(0.005)
 
-    def send_until(self, condition, timeout_s: float = 60.0) -> None:  # type: ignore[no-untyped-def]
+    def send_until(self, condition, timeout_s: float = HANGS_S) -> None:  # type: ignore[no-untyped-def]
         end = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end, "not within time"
@@ -185,7 +185,7 @@ def test_directory_that_cannot_be_written(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     recorder = Recorder(tmp_path / "rig", config_of(blocked / "logs", free_udp_port(), 1))
-    assert recorder.process.wait(30) == 3
+    assert recorder.process.wait(HANGS_S) == 3
     recorder.notify.close()
     (line,) = recorder.stderr().splitlines()
     assert "session.directory" in line

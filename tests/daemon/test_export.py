@@ -27,10 +27,11 @@ from daemon.log.reader import open_logs
 from daemon.sidecar import SUFFIX
 from drivers.core.can_frames import encode_can_frame
 from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from tests.daemon.commands import swath
 from tests.daemon.exchange import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table
-from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_cli import ROOT
 from tests.daemon.test_log import doctor
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 

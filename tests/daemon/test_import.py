@@ -22,9 +22,10 @@ from daemon.replay import timed_units
 from drivers.core.can_frames import encode_can_frame
 from drivers.transports.capture_file import read_candump, read_pcap, read_serial
 from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from tests.daemon.commands import swath
 from tests.daemon.exchange import CONFIG, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.test_cli import ROOT, run_python, swath
+from tests.daemon.test_cli import ROOT, run_python
 from tests.daemon.test_log import doctor
 
 FIXTURES = ROOT / "fixtures"

@@ -14,8 +14,9 @@ import pytest
 from drivers.core.parser import DeviceSettings
 from drivers.core.registry import find_driver
 from georef.records import ChunkBatch
+from tests.daemon.commands import swath
 from tests.daemon.rig import Recorder, session_table
-from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_cli import ROOT
 from tests.daemon.test_log import INFO, write_part
 
 CAPTURE = ROOT / "fixtures/novatel/propak6-basic-fix.gps.gz"

@@ -23,7 +23,7 @@ from daemon.log.claim import is_being_written
 from daemon.log.reader import open_logs
 from daemon.log.recover import recover
 from tests.daemon.log_check import official_counts
-from tests.daemon.rig import free_udp_port, session_table, wait_until
+from tests.daemon.rig import HANGS_S, free_udp_port, session_table, wait_until
 
 KILLS = 100
 AT_ONCE = 4
@@ -50,7 +50,7 @@ class ForkServer:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()
-        self._process.wait(30)
+        self._process.wait(HANGS_S)
         self._process.stdout.close()
 
 

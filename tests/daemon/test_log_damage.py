@@ -23,8 +23,9 @@ from daemon.log.reader import open_logs
 from daemon.log.recover import examine, recover
 from daemon.log.scan import Damage, Record, scan, unpack_chunk
 from daemon.log.writer import LogWriteError, PartWriter
+from tests.daemon.commands import swath
 from tests.daemon.rig import session_table
-from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_cli import ROOT
 from tests.daemon.test_log import (
     EVENTS,
     INFO,

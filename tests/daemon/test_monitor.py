@@ -31,10 +31,11 @@ from daemon.monitor_source import Decoding
 from drivers.core.parser import PacketParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from georef.records import ByteRows, Int64Array, Record
+from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
-from tests.daemon.rig import Recorder, disk_of, free_udp_port, session_table, wait_until
+from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_table, wait_until
 from tests.daemon.test_check import nmea
-from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_cli import ROOT
 from tests.daemon.test_info import CAPTURE
 from tests.daemon.test_log import INFO, write_part
 from tests.daemon.test_recorder_faults import Numbers, scanner
@@ -83,22 +84,41 @@ def once(where: Path) -> tuple[int, dict[str, Any]]:
     return run.returncode, json.loads(run.stdout)
 
 
+def once_when(where: Path, fits: Callable[[dict[str, Any]], bool], what: str) -> tuple[int, dict[str, Any]]:
+    """The first time that the monitor says something: on a busy machine it comes later."""
+    said: list[tuple[int, dict[str, Any]]] = []
+
+    def is_said() -> bool:
+        said.append(once(where))
+        return fits(said[-1][1])
+
+    wait_until(is_said, what)
+    return said[-1]
+
+
+def comes_as_sent(found: dict[str, Any]) -> bool:
+    left = found["sources"].get("scanner/left", {})
+    pulses_hz = left.get("decoded", {}).get("records_hz", {}).get("ScannerReturns", 0.0)
+    return bool(
+        found["verdict"] == "recording"
+        and left.get("rate_hz") == pytest.approx(200.0, rel=0.05)
+        and left.get("bytes_per_s") == pytest.approx(200.0 * len(srep(0)), rel=0.05)
+        and pulses_hz == pytest.approx(200.0 * PULSES, rel=0.2)
+    )
+
+
 def test_says_what_comes_and_that_all_is_well(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 200.0):
         recorder.wait_said("device_opened")
-        time.sleep(6.0)
-        code, found = once(recorder.config)
+        code, found = once_when(recorder.config, comes_as_sent, "the rates of what is sent")
         line = swath("monitor", "--once", str(logs))
         assert recorder.stop() == 0
     assert (code, found["verdict"], found["troubles"]) == (0, "recording", [])
     left = found["sources"]["scanner/left"]
     assert left["state"] == "receiving"
-    assert left["rate_hz"] == pytest.approx(200.0, rel=0.05)
-    assert left["bytes_per_s"] == pytest.approx(200.0 * len(srep(0)), rel=0.05)
     assert left["age_s"] < 2.0
     assert left["lost"] == {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0}
-    assert left["decoded"]["records_hz"]["ScannerReturns"] == pytest.approx(200.0 * PULSES, rel=0.2)
     assert (left["decoded"]["gaps"], left["decoded"]["bad"]) == (0, 0)
     disk = os.statvfs(logs)
     free = disk.f_bavail * disk.f_frsize
@@ -122,15 +142,18 @@ def test_gaps_in_a_sequence_and_damaged_messages_degrade(tmp_path: Path, logs: P
         srep_sender(port, 100.0, lambda sequence: sequence % 100 in (7, 8, 9)),
     ):
         recorder.wait_said("device_opened", times=2)
-        time.sleep(5.0)
-        code, found = once(logs)
+
+        def are_seen(found: dict[str, Any]) -> bool:
+            decoded = [found["sources"].get(name, {}).get("decoded") for name in ("scanner/left", "gnss/rover")]
+            return all(decoded) and decoded[0]["gaps"] > 0 and decoded[1]["messages"] > 10
+
+        code, found = once_when(logs, are_seen, "gaps and damaged messages")
         assert recorder.stop() == 0
     assert (code, found["verdict"]) == (1, "degraded")
     decoded = found["sources"]["scanner/left"]["decoded"]
     assert decoded["gaps"] == 3 * round(decoded["gaps"] / 3) > 0
     assert decoded["gaps"] <= 3 * (decoded["seconds"] + 1)
     rover = found["sources"]["gnss/rover"]["decoded"]
-    assert rover["messages"] > 10
     assert rover["bad"] == pytest.approx(rover["messages"], abs=2)
     troubles = "; ".join(found["troubles"])
     assert f"{decoded['gaps']} missing in its sequence" in troubles
@@ -167,13 +190,16 @@ def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) 
     config = session_table(logs) + scanner(free_udp_port()) + ROVER.format(path=tmp_path / "nothing")
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("scanner/left silent")
-        time.sleep(1.5)
-        run = swath("monitor", "--once", str(logs))
+        said: list[subprocess.CompletedProcess[str]] = []
+
+        def is_said() -> bool:
+            said.append(swath("monitor", "--once", str(logs)))
+            return "gnss/rover absent" in said[-1].stdout and "scanner/left no data yet" in said[-1].stdout
+
+        wait_until(is_said, "what does not come, in the monitor's line")
         assert recorder.stop() == 0
-    assert run.returncode == 1
-    assert run.stdout.startswith("DEGRADED: recording ")
-    assert "gnss/rover absent" in run.stdout
-    assert "scanner/left no data yet" in run.stdout
+    assert said[-1].returncode == 1
+    assert said[-1].stdout.startswith("DEGRADED: recording ")
 
 
 def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
@@ -207,8 +233,7 @@ def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
         note, split = swath("mark", "while it is full", str(logs)), swath("split", str(logs))
         (disk / "filler").unlink()
         recorder.wait_said("recording_resumed")
-        time.sleep(1.5)
-        again, _ = once(logs)
+        again, _ = once_when(logs, lambda found: found["verdict"] == "recording", "recording again")
         assert recorder.stop() == 0
         notes = [event["text"] for event in read_log(logs).events("mark")]
     assert (code, again) == (2, 0)
@@ -295,7 +320,12 @@ def test_follows_over_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> 
             recorder.process.send_signal(signal.SIGHUP)
             wait_until(lambda part=part: len(list(logs.glob("*.mcap"))) == part + 2, "next part")  # type: ignore[misc]
         numbers.send(50, 0.001)
-        time.sleep(1.0)
+
+        def all_is_seen() -> bool:
+            seen.extend(units_of(follower))
+            return len(seen) == numbers.sent
+
+        wait_until(all_is_seen, "all that was sent, in the files")
         recorder.kill()
     with Recorder(tmp_path / "again", config) as recorder:
         recorder.wait_said("device_opened")
@@ -316,7 +346,7 @@ def test_follows_over_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> 
         for row in batch.units
     ]
     assert seen == recorded
-    assert 700 <= len(seen) <= numbers.sent
+    assert len(seen) == numbers.sent == 700
 
 
 def test_a_chunk_is_taken_once_it_is_whole(tmp_path: Path) -> None:
@@ -398,7 +428,7 @@ def test_memory_is_bounded_and_processor_little(tmp_path: Path, logs: Path) -> N
                 resident_kb.append(_resident_kb(monitor.pid))
             spent_s = _processor_s(monitor.pid)
             monitor.send_signal(signal.SIGINT)
-            lines = monitor.communicate(timeout=30)[0].splitlines()
+            lines = monitor.communicate(timeout=HANGS_S)[0].splitlines()
         numbers.close()
         assert recorder.stop() == 0
     assert numbers.sent * 1206 > 40e6
@@ -432,7 +462,7 @@ def test_on_a_terminal_it_is_a_page_until_ctrl_c(tmp_path: Path, logs: Path) -> 
         os.close(secondary)
         wanted = (b"GB free", b"scanner/left", b"receiving", b"session_started", b"h left at this rate")
         shown = b""
-        deadline_s = time.monotonic() + 30.0
+        deadline_s = time.monotonic() + HANGS_S
         while not all(words in shown for words in wanted) and time.monotonic() < deadline_s:
             shown += os.read(main, 65536)  # a page comes in pieces
         process.send_signal(signal.SIGINT)
@@ -440,7 +470,7 @@ def test_on_a_terminal_it_is_a_page_until_ctrl_c(tmp_path: Path, logs: Path) -> 
             assert process.stderr is not None
             with process.stderr:
                 assert process.stderr.read() == b""
-            assert process.wait(30) == 130
+            assert process.wait(HANGS_S) == 130
         assert recorder.stop() == 0
     os.close(main)
     for words in wanted:

@@ -18,8 +18,9 @@ import pytest
 
 from daemon.checksum_list import ChecksumList
 from daemon.offload import BLOCK_BYTES, OffloadReport, offload
-from tests.daemon.rig import Recorder, disk_of, session_table, wait_until
-from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.commands import swath
+from tests.daemon.rig import HANGS_S, Recorder, disk_of, session_table, wait_until
+from tests.daemon.test_cli import ROOT
 from tests.daemon.test_log import INFO, write_part
 
 BIG_BYTES = 24 * BLOCK_BYTES + 12345
@@ -133,7 +134,7 @@ def test_ctrl_c_ends_it_quietly_and_leaves_the_partial_copy(logs: Path, disk: Pa
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=HANGS_S)
     assert (process.returncode, stderr) == (130, "")
     assert names(disk) == [partial.name]
 

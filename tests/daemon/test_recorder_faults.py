@@ -23,9 +23,9 @@ from daemon.errors import UserError
 from daemon.log.reader import open_logs
 from daemon.places import take_directory
 from daemon.repair import MCAP_MAGIC, unfinished_logs
+from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
-from tests.daemon.test_cli import swath
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
 
 SPECIAL = "tests.daemon.special_recorder"
 
@@ -128,7 +128,7 @@ def test_a_stall_within_the_buffer_loses_nothing(tmp_path: Path, logs: Path, num
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config) as recorder:
         recorder.wait_said("device_opened")
-        time.sleep(1.5)
+        wait_until(lambda: read_log(logs).messages["/status/scanner/left"], "a first status in the log")
         granted = last_status(read_log(logs))["receive_buffer_bytes"]
         recorder.process.send_signal(signal.SIGSTOP)
         numbers.send(2 * granted // 2304 // 2)  # the kernel doubles what is asked for
@@ -146,7 +146,7 @@ def test_what_the_kernel_holds_at_the_end_is_recorded(tmp_path: Path, logs: Path
         numbers.send(10_000)
         recorder.process.send_signal(signal.SIGTERM)
         recorder.process.send_signal(signal.SIGCONT)
-        assert recorder.process.wait(30) == 0
+        assert recorder.process.wait(HANGS_S) == 0
     content = read_log(logs)
     assert found(content) == list(range(10_000))
     assert last_status(content)["units"] == 10_000
@@ -363,7 +363,7 @@ def test_started_again_within_the_second_takes_another_name(tmp_path: Path, logs
 def test_death_of_the_writer_ends_the_process(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, module=(SPECIAL, "broken-writer")) as recorder:
-        assert recorder.process.wait(30) == 1
+        assert recorder.process.wait(HANGS_S) == 1
         assert "the writer failed: RuntimeError: a defect" in recorder.stderr()
 
 
@@ -380,7 +380,7 @@ def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watch
             assert recorder.process.poll() is None
             assert recorder.stop() == 1
         else:
-            assert recorder.process.wait(30) == 1
+            assert recorder.process.wait(HANGS_S) == 1
     (path,) = logs.glob("*.mcap")
     assert read_events(path)[-1]["code"] == "session_ended"
 

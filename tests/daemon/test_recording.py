@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
 
 SREP = """
 [scanner.left]
@@ -125,16 +125,17 @@ def test_kernel_stamps_are_the_units_times(tmp_path: Path, logs: Path, sender: s
 
 def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + ROVER.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
-    with Recorder(tmp_path, config, watchdog_s=0.6) as recorder:
+    limit_s = 2.0  # of systemd's watchdog; a machine that is busy for a moment is within it
+    with Recorder(tmp_path, config, watchdog_s=limit_s) as recorder:
         fed = recorder.notify.count("WATCHDOG")
         started = time.monotonic()
         longest, last = 0.0, started
-        while time.monotonic() - started < 10 * 0.6:
+        while time.monotonic() - started < 5 * limit_s:
             recorder.notify.poll(0.05)
             if recorder.notify.count("WATCHDOG") > fed:
                 fed = recorder.notify.count("WATCHDOG")
                 longest, last = max(longest, time.monotonic() - last), time.monotonic()
-        assert longest < 0.6
+        assert longest < limit_s
         assert "gnss/rover absent" in recorder.notify.last("STATUS")
         assert recorder.stop() == 0
     assert {event["source"] for event in read_log(logs).events("device_absent")} == {"gnss/rover", "pps/main"}
@@ -145,10 +146,14 @@ def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
         wait_until(lambda: recorder.notify.count("WATCHDOG") >= 3, "watchdog fed while all is well")
         with recorder.stopped_thread("writer"):
-            time.sleep(4.0)  # progress is allowed 3 s; then nothing may be said any more
-            fed = recorder.notify.count("WATCHDOG")
-            time.sleep(2.0)
-            assert recorder.notify.count("WATCHDOG") == fed
+            time.sleep(3.0)  # progress is allowed so long; then nothing may be said any more
+
+            def is_silent() -> bool:
+                fed = recorder.notify.count("WATCHDOG")
+                time.sleep(2.0)
+                return recorder.notify.count("WATCHDOG") == fed
+
+            wait_until(is_silent, "the watchdog is not fed")
         assert "most recent call first" in recorder.stderr()  # where every thread stood
         recorder.kill()  # what the service manager does now
     with Recorder(tmp_path / "again", config) as restarted:
@@ -262,7 +267,7 @@ def test_two_recorders_in_one_directory(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + SREP.format(port=free_udp_port())
     with Recorder(tmp_path, config):
         second = Recorder(tmp_path / "second", session_table(logs) + SREP.format(port=free_udp_port()))
-        assert second.process.wait(30) == 3
+        assert second.process.wait(HANGS_S) == 3
         assert second.stderr().strip().count("\n") == 0
         assert "another recorder" in second.stderr()
         second.notify.close()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.daemon.commands import swath
 from tests.daemon.log_check import official_counts
-from tests.daemon.test_cli import swath
 from tests.daemon.test_log import INFO, write_part
 
 WHOLE, CUT = f"{INFO.session_id}_0.mcap", f"{INFO.session_id}_1.mcap"

@@ -20,7 +20,7 @@ import pytest
 
 from daemon.wire_player import Output, PtyOutput, TimedUnit, play
 from tests.daemon.log_check import LogContent, read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
@@ -87,7 +87,12 @@ def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogCont
         recorder.wait_said("imu/main device_opened")
         command = [sys.executable, "-m", "daemon.cli.main", "replay", "--pace", pace, "--wire", str(recorder.config)]
         played = subprocess.run(
-            [*command, "--wait", "30", str(logs)], cwd=ROOT, capture_output=True, text=True, timeout=90, check=False
+            [*command, "--wait", "30", str(logs)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=HANGS_S,
+            check=False,
         )
         assert played.returncode == 0, played.stderr
         time.sleep(1.2)
@@ -150,7 +155,7 @@ def test_info_of_a_session_whose_first_part_is_missing_names_it_and_blames_no_co
     second = sorted(first[0].glob("*.mcap"))[1]
     shutil.copy(second, tmp_path / second.name)
     command = [sys.executable, "-m", "daemon.cli.main", "info", "--json", str(tmp_path)]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert told.returncode == 1, told.stderr
     (session,) = json.loads(told.stdout)["sessions"]
     assert session["missing_parts"] == [0]

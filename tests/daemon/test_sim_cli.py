@@ -25,7 +25,7 @@ from daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
 from daemon.wire_player import Output, TimedUnit
 from sim.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, one_processor, session_table, wait_until
+from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until
 from tests.daemon.standin import (
     SOURCES,
     Standin,
@@ -162,9 +162,9 @@ class TestIntoALog:
         folder = tmp_path / "flight"
         command = [sys.executable, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(folder)]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as flying:
-            wait_until(lambda: list(folder.rglob("*.mcap")), "a log that grows", 60.0)
+            wait_until(lambda: list(folder.rglob("*.mcap")), "a log that grows")
             flying.send_signal(signal.SIGINT)
-            _, said = flying.communicate(timeout=30)
+            _, said = flying.communicate(timeout=HANGS_S)
         assert (flying.returncode, said.splitlines()) == (
             cli.INTERRUPTED,
             ["interrupted: what was written of this flight has been removed"],
@@ -408,15 +408,15 @@ class TestWires:
         folder = tmp_path / "wires"
         command = [sys.executable, "-m", "daemon.cli.main", "sim", "fly", plan, "--wire", "-o", str(folder)]
         with subprocess.Popen([*command, "--seconds", SECONDS], cwd=ROOT, stderr=subprocess.PIPE, text=True) as flying:
-            wait_until((folder / "swath.toml").exists, "a configuration", 60.0)
-            wait_until((folder / "pps-main").exists, "the last of the wires", 60.0)
+            wait_until((folder / "swath.toml").exists, "a configuration")
+            wait_until((folder / "pps-main").exists, "the last of the wires")
             text = (folder / "swath.toml").read_text()
             head = session_table(folder / "logs", name='"tiny"')
             config = text.replace(text[: text.index("[pps.main]")], head)
             for name in ("left.nominal.toml", "main.dbc"):
                 (tmp_path / name).write_bytes((folder / name).read_bytes())
             with Recorder(tmp_path, config) as recorder:
-                _, said = flying.communicate(timeout=100)
+                _, said = flying.communicate(timeout=HANGS_S)
                 time.sleep(1.2)
                 assert recorder.stop() == 0
         assert flying.returncode == 0, said

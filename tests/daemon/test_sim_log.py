@@ -21,9 +21,9 @@ from daemon.log.reader import open_logs
 from daemon.replay import timed_units
 from daemon.run import make_wire
 from daemon.sim_log import SimReport, fly_into_log, virtual_boot_id
+from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, official_counts, read_log
 from tests.daemon.standin import PPM, SOURCES, START_NS, Clock, Standin, Unit, aircraft_config
-from tests.daemon.test_cli import swath
 
 SECONDS, SEED = 12.0, 3
 

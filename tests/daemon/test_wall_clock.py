@@ -32,7 +32,7 @@ def restored_clock() -> Iterator[int]:
 def test_wall_clock_stepped_by_an_hour(tmp_path: Path, step_ns: int) -> None:
     port, logs = free_udp_port(), tmp_path / "logs"
     table = f'[scanner.left]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
-    sent_ns: list[int] = []
+    sent_ns: list[tuple[int, int]] = []  # before and after the call
     with (
         Recorder(tmp_path, session_table(logs) + table) as recorder,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
@@ -43,8 +43,9 @@ def test_wall_clock_stepped_by_an_hour(tmp_path: Path, step_ns: int) -> None:
         def send(seconds: float) -> None:
             end = time.monotonic() + seconds
             while time.monotonic() < end:
-                sent_ns.append(time.monotonic_ns())
+                before_ns = time.monotonic_ns()
                 sock.sendto(len(sent_ns).to_bytes(4, "little"), ("127.0.0.1", port))
+                sent_ns.append((before_ns, time.monotonic_ns()))
                 time.sleep(0.002)
 
         send(0.5)
@@ -60,8 +61,8 @@ def test_wall_clock_stepped_by_an_hour(tmp_path: Path, step_ns: int) -> None:
     assert len(times) == len(sent_ns), session
     clocks = [value for _, value in content.messages["/clock"]]
     start_ns = clocks[0]["realtime_ns"] - clocks[0]["monotonic_ns"]
-    errors_ns = [time_ns - start_ns - sent for time_ns, sent in zip(times, sent_ns, strict=True)]
-    # delivered within the send call: 20 ms are for a loaded machine, an hour would be seen
-    assert all(-1_000_000 < error < 20_000_000 for error in errors_ns), (min(errors_ns), max(errors_ns))
+    spans = [(time_ns - start_ns, *span) for time_ns, span in zip(times, sent_ns, strict=True)]
+    # loopback delivers within the send call, however long a busy machine makes it; the clocks' rates differ a little
+    assert all(before - 1_000_000 < stamp < after + 1_000_000 for stamp, before, after in spans), spans
     assert len(content.events("wall_clock_stepped")) == 2
     assert content.messages["/status/scanner/left"][-1][1]["stamp_ambiguous"] == 0

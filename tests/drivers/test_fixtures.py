@@ -7,7 +7,10 @@ import csv
 import gzip
 import hashlib
 import json
+import os
 import re
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from functools import cache
@@ -23,7 +26,6 @@ from drivers.core.registry import find_driver
 from drivers.gnss.novatel import message_name
 from drivers.imu.nmea2000 import pgn_and_source
 from drivers.scanner.ouster_head import read_head
-from drivers.transports.can_frame import pack_frame
 from drivers.transports.capture_file import read_candump, read_pcap
 from georef.records import Chunk, Record, ScannerReturns, TimeMessage
 from tests.drivers.imu_dbc import imu_rows
@@ -310,15 +312,27 @@ def test_every_file_of_the_collection_has_a_copy_or_says_why_not() -> None:
     assert hashlib.sha256(without_licence).hexdigest() == dbc["sha256"]
 
 
+MF4_FRAMES = """
+import json, sys
+from can.io.mf4 import MF4Reader
+from drivers.transports.can_frame import pack_frame
+
+with MF4Reader(sys.argv[1]) as messages:
+    frames = [(round(one.timestamp * 1e6) * 1000, f"can{one.channel}", pack_frame(one).hex()) for one in messages]
+print(json.dumps(frames))
+"""
+
+
 @pytest.mark.parametrize("name", ["2F6913DB_00000004_00000001", "3BA199E2_00000164_00000005"])
 def test_frames_of_a_candump_log_are_those_of_the_loggers_own_file(name: str, tmp_path: Path) -> None:
-    """The logger's MF4, as python-can reads it by asammdf; both write microseconds."""
-    from can.io.mf4 import MF4Reader  # brings pandas along: seconds that no other test should wait
-
+    """The logger's MF4, as python-can reads it by asammdf, in a process that has it; both write microseconds."""
     own = tmp_path / "own.MF4"
     own.write_bytes(content(FIXTURES / "canmod-gps" / f"{name}.MF4.gz"))
-    with MF4Reader(own) as messages:
-        frames = [(round(one.timestamp * 1e6) * 1000, f"can{one.channel}", pack_frame(one)) for one in messages]
+    command = [sys.executable, "-c", MF4_FRAMES, str(own)]
+    with_asammdf = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=with_asammdf, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    frames = [(time_ns, channel, bytes.fromhex(data)) for time_ns, channel, data in json.loads(done.stdout)]
     units = read_candump(FIXTURES / "canmod-gps" / f"{name}_candump.log.gz")
     assert [(unit.time_ns, unit.channel, unit.data) for unit in units] == frames
 

@@ -1,0 +1,120 @@
+"""`swath COMMAND` as a process of its own, forked from one that has loaded everything: a tenth of a fresh start's cost.
+
+For tests of what a command does; that it starts at all, and what it loads, is shown by those that start it afresh.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import importlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from daemon.cli.main import COMMANDS, main
+from drivers.core.registry import KINDS, all_drivers
+from tests.daemon.rig import HANGS_S
+
+ROOT = Path(__file__).parents[2]
+LOADED = (
+    *(command.module for command in COMMANDS),
+    "cantools.database",
+    "daemon.capture_files",
+    "daemon.check",
+    "daemon.control_client",
+    "daemon.device_setup",
+    "daemon.exporting",
+    "daemon.importing",
+    "daemon.log.recover",
+    "daemon.monitor",
+    "daemon.offload",
+    "daemon.run",
+    "daemon.statistics",
+    "pynmea2",
+    "rich.progress",
+)
+
+
+def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line with this process's environment and some more."""
+    return _starter().run(list(arguments), os.environ | {"COLUMNS": "100", "NO_COLOR": "1"} | environment)
+
+
+@functools.cache
+def _starter() -> Starter:
+    starter = Starter()
+    atexit.register(starter.close)
+    return starter
+
+
+class Starter:
+    """The process that forks, and the line to it."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.daemon.commands"],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # so that it can be ended together with a command that hangs
+        )
+
+    def run(self, arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+        """Its exit code, and what it said."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with tempfile.TemporaryDirectory() as folder:
+            output, errors = Path(folder) / "stdout", Path(folder) / "stderr"
+            wish = {"arguments": arguments, "environment": environment, "says_to": [str(output), str(errors)]}
+            self._process.stdin.write(json.dumps(wish) + "\n")
+            self._process.stdin.flush()
+            if not select.select([self._process.stdout], [], [], HANGS_S)[0]:
+                self.close()
+                _starter.cache_clear()
+                raise AssertionError(f"swath {arguments} hangs: {errors.read_text()}")
+            code = int(self._process.stdout.readline())
+            return subprocess.CompletedProcess(arguments, code, output.read_text(), errors.read_text())
+
+    def close(self) -> None:
+        """End it, and what it has started."""
+        if self._process.poll() is None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.communicate()
+
+
+def serve() -> None:
+    """Run a command for every line on standard input; its exit code is the answer."""
+    for name in LOADED:
+        importlib.import_module(name)
+    for kind in KINDS:
+        all_drivers(kind)
+    for line in sys.stdin:
+        pid = os.fork()
+        if pid == 0:
+            become(**json.loads(line))
+            main()
+        _, status = os.waitpid(pid, 0)
+        sys.stdout.write(f"{os.waitstatus_to_exitcode(status)}\n")
+        sys.stdout.flush()
+
+
+def become(arguments: list[str], environment: dict[str, str], says_to: list[str]) -> None:
+    """Have the arguments, the environment and the outputs of a process that was started so."""
+    sys.argv[1:] = arguments
+    os.environ.clear()
+    os.environ.update(environment)
+    opened = [os.open(os.devnull, os.O_RDONLY), *(os.open(path, os.O_WRONLY | os.O_CREAT) for path in says_to)]
+    for number, descriptor in enumerate(opened):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+
+
+if __name__ == "__main__":
+    serve()
