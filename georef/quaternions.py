@@ -50,3 +50,8 @@ def rotation_vector(q: FloatArray) -> FloatArray:
         factor = np.where(sine > 0.0, 2.0 * half / sine, 2.0)
     turned: FloatArray = np.where(cosine < 0.0, -factor, factor) * q[..., 1:]
     return turned
+
+
+def rotations_between(q: FloatArray) -> FloatArray:
+    """(n − 1, 3) from each of (n, 4) to the next, as `rotation_vector` in the axes of the first."""
+    return rotation_vector(product(conjugate(q[:-1]), q[1:]))

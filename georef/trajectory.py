@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from georef.compiled import kept, kernel
 from georef.earth import e_from_geodetic, geodetic_from_e
 from georef.points import ByteArray, Fate
-from georef.quaternions import about, conjugate, product, rotated, rotation_vector
+from georef.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
 from georef.records import Int64Array
 from georef.rotations import quaternion_from_rot, rot_l_from_plumb
 from georef.timescales.gps_time import SECOND_NS, week_from_gps
@@ -223,7 +223,7 @@ class Trajectory:
     @cached_property
     def rotvec_b(self) -> FloatArray:
         """(n − 1, 3) rotation vector of each interval in b, rad, the shorter way: q1 = q0 ⊗ exp(rotvec_b / 2)."""
-        return rotation_vector(product(conjugate(self.q_e_from_b[:-1]), self.q_e_from_b[1:]))
+        return rotations_between(self.q_e_from_b)
 
     @cached_property
     def has_attitude(self) -> bool:

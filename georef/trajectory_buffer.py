@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.quaternions import rotations_between
 from georef.records import INS_DTYPE, Int64Array, StructArray
 from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
@@ -53,6 +54,7 @@ class TrajectoryBuffer:
         self._max_gap_ns, self._name = max_gap_ns, name
         empty = _trajectory_of(np.empty(0, INS_DTYPE), np.empty((0, 3)), np.empty((0, 3)))
         self._columns = {column: getattr(empty, column) for column in COLUMNS}
+        self._rotvec_b = np.empty((0, 3))  # of the interval that begins with the epoch
         self._begin = self._end = 0
         self._sigma = {column: (0, np.full(3, np.nan)) for column in SIGMAS}  # the last one said, and its time
         self._newest_ns: int | None = None
@@ -86,7 +88,10 @@ class TrajectoryBuffer:
     def snapshot(self) -> Trajectory:
         """All epochs not forgotten. It shares memory with the buffer and does not change when that grows."""
         columns: dict[str, Any] = {name: values[self._begin : self._end] for name, values in self._columns.items()}
-        return Trajectory(**columns, max_gap_ns=self._max_gap_ns, name=self._name)
+        whole = Trajectory(**columns, max_gap_ns=self._max_gap_ns, name=self._name)
+        if len(whole):  # what the trajectory would compute of all its epochs at each tick anew
+            vars(whole)["rotvec_b"] = self._rotvec_b[self._begin : self._end - 1]
+        return whole
 
     def forget_before(self, gps_ns: int) -> None:
         """Poses before gps_ns will not be asked for any more."""
@@ -139,12 +144,17 @@ class TrajectoryBuffer:
                 grown = np.empty((capacity, *old.shape[1:]), dtype=old.dtype)
                 grown[:kept] = old[self._begin : self._end]
                 self._columns[column] = grown
+            turns = np.empty((capacity, 3))
+            turns[:kept] = self._rotvec_b[self._begin : self._end]
+            self._rotvec_b = turns
             self._begin, self._end, end = 0, kept, kept + len(new)
         for column, values in self._columns.items():
             values[self._end : end] = getattr(new, column)
         attitudes = self._columns["q_e_from_b"]
         if self._end > self._begin and attitudes[self._end] @ attitudes[self._end - 1] < 0:
             attitudes[self._end : end] *= -1.0
+        first = max(self._begin, self._end - 1)
+        self._rotvec_b[first : end - 1] = rotations_between(attitudes[first:end])
         self._end = end
         self._newest_ns = int(new.time_ns[-1])
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 
 START_NS = 2445 * 604_800_000_000_000
 STEP_NS = 10_000_000
-COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad", "rotvec_b")
 
 
 def solutions(n: int, first: int = 0) -> StructArray:
