@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-LEAN = Path(__file__).parent / "lean"
+import pytest
+
+TESTS = Path(__file__).parent
+LEAN = TESTS / "lean"
 
 
 def prepare_processes() -> None:
@@ -26,6 +29,30 @@ def heed_interrupts() -> None:
     """A job that a shell runs in the background begins deaf to SIGINT, and so would all it starts."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One worker for tests that share what is made once: a fixture of their file, or loops that are to be compiled.
+
+    `make test` compiles most loops beforehand. What is left is compiled once for georef and once for sim; tests of
+    whole commands find it there, or compile the same beside them.
+    """
+    for item in items:
+        marker = item.get_closest_marker("xdist_group")
+        if marker is None and _shares_a_fixture(item):
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+        elif marker is not None and marker.args == ("kernels",):
+            folder = item.path.parent.name
+            group = item.path.stem if folder == "daemon" else f"kernels of {folder}"
+            item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _shares_a_fixture(item: pytest.Item) -> bool:
+    if not isinstance(item, pytest.Function):
+        return False
+    module, fixtures = item.nodeid.partition("::")[0], item._fixtureinfo.name2fixturedefs.values()
+    return any(one.scope == "module" and one.baseid == module for found in fixtures for one in found)
 
 
 prepare_processes()

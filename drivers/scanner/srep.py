@@ -151,7 +151,9 @@ class SrepParser(PacketParser):
             return []
         records: list[Record] = list(self._status(host_time_ns, header))
         forward = self._forward(unwrapped)
-        if forward.any():
+        if forward.all():  # nothing is copied
+            records.append(DeviceClockSamples(_clock_samples(host_time_ns, header, units)))
+        elif forward.any():
             clock = _clock_samples(host_time_ns[forward], header[forward], units[forward])
             records.append(DeviceClockSamples(clock))
         if self._thinner is None:

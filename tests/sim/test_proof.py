@@ -6,7 +6,9 @@ The bound of each return is 1 mm and half the packet's own quanta carried to the
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from drivers.scanner.beams import beam_points as velodyne_points
 from drivers.scanner.ouster_head import beam_points as ouster_points
 from drivers.scanner.ouster_head import read_head
 from drivers.scanner.velodyne_heads import VLP16
-from georef.records import Chunk, DeviceClockSamples, ScannerReturns
+from georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight, open_truth
 from sim.plan import Plan, parse_plan
@@ -133,11 +135,7 @@ def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 15.5) 
     config = tomllib.loads(config_text(plan, default_wires(plan), "."))["scanner"]["left"]
     geometry = {"geometry": files["left.json"]} if "left.json" in files else {}
     parser = find_driver("scanner", config["protocol"]).make_parser(DeviceSettings("scanner/left", config, geometry))
-    records = []
-    for unit in flight.units():
-        if unit.source.startswith("scanner/left"):
-            records += parser.feed(Chunk(unit.source, flight.host_clock.host_ns(unit.time_s), unit.data))
-    records += parser.close()
+    records = [record for batch in scanner_batches(flight) for record in parser.feed_batch(batch)] + parser.close()
     flight.finish_truth()
     assert parser.counters.bad_messages == parser.counters.bad_checksums == parser.counters.bytes_skipped == 0
     rows = np.concatenate([record.rows for record in records if isinstance(record, ScannerReturns)])
@@ -147,6 +145,16 @@ def fly_and_decode(folder: Path, changes: dict[str, Any], stop_s: float = 15.5) 
     assert len(rows) == len(loaded["left.gps_ns"]) > 5000
     time_s = pulse_times(flight, rows, clock)
     return Flown(plan, rows, time_s, loaded, Calibration.read(files["left.true.toml"].decode()), files)
+
+
+def scanner_batches(flight: VirtualFlight) -> Iterator[ChunkBatch]:
+    """The scanner's packets; those of one length that follow each other together."""
+    units = (unit for unit in flight.units() if unit.source.startswith("scanner/left"))
+    for (source, length), alike in groupby(units, lambda unit: (unit.source, len(unit.data))):
+        together = list(alike)
+        host_ns = np.array([flight.host_clock.host_ns(unit.time_s) for unit in together], dtype=np.int64)
+        data = np.frombuffer(b"".join(unit.data for unit in together), dtype=np.uint8)
+        yield ChunkBatch(source, host_ns, data.reshape(len(together), length))
 
 
 def pulse_times(flight: VirtualFlight, rows: NDArray[np.void], clock: NDArray[np.void]) -> FloatArray:
