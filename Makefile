@@ -11,11 +11,12 @@ PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
 DESTDIR ?=
 PREFIX ?= /opt/swath
 
+unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long soak-short fuzz lint bench install uninstall clean
+.PHONY: help demo test test-long soak-short fuzz lint ready bench install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -23,7 +24,8 @@ help: ## say what there is to make
 demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through real wires into a recorder, about 2 min
 	@$(BIN)/python -m demo
 
-test: lint $(VENV)/.tools ## install and run everything: style, types, import rules, tests
+test: $(VENV)/.tests $(VENV)/.tools ## install and run everything: style, types, import rules, tests
+	@$(MAKE) --no-print-directory -j 2 --output-sync=target lint ready
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone"
 	$(PYTEST) -n 0 -m "alone and not long"
 
@@ -41,7 +43,13 @@ lint: $(VENV)/.tests ## style, import rules and types only
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/mypy
+	MYPY_NUM_WORKERS=2 $(BIN)/mypy
+
+# what each worker would do for itself: loops compiled by numba, tests by Python
+ready: $(VENV)/.tests
+	$(BIN)/python -m daemon.cli.main warm-up
+	@folder=$$(mktemp -d) && $(BIN)/python -m daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
+	@$(PYTEST) -n 0 -q --collect-only >/dev/null || true
 
 bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit
 	$(BIN)/python -m benchmarks

@@ -21,6 +21,7 @@ def prepare_processes() -> None:
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(LEAN), *paths]))
     loaded: dict[str, Any] = sys.modules
     loaded.setdefault("asammdf", None)  # this process has begun: its path is settled
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as many workers as processors: threads would wait in turn
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each reads all modules as text
     sys.dont_write_bytecode = False
 
@@ -29,6 +30,13 @@ def heed_interrupts() -> None:
     """A job that a shell runs in the background begins deaf to SIGINT, and so would all it starts."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """The few tests that are alone are looked for where the mark stands, not by importing all the others."""
+    if not config.option.markexpr.startswith("alone") or collection_path.suffix != ".py":
+        return None
+    return True if "pytest.mark.alone" not in collection_path.read_text() else None
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -26,7 +26,7 @@ from tests.daemon.log_check import official_counts
 from tests.daemon.rig import HANGS_S, free_udp_port, session_table, wait_until
 
 KILLS = 100
-AT_ONCE = 4
+AT_ONCE = 6
 LOSS_S = 0.5
 
 

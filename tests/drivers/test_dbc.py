@@ -24,7 +24,7 @@ from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Par
 from drivers.core.registry import find_driver
 from drivers.imu.dbc import DbcParser, make_clock_parser
 from georef.records import ChunkBatch, DeviceClockSamples, Record, StructArray
-from tests.drivers.harness import check_packet_damage, check_packets, packed_rows
+from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
 from tests.drivers.imu_dbc import (
     ACC,
     IMU_DBC,
@@ -84,6 +84,7 @@ def reference_samples(kinds: str, rule: str) -> tuple[list[dict[str, int]], int,
 @pytest.mark.parametrize("rule", ["last", "first", "repeat"])
 def test_samples_are_those_of_the_stated_rule_however_batches_are_cut(rule: str) -> None:
     parts, drop = KINDS[rule]
+    fresh = Snapshot(make(rule, *drop)).again
 
     @hypothesis_settings(max_examples=200, deadline=None, derandomize=True)
     @given(
@@ -92,7 +93,7 @@ def test_samples_are_those_of_the_stated_rule_however_batches_are_cut(rule: str)
     )
     def property_holds(kinds: str, cuts: list[int]) -> None:
         frames = [_numbered(kind, number) for number, kind in enumerate(kinds)]
-        parser = make(rule, *drop)
+        parser = fresh()
         records: list[Record] = []
         edges = sorted({0, len(frames), *(cut for cut in cuts if cut < len(frames))})
         for start, end in itertools.pairwise(edges):

@@ -27,7 +27,8 @@ from drivers.gnss.novatel import message_name
 from drivers.imu.nmea2000 import pgn_and_source
 from drivers.scanner.ouster_head import read_head
 from drivers.transports.capture_file import read_candump, read_pcap
-from georef.records import Chunk, Record, ScannerReturns, TimeMessage
+from georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
+from tests.drivers.harness import packet_batches
 from tests.drivers.imu_dbc import imu_rows
 from tests.drivers.ouster_cases import metadata_of
 from tests.drivers.recordings import FIXTURES, every_recording, expected, gpsd_lines
@@ -136,7 +137,9 @@ def check_canmod(copy: Path, entry: Entry) -> None:
     assert {unit.channel for unit in units} == {f"can{bus}" for bus in entry["buses"]}
     assert len({int.from_bytes(unit.data[:4], "little") & CAN_EFF_MASK for unit in units}) == entry["ids"]
     parser = find_driver("imu", "canmod-gps").make_parser(DeviceSettings("imu/main"))
-    records = [record for unit in units for record in parser.feed(Chunk("imu/main", unit.time_ns, unit.data))]
+    data = np.frombuffer(b"".join(unit.data for unit in units), np.uint8).reshape(len(units), -1)
+    host_ns = np.array([unit.time_ns for unit in units], np.int64)
+    records = parser.feed_batch(ChunkBatch("imu/main", host_ns, data))
     assert +parser.counters.messages == Counter(entry["by_message"])
     rows = imu_rows(records)
     values = np.hstack([rows["specific_force_b"], np.degrees(rows["angular_rate_b"])])
@@ -155,8 +158,8 @@ def check_nmea2000(copy: Path, entry: Entry) -> None:
     frames = bus(copy.name)
     messages = entry.get("messages") or entry["messages_after_fast_packet_reassembly"]
     parser = find_driver("imu", "nmea2000").make_parser(DeviceSettings("imu/main"))
-    for frame in frames:
-        parser.feed(Chunk("imu/main", 0, frame))
+    for batch in packet_batches(frames, lambda: len(frames)):
+        parser.feed_batch(batch)
     read_here = set().union(*NMEA2000_COUNTS.values())
     assert parser.counters.messages == {pgn: count for pgn, count in messages.items() if pgn in read_here}
     if "lines" in entry:
