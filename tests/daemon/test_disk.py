@@ -129,6 +129,7 @@ def keep_parts(logs: Path, kept: Path) -> None:
         shutil.copy(path, kept)
 
 
+@pytest.mark.alone  # asserts how soon
 def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_to(
     failing_disk: tuple[Path, Path], tmp_path: Path
 ) -> None:
