@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from georef.atmosphere import Air
 from georef.beams import Geometry
-from georef.calibration import Calibration
+from georef.calibration import INDEX, Calibration
 from georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
 from georef.kernels.rays import cast
 from georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
@@ -68,8 +68,9 @@ class SensorModel:
 
     @property
     def needs_encoder_motion(self) -> bool:
-        """Whether encoder latency or torsion ask for the encoder's rate and acceleration."""
-        return self.calibration.value("encoder_latency_s") != 0.0 or self.calibration.value("torsion_s2") != 0.0
+        """Whether encoder latency or torsion, or their sigmas, ask for the encoder's rate and acceleration."""
+        asking = [INDEX["encoder_latency_s"], INDEX["torsion_s2"]]
+        return bool(self.calibration.parameters[asking].any() or self.calibration.sigmas[asking].any())
 
     def rays(
         self,

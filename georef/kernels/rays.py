@@ -218,6 +218,41 @@ def to_e(
         put(block, POINT, i, plus(origin, block[COUNTED, i], u))
 
 
+@kernel
+def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: float, per_ns: float) -> None:
+    """Where returns are in an interval that begins then."""
+    for i in range(len(stamps)):
+        passed = stamps[i] - begin
+        block[row, i] = (passed + offset_ns) * per_ns
+
+
+@kernel
+def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceleration: Any) -> None:
+    """Ranges, scan angles, and the beams as the boresight's ω and φ see them; ``part`` are the rows from k on."""
+    ranging, scanning, mounted, _ = model
+    n, kind = len(part), scanning.kind
+    if scanning.select != ONE:
+        take_table(block, part, scanning)
+    take(block, part, ranging, scanning, rate, acceleration)
+    aim(block, n, kind)
+    lean(block, n, mounted.slope)
+    through_mount(block, n, k, mounted, HEAD, ALONG, 0.0)
+    if mounted.shifted:
+        if kind != SPINNING:
+            clear(block, HEAD_START)
+        through_mount(block, n, k, mounted, HEAD_START, START, 1.0)
+
+
+@kernel
+def hand_out(block: FloatArray, n: int, here: Any, out: Out) -> None:
+    """What became of the returns of a block."""
+    give(block, n, ORIGIN, out.origin_e[here])
+    give(block, n, POINT, out.points_e[here])
+    angles, ranges = out.angle_rad[here], out.range_m[here]
+    for i in range(n):
+        angles[i], ranges[i] = block[THETA, i], block[RHO, i]
+
+
 @kept
 def cast(
     rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes | None, doubt: Doubt | None
@@ -227,8 +262,7 @@ def cast(
     The trajectory has at least two epochs, n > 0.
     """
     ranging, scanning, mounted, track = model
-    rate, acceleration, kind = scanning.rate, scanning.acceleration, scanning.kind
-    shifted, slope, moves = mounted.shifted, mounted.slope, len(mounted.inner) > 1
+    rate, acceleration, moves = scanning.rate, scanning.acceleration, len(mounted.inner) > 1
     offset_ns, turn_offset_ns = track.offset_ns, track.offset_ns + track.latency_ns
     whole_ns, turn_ns = round(offset_ns), round(turn_offset_ns)
     begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, FIRST)
@@ -262,35 +296,18 @@ def cast(
             k += n
             continue
 
-        if scanning.select != ONE:
-            take_table(block, part, scanning)
-        take(block, part, ranging, scanning, rate[here], acceleration[here])
-        for i in range(n):
-            passed = stamps[i] - begin
-            block[SHARE, i] = (passed + offset_ns) * per_ns
-        for i in range(n):
-            passed = stamps[i] - begun
-            block[TURN_SHARE, i] = (passed + turn_offset_ns) * per_turn_ns
-        aim(block, n, kind)
-        lean(block, n, slope)
-        through_mount(block, n, k, mounted, HEAD, ALONG, 0.0)
-        if shifted:
-            if kind != SPINNING:
-                clear(block, HEAD_START)
-            through_mount(block, n, k, mounted, HEAD_START, START, 1.0)
+        shares(block, SHARE, stamps, begin, offset_ns, per_ns)
+        shares(block, TURN_SHARE, stamps, begun, turn_offset_ns, per_turn_ns)
+        beams(block, k, part, model, rate[here], acceleration[here])
         gate(block, fates, ranging.minimum_m, ranging.maximum_m)
         factors(block, n, phi2)
-        to_e(block, n, (place, way), (turn, phi), arms, shifted)
-        give(block, n, ORIGIN, out.origin_e[here])
-        give(block, n, POINT, out.points_e[here])
-        angles, ranges = out.angle_rad[here], out.range_m[here]
-        for i in range(n):
-            angles[i], ranges[i] = block[THETA, i], block[RHO, i]
+        to_e(block, n, (place, way), (turn, phi), arms, mounted.shifted)
+        hand_out(block, n, here, out)
         if axes is not None:
-            turn_axes(block, n, k, kind, mounted, True)
+            turn_axes(block, n, k, scanning.kind, mounted, True)
             fill_axes(block, n, k, track, axes, turning, at, phi2)
         if doubt is not None:
-            turn_axes(block, n, k, kind, mounted, not doubt.known.along_only)
+            turn_axes(block, n, k, scanning.kind, mounted, not doubt.known.along_only)
             if at != doubted:
                 interval, doubted = interval_at(doubt.flown, at), at
             if not doubt.known.along_only:

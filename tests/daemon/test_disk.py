@@ -8,7 +8,7 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -50,7 +50,7 @@ class Flood:
                     self.sent += 1
                 time.sleep(0.005)
 
-    def send_until(self, condition, timeout_s: float = HANGS_S) -> None:  # type: ignore[no-untyped-def]
+    def send_until(self, condition: Callable[[], object], timeout_s: float = HANGS_S) -> None:
         end = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end, "not within time"

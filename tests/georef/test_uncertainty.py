@@ -247,3 +247,13 @@ def test_a_correlation_that_is_none_is_refused() -> None:
     calibration = replace(NOMINAL, sigmas=np.ones(len(NAMES)), correlation=wrong)
     with pytest.raises(UncertaintyError, match="positive definite"):
         Uncertainty(calibration, NOISE)
+
+
+def test_an_encoder_latency_of_none_has_a_sigma_all_the_same() -> None:
+    sigmas = np.where(np.array(NAMES) == "encoder_latency_s", 1e-6, 0.0)
+    geometry = replace(level(replace(NOMINAL, sigmas=sigmas)), encoder_rate=60.0)
+    plain = replace(geometry, calibration=NOMINAL)
+    more = np.trace(as_matrix(geometry.covariance_e(NOISE)) - as_matrix(plain.covariance_e(NOISE)))
+    assert more == pytest.approx((60.0 * 1e-6 * geometry.range_m) ** 2, rel=1e-6)
+    assert SensorModel(geometry.calibration, LineGeometry()).needs_encoder_motion
+    assert not SensorModel(NOMINAL, LineGeometry()).needs_encoder_motion
