@@ -43,6 +43,7 @@ CONFIGURED_NOISE = (  # keys of ImuNoiseTable that the configuration has too
     "bias_correlation_h",
     "gyro_scale_ppm",
     "accel_scale_ppm",
+    "misalignment_mrad",
 )
 DBC = """VERSION ""
 

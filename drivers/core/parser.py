@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,8 +20,8 @@ from georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, R
 if TYPE_CHECKING:
     from drivers.core.startup import StartupMessage, StartupWish
 
-DeviceKind = Literal["gnss", "imu", "scanner"]
-TransportKind = Literal["serial", "can", "udp", "gnss"]
+DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
+TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
 
 
 class DriverSettingsError(ValueError):
@@ -54,8 +55,8 @@ class ParserCounters:
 class Parser(ABC):
     """Feeds on units of one channel in the order of their arrival.
 
-    ``feed`` and ``feed_batch`` give the same records for the same bytes however they are cut. `close` gives what
-    was still held back and counts an unfinished tail in ``counters.bytes_skipped``.
+    ``feed``, ``feed_batch`` and ``feed_batches`` give the same records for the same bytes however they are cut. `close`
+    gives what was still held back and counts an unfinished tail in ``counters.bytes_skipped``.
     """
 
     def __init__(self) -> None:
@@ -69,9 +70,27 @@ class Parser(ABC):
     def feed_batch(self, batch: ChunkBatch) -> list[Record]:
         """Take consecutive units of equal length; return the records they completed, in order."""
 
+    def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
+        """Take consecutive batches of one channel, of any lengths; return the records they completed, in order.
+
+        Neighbours of equal length go to `feed_batch` as one: a call of it costs as much as many units.
+        """
+        records: list[Record] = []
+        for _, equal in groupby(batches, key=lambda batch: batch.units.shape[1]):
+            records += self.feed_batch(_joined(list(equal)))
+        return records
+
     def close(self) -> list[Record]:
         """Release the tail at the end of a stream."""
         return []
+
+
+def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
+    """Batches of units of one length as one."""
+    if len(batches) == 1:
+        return batches[0]
+    times = np.concatenate([batch.host_time_ns for batch in batches])
+    return ChunkBatch(batches[0].source, times, np.concatenate([batch.units for batch in batches]))
 
 
 class StreamParser(Parser):
@@ -131,7 +150,7 @@ class Driver:
 
     Attributes:
         protocol: the name in the configuration.
-        kind: gnss, imu or scanner.
+        kind: gnss, imu, scanner or corrections.
         transports: kinds of transport it can come by.
         yields: record types it gives.
         summary: one line for ``swath devices``.

@@ -8,7 +8,7 @@ from functools import cache
 
 from drivers.core.parser import DeviceKind, Driver
 
-KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner")
+KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
 
 
 class UnknownProtocolError(LookupError):

@@ -136,17 +136,20 @@ class ReturnSlots:
     def _write_pulses(self, words: NDArray[np.uint64], pulse: NDArray[np.intp]) -> None:
         """The same of these pulses, in order."""
         m, n = self.shape
-        # pulses of a row are neighbours: to repeat its value takes half as long as to gather it
-        counts = np.diff(pulse.searchsorted(np.arange(m + 1) * n))
-        minor = pulse - np.repeat(np.arange(m) * n, counts)
+        # pulses of a row are neighbours: to repeat its value takes half as long as to gather it, unless it has but one
+        counts = None if n == 1 else np.diff(pulse.searchsorted(np.arange(m + 1) * n))
+        minor = np.zeros_like(pulse) if counts is None else pulse - np.repeat(np.arange(m) * n, counts)
+
+        def of_rows(values: NDArray[Any]) -> NDArray[Any]:
+            return values.take(pulse) if counts is None else np.repeat(values, counts)
 
         def chosen(values: NDArray[Any]) -> NDArray[Any]:
             if values.shape[1] == 1:
-                return np.repeat(values[:, 0], counts)
+                return of_rows(values[:, 0])
             return values[0].take(minor) if len(values) == 1 else values.reshape(-1).take(pulse)
 
         words[-1] = chosen(self.common)
-        np.add(np.repeat(self.pulse_id, counts), minor, out=_column(words, "pulse_id").view(np.int64))
+        np.add(of_rows(self.pulse_id), minor, out=_column(words, "pulse_id").view(np.int64))
         for name, made_of in self.per_pulse.items():
             _column(words, name)[:] = made_of(chosen)
 

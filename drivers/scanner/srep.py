@@ -8,12 +8,11 @@ u64 counter fits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import NDArray
 
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
@@ -25,24 +24,24 @@ from drivers.scanner.srep_layout import (
     FLAG_PPS_LOCKED,
     FLAG_RANGE_GATE,
     HEADER_BYTES,
-    HEADER_DTYPE,
-    PULSE_HEAD_BYTES,
     PULSE_WIDTH_UNIT_NS,
     RANGE_UNIT_M,
-    SLOT_BYTES,
     SLOT_DTYPE,
     ZONE_UNKNOWN,
+    PulseRows,
     SrepHeader,
+    body_words,
     encode_datagram,
     header_checks,
     nanoseconds,
     pulse_dtype,
     pulse_times,
 )
+from drivers.scanner.srep_units import Datagrams, clock_samples
 from georef.records import (
-    DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_PPS_LOCKED,
     ByteRows,
+    ChunkBatch,
     DeviceClockSamples,
     DeviceStatus,
     Int64Array,
@@ -133,32 +132,37 @@ class SrepParser(PacketParser):
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         """Decode datagrams of equal length; see `PacketParser.parse_units`."""
-        self.counters.bytes += units.size
-        good, chosen = self._check(host_time_ns, units)
-        if not good.any():
+        return self._parse(Datagrams(host_time_ns, [units])) if len(units) else []
+
+    def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
+        """Decode datagrams of any lengths at once, for a scanner that ends one where its zone changes mixes lengths."""
+        held = [batch for batch in batches if len(batch.units)]
+        if not held:
             return []
-        if not good.all():
-            host_time_ns, units, chosen = host_time_ns[good], units[good], chosen[good]
-        header = _headers(units)
+        host_time_ns = np.concatenate([batch.host_time_ns for batch in held])
+        return self._parse(Datagrams(host_time_ns, [batch.units for batch in held]))
+
+    def _parse(self, units: Datagrams) -> list[Record]:
+        units, header, chosen = self._check(units)
+        if not len(units):
+            return []
         self.counters.messages["srep"] += len(units)
         unwrapped, fresh = self._tracker.follow(
             header["sequence"], nanoseconds(header["first_ticks"], header["tick_hz"]), header["pps_count"]
         )
-        if not (fresh & chosen).all():
-            keep = fresh & chosen
-            host_time_ns, units, header, unwrapped = host_time_ns[keep], units[keep], header[keep], unwrapped[keep]
-        if not len(units):
+        keep = fresh & chosen
+        if not keep.any():
             return []
-        records: list[Record] = list(self._status(host_time_ns, header))
+        if not keep.all():
+            units, header, unwrapped = units.where(keep), header[keep], unwrapped[keep]
+        records: list[Record] = list(self._status(units.host_time_ns, header))
+        words = units.bodies()
         forward = self._forward(unwrapped)
-        if forward.all():  # nothing is copied
-            records.append(DeviceClockSamples(_clock_samples(host_time_ns, header, units)))
-        elif forward.any():
-            clock = _clock_samples(host_time_ns[forward], header[forward], units[forward])
-            records.append(DeviceClockSamples(clock))
+        if forward.any():
+            records.append(DeviceClockSamples(clock_samples(units.host_time_ns, header, words)[forward]))
         if self._thinner is None:
             self._tell_rates(header, unwrapped)
-            rows = self._returns(host_time_ns, header, units, unwrapped)
+            rows = self._returns(units.host_time_ns, header, words, unwrapped)
             if len(rows):
                 records.append(ScannerReturns(rows))
         return records
@@ -170,33 +174,38 @@ class SrepParser(PacketParser):
         forward: BoolArray = unwrapped > newest[:-1]
         return forward
 
-    def _check(self, host_time_ns: Int64Array, units: ByteRows) -> tuple[BoolArray, BoolArray]:
-        """Which units are whole datagrams, and which of them are decoded; the others are counted."""
-        n, length = units.shape
-        chosen = np.ones(n, dtype=np.bool_) if self._thinner is None else self._thinner.choose(host_time_ns)
-        if length < HEADER_BYTES + CRC.size:
-            self._refuse("bad_length", n)
-            self.counters.bytes_skipped += n * length
-            return np.zeros(n, dtype=np.bool_), chosen
-        header = _headers(units)
-        good = np.ones(n, dtype=np.bool_)
-        for code, passes in header_checks(header, length):
+    def _check(self, units: Datagrams) -> tuple[Datagrams, StructArray, BoolArray]:
+        """Whole datagrams, their headers, and which of them are decoded; the others are counted."""
+        chosen = np.ones(len(units), dtype=np.bool_)
+        if self._thinner is not None:
+            chosen = self._thinner.choose(units.host_time_ns)
+        size, lengths = sum(block.size for block in units.blocks), units.lengths()
+        if min(block.shape[1] for block in units.blocks) < HEADER_BYTES + CRC.size:
+            long = lengths >= HEADER_BYTES + CRC.size
+            self._refuse("bad_length", int((~long).sum()))
+            units, chosen, lengths = units.where(long), chosen[long], lengths[long]
+        header = units.headers()
+        good = np.ones(len(units), dtype=np.bool_)
+        for code, passes in header_checks(header, lengths):
             self._refuse(code, int((good & ~passes).sum()))
             good &= passes
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
-        content = units[:, : -CRC.size]
-        said = np.ascontiguousarray(units[:, -CRC.size :]).view("<u4")[:, 0].tolist()
-        for row in np.flatnonzero(verify).tolist():
-            if crc32(content[row]) != said[row]:
-                good[row] = False
-                self.counters.bad_checksums += 1
-        self.counters.bytes_framed += length * int(good.sum())
-        self.counters.bytes_skipped += length * int((~good).sum())
-        return good, chosen
+        agree = units.where(verify).agree_with_crc()
+        self.counters.bad_checksums += int((~agree).sum())
+        good[verify] = agree
+        framed = int(lengths[good].sum())
+        self.counters.bytes += size
+        self.counters.bytes_framed += framed
+        self.counters.bytes_skipped += size - framed
+        if not good.all():  # else nothing is copied
+            units, header, chosen = units.where(good), header[good], chosen[good]
+        return units, header, chosen
 
     def _breaks(self, sequence: NDArray[np.uint32], good: BoolArray) -> BoolArray:
         """Where a datagram does not follow the one before, beginning with the last of the batch before."""
         follows = np.zeros(len(sequence), dtype=np.bool_)
+        if not len(sequence):
+            return follows
         follows[1:] = (np.diff(sequence) == 1) & good[1:] & good[:-1]
         if self._last_sequence is not None:
             follows[0] = int(sequence[0]) == (self._last_sequence + 1) % (1 << 32)
@@ -221,38 +230,44 @@ class SrepParser(PacketParser):
         if self.tell_rates is None:
             return
         prf_mhz, tick_hz = header["prf_mhz"].astype(np.int64), header["tick_hz"].astype(np.int64)
-        same = (prf_mhz == self._last_rates[0]) & (tick_hz == self._last_rates[1])
-        for row in np.flatnonzero(~same).tolist():
+        changed = np.ones(len(header), dtype=np.bool_)
+        changed[1:] = (prf_mhz[1:] != prf_mhz[:-1]) | (tick_hz[1:] != tick_hz[:-1])
+        for row in np.flatnonzero(changed).tolist():
             rates = (int(prf_mhz[row]), int(tick_hz[row]))
             apart_mhz = abs(rates[0] - self._last_rates[0])
-            if rates[1] == self._last_rates[1] and apart_mhz <= SAME_RATE * self._last_rates[0] and rates[0]:
+            alike = apart_mhz <= SAME_RATE * self._last_rates[0] and rates[0] > 0
+            if rates == self._last_rates or (rates[1] == self._last_rates[1] and alike):
                 continue
             self._last_rates = rates
             self.tell_rates(int(unwrapped[row]) << 16, rates[0] / 1000, rates[1])
 
     def _returns(
-        self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
+        self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> StructArray:
-        """Returns of all datagrams, in order, decoded in blocks of one layout."""
-        slots = header["pulses"].astype(np.int64) * header["return_slots"]
-        table = returns_table(int(slots.sum()))
+        """Returns of all datagrams, whose `Datagrams.bodies` these are, in order, decoded in blocks of one layout."""
+        fired = header["pulses"] > 0
+        if not fired.all():
+            host_time_ns, header, unwrapped = host_time_ns[fired], header[fired], unwrapped[fired]
+        ends = np.cumsum(body_words(header)).tolist()
+        slots = np.cumsum(header["pulses"].astype(np.int64) * header["return_slots"])
+        table = returns_table(int(slots[-1]) if len(slots) else 0)
         filled = 0
-        for start, stop in _same_layout(header):
+        for start, stop in _same_layout(header, slots):
             part = slice(start, stop)
-            if header["pulses"][start]:
-                block = self._block(host_time_ns[part], header[part], units[part], unwrapped[part])
-                apparent = header["mta_zone"][part] == ZONE_UNKNOWN
-                if self.emissions and apparent.any():
-                    filled += self._fill_all(block, apparent, table[filled:])
-                else:
-                    filled += self._fill(block, table[filled:])
+            body = words[ends[start - 1] if start else 0 : ends[stop - 1]]
+            block = self._block(host_time_ns[part], header[part], body, unwrapped[part])
+            apparent = header["mta_zone"][part] == ZONE_UNKNOWN
+            if self.emissions and apparent.any():
+                filled += self._fill_all(block, np.repeat(apparent, header["pulses"][part]), table[filled:])
+            else:
+                filled += self._fill(block, table[filled:])
         return table[:filled]
 
     def _fill_all(self, block: ReturnSlots, apparent: BoolArray, table: StructArray) -> int:
-        """As `fill`; a pulse without a return is a row as well where ranges are apparent, (m,) of datagrams."""
+        """As `fill`; a pulse without a return is a row as well where ranges are ``apparent``, of pulses in order."""
         content = block.content.copy()
         returns = np.count_nonzero(content["range"][:, block.others :], axis=1)
-        alone = (returns == 0) & np.repeat(apparent, block.shape[1])
+        alone = (returns == 0) & apparent
         content["range"][alone, block.others] = 1  # so that there is a row
         block.content = content
         filled = self._fill(block, table)
@@ -264,73 +279,56 @@ class SrepParser(PacketParser):
         return filled
 
     def _block(
-        self, host_time_ns: Int64Array, header: StructArray, units: ByteRows, unwrapped: Int64Array
+        self, host_time_ns: Int64Array, header: StructArray, words: NDArray[np.uint64], unwrapped: Int64Array
     ) -> ReturnSlots:
-        """The slots of datagrams of one layout."""
-        n, pulses, slots = len(units), int(header["pulses"][0]), int(header["return_slots"][0])
-        # one copy at once: field by field it takes ten times as long
-        words = np.ascontiguousarray(units[:, HEADER_BYTES : -CRC.size]).view("<u8").reshape(n * pulses, 1 + slots)
-        body = words.view(pulse_dtype(slots)).reshape(n, pulses)
+        """The slots of datagrams of one layout, whose pulses these words are."""
+        slots = int(header["return_slots"][0])
+        rows = PulseRows.of(header["pulses"])
+        words = words.reshape(-1, 1 + slots)
+        body = words.view(pulse_dtype(slots)).reshape(rows.shape)
         angle, facet = self._scan_angle.angles(body["encoder"], int(header["encoder_counts"][0]))
-        times_ns = pulse_times(header, body["ticks"])
+        times_ns = pulse_times(header, body["ticks"], rows)
+        host_times_ns = rows.spread(host_time_ns)[:, np.newaxis]
         per_pulse: dict[str, Callable[[Chosen], NDArray[Any]]] = {
-            "host_time_ns": lambda at: at(host_time_ns[:, np.newaxis]),
+            "host_time_ns": lambda at: at(host_times_ns),
             "device_time_ns": lambda at: at(times_ns),
             "encoder_rad": lambda at: at(angle),
         }
         if facet is not None:
             per_pulse["channel"] = lambda at: at(facet)
         locked = (header["flags"] & FLAG_PPS_LOCKED) * np.uint8(RETURN_FLAG_PPS_LOCKED)
+        common = common_words((len(header), 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis])
         # a pulse's head lies as one more slot before its own; beside a single slot, which pulses mostly fill, it is
         # left out
         content = np.ascontiguousarray(words[:, 1:] if slots == 1 else words).view(SLOT_DTYPE)
         return ReturnSlots(
             content=content,
             range_unit_m=RANGE_UNIT_M,
-            common=common_words((n, 1), mta_zone=header["mta_zone"][:, np.newaxis], flags=locked[:, np.newaxis]),
-            shape=(n, pulses),
-            pulse_id=unwrapped << 16,
+            common=rows.spread(common[:, 0])[:, np.newaxis],
+            shape=rows.shape,
+            pulse_id=rows.first_ids(unwrapped << 16),
             per_pulse=per_pulse,
             pulse_width_unit_ns=np.float32(PULSE_WIDTH_UNIT_NS),
             others=0 if slots == 1 else 1,
         )
 
 
-def _headers(units: ByteRows) -> StructArray:
-    return np.ascontiguousarray(units[:, :HEADER_BYTES]).view(HEADER_DTYPE).reshape(-1)
+def _same_layout(header: StructArray, slots: Int64Array) -> list[tuple[int, int]]:
+    """Bounds of runs of datagrams of one layout: equal R, tick_hz and encoder_counts.
 
-
-def _same_layout(header: StructArray) -> list[tuple[int, int]]:
-    """Bounds of runs of datagrams of one layout: equal N, R, tick_hz and encoder_counts.
-
-    None is of more than `BLOCK_SLOTS` slots (or one row).
+    None is of more than `BLOCK_SLOTS` slots (or one datagram); ``slots`` are those of all to the end of each, (n,).
     """
-    names = ("pulses", "return_slots", "tick_hz", "encoder_counts")
+    names = ("return_slots", "tick_hz", "encoder_counts")
     layout = np.stack([header[name].astype(np.int64) for name in names], axis=1)
     edges = [0, *(np.flatnonzero((layout[1:] != layout[:-1]).any(axis=1)) + 1).tolist(), len(header)]
     bounds = []
     for start, stop in pairwise(edges):
-        step = max(1, BLOCK_SLOTS // max(1, int(layout[start, 0] * layout[start, 1])))
-        bounds += [(at, min(at + step, stop)) for at in range(start, stop, step)]
+        while start < stop:
+            before = int(slots[start - 1]) if start else 0
+            full = int(slots.searchsorted(before + BLOCK_SLOTS, side="right"))
+            bounds.append((start, min(max(full, start + 1), stop)))
+            start = bounds[-1][1]
     return bounds
-
-
-def _clock_samples(host_time_ns: Int64Array, header: StructArray, units: ByteRows) -> StructArray:
-    """One `DEVICE_CLOCK_DTYPE` row a datagram: the counter at its last pulse beside the latched one."""
-    rows = np.empty(len(header), dtype=DEVICE_CLOCK_DTYPE)
-    last_ticks = header["first_ticks"].copy()
-    fired = header["pulses"] > 0
-    for slots in np.unique(header["return_slots"][fired]).tolist():
-        at = units.shape[1] - CRC.size - PULSE_HEAD_BYTES - SLOT_BYTES * slots
-        same = fired & (header["return_slots"] == slots)
-        last_ticks[same] += np.ascontiguousarray(units[same, at : at + 4]).view("<u4")[:, 0]
-    latched = header["pps_count"] > 0
-    rows["host_time_ns"] = host_time_ns
-    rows["device_time_ns"] = nanoseconds(last_ticks, header["tick_hz"])
-    rows["pps_time_ns"] = np.where(latched, nanoseconds(header["pps_ticks"], header["tick_hz"]), -1)
-    rows["pps_count"] = header["pps_count"]
-    rows["locked"] = header["flags"] & FLAG_PPS_LOCKED
-    return rows
 
 
 def _status(host_time_ns: int, scanner_id: int, flags: int, prf_mhz: int) -> DeviceStatus:

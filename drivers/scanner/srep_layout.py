@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
@@ -62,6 +63,12 @@ def pulse_dtype(return_slots: int) -> np.dtype[np.void]:
 def datagram_bytes(pulses: int, return_slots: int) -> int:
     """The only right length of a datagram."""
     return HEADER_BYTES + pulses * (PULSE_HEAD_BYTES + SLOT_BYTES * return_slots) + CRC.size
+
+
+def body_words(header: StructArray) -> Int64Array:
+    """Words of 64 bits that the pulses of datagrams take, (n,) of headers (n,)."""
+    words: Int64Array = header["pulses"].astype(np.int64) * (1 + header["return_slots"].astype(np.int64))
+    return words
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,13 +138,17 @@ def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64
     return ((seconds % np.uint64(_SECONDS)) * np.uint64(_NS) + rest * np.uint64(_NS) // hz).astype(np.int64)
 
 
-def header_checks(header: StructArray, length: int) -> list[tuple[str, BoolArray]]:
-    """What a header must say, by the code its failure is counted under; (n,) True where it does."""
-    pulses, slots = header["pulses"].astype(np.int64), header["return_slots"].astype(np.int64)
+def header_checks(header: StructArray, length: Int64Array) -> list[tuple[str, BoolArray]]:
+    """What headers (n,) of datagrams of these lengths (n,) must say, by the code a failure is counted under.
+
+    Returns:
+        (n,) True where it does, by code.
+    """
+    pulses, slots = header["pulses"], header["return_slots"]
     return [
         ("bad_magic", header["magic"] == MAGIC),
         ("bad_version", header["version"] == VERSION),
-        ("bad_length", datagram_bytes(1, 0) - PULSE_HEAD_BYTES + pulses * (8 + 8 * slots) == length),
+        ("bad_length", HEADER_BYTES + 8 * body_words(header) + CRC.size == length),
         (
             "bad_header",
             (slots >= 1)
@@ -148,18 +159,57 @@ def header_checks(header: StructArray, length: int) -> list[tuple[str, BoolArray
     ]
 
 
-def pulse_times(header: StructArray, ticks: NDArray[np.uint32]) -> Int64Array:
-    """Device times (n, N) of pulses ``ticks`` (n, N) after each datagram's first, of datagrams with one tick_hz.
+@dataclass(frozen=True, slots=True)
+class PulseRows:
+    """How the pulses of datagrams are laid out: a row is a datagram where all have equally many, else a pulse.
 
-    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64.
+    Attributes:
+        shape: rows, pulses of each.
+        counts: pulses of each datagram (n,), where a row is a pulse.
+    """
+
+    shape: tuple[int, int]
+    counts: NDArray[np.intp] | None = None
+
+    @classmethod
+    def of(cls, pulses: NDArray[np.uint16]) -> PulseRows:
+        """Of datagrams that have so many (n,)."""
+        if (pulses == pulses[0]).all():
+            return cls((len(pulses), int(pulses[0])))
+        counts = pulses.astype(np.intp)
+        return cls((int(counts.sum()), 1), counts)
+
+    def spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """What is said of datagrams (n,), of each row."""
+        return values if self.counts is None else np.repeat(values, self.counts)
+
+    def first_ids(self, ids: Int64Array) -> Int64Array:
+        """Of each row's first pulse, where the first of each datagram (n,) has these, and the others count on."""
+        if self.counts is None:
+            return ids
+        before = np.cumsum(self.counts) - self.counts
+        first: Int64Array = self.spread(ids - before)
+        first += np.arange(len(first))
+        return first
+
+
+def pulse_times(header: StructArray, ticks: NDArray[np.uint32], rows: PulseRows) -> Int64Array:
+    """Device times of pulses ``ticks`` after each datagram's first, of datagrams (n,) with one tick_hz.
+
+    The whole seconds are split off before: (rest + ticks) · 10⁹ < 2³³ · 10⁹ fits int64. Ticks and times are laid out
+    as ``rows``.
     """
     hz = int(header["tick_hz"][0])
-    seconds, rest = np.divmod(header["first_ticks"], np.uint64(hz))
+    seconds, left = np.divmod(header["first_ticks"], np.uint64(hz))
     base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * _NS
+    rest = left.astype(np.int64)
     after = ticks.astype(np.int64)
-    after += rest.astype(np.int64)[:, np.newaxis]
-    after *= _NS // hz if _NS % hz == 0 else _NS
-    if _NS % hz:
+    if _NS % hz == 0:
+        after *= _NS // hz
+        base += rest * (_NS // hz)
+    else:
+        after += rows.spread(rest)[:, np.newaxis]
+        after *= _NS
         after //= hz
-    after += base[:, np.newaxis]
+    after += rows.spread(base)[:, np.newaxis]
     return after

@@ -114,14 +114,24 @@ class KernelPps(PpsSource):
                 edge = self._fetch(0.0)
                 if edge.sequence == self._last_sequence and timeout_s > 0:
                     edge = self._fetch(min(timeout_s, LONGEST_FETCH_S))
+                if edge.sequence == self._last_sequence:
+                    self._see_that_it_is_there()
             except InterruptedError:
                 return []
+            except TransportError:
+                raise
             except OSError as error:
                 raise TransportError(self._why(error)) from error
             if edge.sequence == self._last_sequence:
                 return []
             self._last_sequence = edge.sequence
             return [edge]
+
+    def _see_that_it_is_there(self) -> None:
+        """The path still names what is open; of a source that was unregistered the kernel says nothing, for ever."""
+        opened, now = os.fstat(self._fd), os.stat(self._path)
+        if (now.st_dev, now.st_ino) != (opened.st_dev, opened.st_ino):
+            raise TransportError(f"{self._path}: was replaced by another PPS device")
 
     def close(self) -> None:
         """Close; waits for a `receive` under way, 0.4 s at most."""

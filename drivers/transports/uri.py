@@ -4,6 +4,7 @@ serial:<path>?baud=921600&bytesize=8&parity=N&stopbits=1&rtscts=no&xonxoff=no&ds
 udp:<host>:<port>?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=32
 can:<interface>:<channel>?<keyword>=<value>…
 gnss:<name>
+ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass, field
 
 from drivers.transports.base import PpsSource, Transport
 
-FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel> or gnss:<name>"
+FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
 
@@ -28,7 +29,7 @@ class TransportSpec:
     """One transport of the configuration, checked.
 
     Attributes:
-        kind: "serial", "udp", "can" or "gnss" (inside another device's stream: no transport of its own).
+        kind: "serial", "udp", "can", "ntrip" or "gnss" (inside another device's stream: no transport of its own).
         address: what stands between the kind and the options.
         options: keyword to value, as text.
         text: the whole, as configured.
@@ -58,6 +59,21 @@ class TransportSpec:
     def channel(self) -> str:
         """CAN channel (can0, /dev/ttyUSB0, 239.74.163.2)."""
         return self.address.partition(":")[2]
+
+    @property
+    def ntrip_host(self) -> str:
+        """A caster's name or address."""
+        return self.address.partition("/")[0].rpartition(":")[0].strip("[]")
+
+    @property
+    def ntrip_port(self) -> int:
+        """A caster's port number."""
+        return int(self.address.partition("/")[0].rpartition(":")[2])
+
+    @property
+    def mountpoint(self) -> str:
+        """Of a caster."""
+        return self.address.partition("/")[2]
 
     @property
     def device(self) -> str:
@@ -141,7 +157,27 @@ def _buffer_mb(value: str) -> bool:
     return True
 
 
-_Option = tuple[Callable[[str], bool], str]
+def ntrip_position(value: str) -> tuple[float, float, float]:
+    """Latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
+    lat, lon, height = (float(part) for part in value.split(","))
+    if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(height) <= 10_000.0):
+        raise ValueError("not on earth")
+    return lat, lon, height
+
+
+def _printable(value: str) -> bool:
+    if not value.isprintable() or ":" in value:
+        raise ValueError("not printable")
+    return True
+
+
+def _variable(value: str) -> bool:
+    if not value.isidentifier():
+        raise ValueError("not a variable's name")
+    return True
+
+
+_Option = tuple[Callable[[str], object], str]
 
 # option: (check, what would be right)
 SERIAL_OPTIONS: dict[str, _Option] = {
@@ -164,6 +200,14 @@ SOCKETCAN_OPTIONS: dict[str, _Option] = {
     "data_bitrate": (_positive, "bits per second such as 4000000"),
     "fd": (_boolean, "yes or no"),
     "buffer_mb": (_buffer_mb, f"whole mebibytes, 1 to {MAX_BUFFER_MB}"),
+}
+
+
+NTRIP_OPTIONS: dict[str, _Option] = {
+    "user": (_printable, "a user's name, without a colon"),
+    "password_env": (_variable, "the name of the environment variable that holds the password"),
+    "version": (_one_of("1", "2"), "1 or 2"),
+    "position": (ntrip_position, "latitude,longitude,height in degrees and metres, such as 47.5,8.7,500"),
 }
 
 
@@ -216,16 +260,31 @@ def _check_gnss(spec: TransportSpec) -> None:
         raise ValueError(f"transport {spec.text!r}: want gnss:<name> of a [gnss.<name>] section, without options")
 
 
+def _check_ntrip(spec: TransportSpec) -> None:
+    place, _, mountpoint = spec.address.partition("/")
+    host, _, port = place.rpartition(":")
+    if not host or not mountpoint or not all(letter.isprintable() and letter != " " for letter in spec.address):
+        raise ValueError(
+            f"transport {spec.text!r}: want ntrip:<host>:<port>/<mountpoint>, such as ntrip:caster.example:2101/ZIMM0"
+        )
+    if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535, such as 2101")
+    _check_options(spec, NTRIP_OPTIONS)
+    if "password_env" in spec.options and "user" not in spec.options:
+        raise ValueError(f"transport {spec.text!r}: password_env needs user=<name> too")
+
+
 _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "serial": _check_serial,
     "udp": _check_udp,
     "can": _check_can,
     "gnss": _check_gnss,
+    "ntrip": _check_ntrip,
 }
 
 
-def open_transport(spec: TransportSpec) -> Transport:
-    """The transport for ``spec``, not yet opened.
+def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
+    """The transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant computer.
 
     Raises:
         ValueError: the kind has no transport of its own (gnss).
@@ -240,6 +299,10 @@ def open_transport(spec: TransportSpec) -> Transport:
         return SerialTransport(spec)
     if spec.kind == "can":
         return _open_can(spec)
+    if spec.kind == "ntrip":
+        from drivers.transports.ntrip_client import NtripTransport
+
+        return NtripTransport(spec, stopped)
     raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
 
 

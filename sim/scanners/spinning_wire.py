@@ -167,5 +167,6 @@ def head_config(table: ScannerTable, transport: str, protocol: str) -> dict[str,
         "lever_arm_m": [nominal.lever_arm_x_m, nominal.lever_arm_y_m, nominal.lever_arm_z_m],
         "range_min_m": table.range_min_m,
         "range_max_m": table.range_max_m,
+        "divergence_mrad": table.divergence_mrad,
     }
     return config | ({"pps": table.pps} if table.pps is not None else {})

@@ -226,6 +226,7 @@ def config_table(table: ScannerTable, name: str, transport: str) -> dict[str, An
         "lever_arm_m": [getattr(table.nominal, f"lever_arm_{axis}_m") for axis in "xyz"],
         "range_min_m": table.range_min_m,
         "range_max_m": table.range_max_m,
+        "divergence_mrad": table.divergence_mrad,
         "geometry": config_geometry(table),
     }
     return config if table.pps is None else config | {"pps": table.pps}

@@ -18,7 +18,7 @@ import random
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
+from functools import cache, partial
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -400,8 +400,23 @@ def run_packets(make: Factory, units: Sequence[bytes], largest: Callable[[], int
     return outcome(records + parser.close(), parser)
 
 
+def run_together(make: Factory, units: Sequence[bytes], some: Callable[[], int]) -> Outcome:
+    """The same, ``some()`` batches of any lengths at once, each of at most as many rows."""
+    parser = make()
+    records: list[Record] = []
+    batches = iter(packet_batches(units, some))
+    while held := list(itertools.islice(batches, max(1, some()))):
+        records += parser.feed_batches(held)
+    return outcome(records + parser.close(), parser)
+
+
+def few_or_many(rng: random.Random) -> int:
+    """A size of 1 to 99, small ones as likely as large."""
+    return int(100 ** rng.random())
+
+
 def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = (1, 2, 3)) -> Outcome:
-    """Largest batches, one by one through `feed`, and random batch sizes: same records, same counters."""
+    """Largest batches, one by one through `feed`, random batch sizes, several at once: same records, same counters."""
     assert units, "an empty recording proves nothing"
     whole = run_packets(make, units, lambda: len(units))
     assert whole.counters["bytes"] == sum(map(len, units))
@@ -413,8 +428,10 @@ def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = 
     assert outcome(single + parser.close(), parser) == whole, "differs when fed one by one"
     for seed in seeds:
         rng = random.Random(seed)
-        got = run_packets(make, units, lambda rng=rng: int(100 ** rng.random()))  # type: ignore[misc]
+        got = run_packets(make, units, partial(few_or_many, rng))
         assert got == whole, f"differs in batches of seed {seed}"
+        got = run_together(make, units, partial(few_or_many, rng))
+        assert got == whole, f"differs in several batches at once, of seed {seed}"
     return whole
 
 
@@ -445,5 +462,6 @@ def check_packet_damage(make: Factory, units: Sequence[bytes], *, examples: int 
         got = run_packets(fresh, broken, lambda: int(100 ** rng.random()))
         assert got.counters["bytes"] == sum(map(len, broken))
         assert got == run_packets(fresh, broken, lambda: 1)
+        assert got == run_together(fresh, broken, lambda: int(100 ** rng.random()))
 
     property_holds()

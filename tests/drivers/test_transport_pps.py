@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -231,6 +232,34 @@ def test_a_pty_has_no_dcd() -> None:
         SerialDcdPps(os.ttyname(slave)).open()
     os.close(master)
     os.close(slave)
+
+
+def test_kernel_source_that_vanishes_or_is_another_one_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = tmp_path / "pps0"
+
+    def silent(fd: int, request: int, argument: bytes) -> bytes:
+        """An ioctl of a source that has had one edge and no more; it goes on so when the source is unregistered."""
+        if request == PPS_FETCH and FETCH_DATA.unpack(argument)[9:11] != (0, 0):
+            raise TimeoutError
+        values = {
+            PPS_GETCAP: (1).to_bytes(4, sys.byteorder),
+            PPS_GETPARAMS: PARAMETERS.pack(1, 1, *(0,) * 6),
+            PPS_FETCH: FETCH_DATA.pack(1, 0, 1_800_000_000, 0, 0, 0, 0, 0, 0, 0, 0, 0),
+        }
+        return values[request]
+
+    monkeypatch.setattr("fcntl.ioctl", silent)
+    for replaced, says in ((False, "there is no such PPS device"), (True, "was replaced by another PPS device")):
+        device.write_bytes(b"")
+        source = KernelPps(str(device))
+        source.open()
+        assert source.receive(0.1) == []
+        device.rename(tmp_path / "gone")
+        if replaced:
+            device.write_bytes(b"")
+        with pytest.raises(TransportError, match=says):
+            source.receive(0.1)
+        source.close()
 
 
 def test_ioctl_numbers_and_layouts_are_those_of_the_header() -> None:

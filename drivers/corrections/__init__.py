@@ -1,0 +1,1 @@
+"""Corrections of base stations: one file a protocol."""
