@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -17,16 +18,21 @@ Compiled = TypeVar("Compiled", bound=Callable[..., Any])
 _njit: Any = numba.njit
 
 
-def _digest() -> int:
-    """A number that changes with the text of any module whose functions or constants may be compiled into another's."""
+_HERE = Path(__file__).parent
+
+
+@cache
+def _digest(folder: Path) -> int:
+    """A number that changes with the text of any module whose functions or constants may be compiled into another's.
+
+    Those here, and those of the folder of a package that builds on this one.
+    """
     digest = 0
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        if "timescales" not in path.parts:
-            digest = zlib.crc32(path.read_bytes(), digest)
+    for one in (_HERE, *(() if folder.is_relative_to(_HERE) else (folder,))):
+        for path in sorted(one.rglob("*.py")):
+            if "timescales" not in path.parts:
+                digest = zlib.crc32(path.read_bytes(), digest)
     return digest
-
-
-_DIGEST = _digest()
 
 
 def kernel(function: Compiled) -> Compiled:
@@ -47,7 +53,8 @@ def kept(function: Compiled) -> Compiled:
     try:
         compiled = _njit(cache=True, **options)(function)
         index = compiled._cache._cache_file  # noqa: SLF001  (numba has no other way in)
-        index._source_stamp = (index._source_stamp, _DIGEST)  # noqa: SLF001
+        stamp = _digest(Path(function.__code__.co_filename).parent)
+        index._source_stamp = (index._source_stamp, stamp)  # noqa: SLF001
     except (RuntimeError, AttributeError):
         compiled = _njit(**options)(function)
     kept_one: Compiled = compiled

@@ -29,7 +29,7 @@ def _place(
     for i in range(len(device_ns)):
         cell = (device_ns[i] >> CELL_BITS) - first_cell
         into = device_ns[i] - ((cell + first_cell) << CELL_BITS)
-        out[i] = gps_ns[cell] + round(into * rate[cell])
+        out[i] = gps_ns[cell] + np.int64(np.rint(into * rate[cell]))
 
 
 @kept

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on, weeks_ns
 from georef.formats.trajectory_columns import TrajectoryColumns, unsaid
-from georef.records import Int64Array
+from georef.records import FixType, Int64Array
 from georef.timescales.gps_time import DAY_NS, SECOND_NS
 from georef.trajectory import TrajectoryError
 
@@ -24,6 +24,15 @@ TIME_SYSTEMS = ("GPST", "UTC", "JST")
 HEADER = re.compile(rf"^%\s*({'|'.join(TIME_SYSTEMS)})\s+(\S.*)$", re.MULTILINE)
 DMS = "(d'\")"
 GEODETIC, ECEF = ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef")
+# Column Q (manual, appendix B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
+FIX_TYPES = {
+    1: FixType.RTK_FIXED,
+    2: FixType.RTK_FLOAT,
+    3: FixType.DIFFERENTIAL,
+    4: FixType.DIFFERENTIAL,
+    5: FixType.SINGLE,
+    6: FixType.PPP,
+}
 
 
 def is_rtklib_pos(text: str) -> bool:
@@ -55,6 +64,10 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
         *(position_sigma_l, unsaid(len(time_ns))),
         "line",
         numbered[0][0],
+        fix_type=fix_types(table.get("q"), FIX_TYPES),
+        satellites=None if "ns" not in table else np.clip(table["ns"], 0, 255).astype(np.uint8),
+        velocity_sigma_l=_stacked(table, ("sdvn", "sdve", "sdvu")) if "sdvn" in table else None,
+        position_correlation_l=_correlation_l(table, position_sigma_l),
     )
 
 
@@ -84,6 +97,23 @@ def degrees_of(dms: FloatArray) -> FloatArray:
     size = np.abs(dms) @ np.array([1.0, 1.0 / 60.0, 1.0 / 3600.0])
     degrees: FloatArray = np.copysign(size, dms[:, 0])
     return degrees
+
+
+def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> NDArray[np.uint8] | None:
+    """(n,) `FixType` of a column of quality numbers; NONE of a number that is not known, None without a column."""
+    if quality is None:
+        return None
+    return np.array([known.get(int(q) if np.isfinite(q) else 0, FixType.NONE) for q in quality], dtype=np.uint8)
+
+
+def _correlation_l(table: dict[str, FloatArray], sigma_l: FloatArray) -> FloatArray | None:
+    """(n, 3) of north–east, north–down, east–down, of sdne, sdeu, sdun: roots of covariances with their sign."""
+    if not all(column in table for column in ("sdne", "sdeu", "sdun")):
+        return None
+    mixed = _stacked(table, ("sdne", "sdun", "sdeu")) * np.array([1.0, -1.0, -1.0])
+    scale = sigma_l[:, [0, 0, 1]] * sigma_l[:, [1, 2, 2]]
+    found: FloatArray = np.copysign(mixed**2, mixed) / np.where(scale > 0.0, scale, np.inf)
+    return np.where(np.abs(found) < 1.0, found, 0.0)
 
 
 def _gps_ns(system: str, dates: list[str], clocks: list[str], name: str, leap_seconds: int | None) -> Int64Array:

@@ -116,9 +116,16 @@ def sbet_bytes(trajectory: Trajectory) -> bytes:
     return table.tobytes()
 
 
-def smrmsg_bytes(trajectory: Trajectory) -> bytes:
-    """The trajectory's sigmas as an smrmsg, an epoch each; unsaid ones, as those of the velocities, are nan."""
+def smrmsg_bytes(trajectory: Trajectory, velocity_sigma_l: FloatArray | None = None) -> bytes:
+    """The trajectory's sigmas as an smrmsg, an epoch each; unsaid ones are nan.
+
+    Args:
+        trajectory: says those of position and attitude.
+        velocity_sigma_l: (n, 3) north, east, down, m/s; None: unsaid.
+    """
     table = np.full((len(trajectory), SMRMSG_DOUBLES), np.nan, dtype="<f8")
+    if velocity_sigma_l is not None:
+        table[:, 4:7] = velocity_sigma_l
     table[:, 0] = _of_first_week_ns(trajectory) / SECOND_NS
     table[:, 1:4] = trajectory.position_sigma_l
     table[:, 7:10] = trajectory.attitude_sigma_rad / ARC_MINUTE

@@ -36,6 +36,9 @@ class TrajectoryColumns:
         row: what a row is called in messages: record, line.
         first_row: number of the first one.
         angles_in: the unit which the file should have for attitudes and positions, for messages.
+        fix_type, satellites: (n,) of positions of an antenna, `georef.records.FixType`; None: the file does not say.
+        velocity_sigma_l: (n, 3) one standard deviation; None likewise.
+        position_correlation_l: (n, 3) of north–east, north–down, east–down; None likewise.
     """
 
     time_ns: Int64Array
@@ -51,6 +54,10 @@ class TrajectoryColumns:
     row: str = "record"
     first_row: int = 1
     angles_in: str = "degrees"
+    fix_type: NDArray[np.uint8] | None = None
+    satellites: NDArray[np.uint8] | None = None
+    velocity_sigma_l: FloatArray | None = None
+    position_correlation_l: FloatArray | None = None
 
     def at(self, where: NDArray[np.bool_]) -> str:
         """The first row at which something is so, by name."""

@@ -17,10 +17,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.formats.rtklib_pos import degrees_of
+from georef.formats.rtklib_pos import degrees_of, fix_types
 from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on
 from georef.formats.trajectory_columns import Span, TrajectoryColumns, continuous_of_week, placed_in_week
-from georef.records import Int64Array
+from georef.records import FixType, Int64Array
 from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS
 from georef.trajectory import TrajectoryError
 
@@ -47,6 +47,21 @@ NAMES = {
     **dict.fromkeys(("rollsd", "sdroll"), "sigma_roll"),
     **dict.fromkeys(("pitchsd", "sdpitch"), "sigma_pitch"),
     **dict.fromkeys(("headingsd", "hdngsd", "sdheading", "headsd"), "sigma_heading"),
+    **dict.fromkeys(("sdvn", "sdvnorth", "vnsd"), "sigma_v_north"),
+    **dict.fromkeys(("sdve", "sdveast", "vesd"), "sigma_v_east"),
+    **dict.fromkeys(("sdvh", "sdvu", "sdvup", "vhsd"), "sigma_v_up"),
+    **dict.fromkeys(("q", "quality"), "quality"),
+    **dict.fromkeys(("ns", "numsv", "numsats"), "satellites"),
+}
+# Quality number of Waypoint's programs: 1 fixed integer, 2 converged float or noisy fixed, 3 and 4 converging float,
+# 5 differential code, 6 less than that
+FIX_TYPES = {
+    1: FixType.RTK_FIXED,
+    2: FixType.RTK_FLOAT,
+    3: FixType.RTK_FLOAT,
+    4: FixType.RTK_FLOAT,
+    5: FixType.DIFFERENTIAL,
+    6: FixType.SINGLE,
 }
 NEEDED = {"lat": "Latitude", "lon": "Longitude", "height": "H-Ell"}
 TOKEN = re.compile(r"\([^)]*\)|\S+")
@@ -156,6 +171,15 @@ def read_waypoint(
         *(np.stack(sigmas, axis=1), np.stack(angle_sigmas, axis=1)),
         "line",
         sheet.first_line,
+        fix_type=fix_types(sheet.numbers("quality") if "quality" in sheet.columns else None, FIX_TYPES),
+        satellites=np.clip(sheet.numbers("satellites"), 0, 255).astype(np.uint8)
+        if "satellites" in sheet.columns
+        else None,
+        velocity_sigma_l=np.stack(
+            [sheet.quantity(f"sigma_v_{axis}", METRES_PER_SECOND) for axis in ("north", "east", "up")], axis=1
+        )
+        if "sigma_v_north" in sheet.columns
+        else None,
     )
 
 

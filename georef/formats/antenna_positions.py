@@ -1,0 +1,47 @@
+"""Positions of an antenna from post-processing, as observations for navigation: RTKLIB .pos and Waypoint text."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
+from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
+from georef.formats.trajectory_csv import is_csv
+from georef.formats.waypoint import is_waypoint, read_waypoint
+from georef.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
+
+
+def read_antenna_positions(
+    data: bytes, name: str, *, span_ns: Span | None = None, week: int | None = None, leap_seconds: int | None = None
+) -> TrajectoryColumns:
+    """Rows of a file of positions, with sigmas, fix types and velocities as far as it says them.
+
+    Args:
+        data: the file.
+        name: for messages.
+        span_ns: GPS time of the log's first and last record: tells the week of files that say none.
+        week: GPS week of the first row; goes before span_ns.
+        leap_seconds: GPS − UTC as the log knows it, for files in UTC.
+
+    Raises:
+        TrajectoryError: in one line what is wrong; a file with attitudes is no antenna's.
+    """
+    text = data.decode("utf-8", errors="replace")
+    if is_rtklib_pos(text):
+        columns = read_rtklib_pos(text, name, leap_seconds=leap_seconds)
+    elif is_waypoint(text):
+        columns = read_waypoint(text, name, span_ns=span_ns, week=week, leap_seconds=leap_seconds)
+    elif is_csv(text):
+        raise TrajectoryError(_finished(name))
+    else:
+        raise TrajectoryError(f"{name}: is no file of an antenna's positions: RTKLIB .pos or Waypoint text is expected")
+    if np.isfinite(columns.roll_rad).any():
+        raise TrajectoryError(_finished(name))
+    trajectory_of(columns, name, DEFAULT_MAX_GAP_NS)  # refuses what cannot be meant
+    return columns
+
+
+def _finished(name: str) -> str:
+    return (
+        f"{name}: has attitudes, so it is a finished trajectory and no antenna's positions; want GNSS positions alone"
+    )

@@ -1,0 +1,181 @@
+"""A whole flight: filter, smoother, the noise found, and further passes from where the smoothed flight began.
+
+The filter is linear about its own state, which is poor while the heading is hardly known: a pass that begins with the
+smoothed attitude has small errors from its first sample on, and with the prior sigmas kept it learns nothing twice that
+matters. A GNSS time offset is taken out of the observations' times likewise, so that what is left of it is small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.earth import geodetic_from_e, rot_e_from_l
+from georef.navigation.filter import FilterRun, run_filter
+from georef.navigation.inputs import Inertial, Kind, Setup, Solution, Start
+from georef.navigation.noise import NoiseFound, find_noise, moment_scales, scaled
+from georef.navigation.smoother import SmoothedNodes, forward, smooth_nodes, solution_of
+from georef.navigation.stores import IN_MEMORY, Storage
+from georef.navigation.strapdown import ATTITUDE, TIME_OFFSET
+from georef.records import StructArray
+from georef.rotations import attitude_of, rot_from_quaternion
+from georef.timescales import SECOND_NS
+
+FloatArray = NDArray[np.float64]
+
+MOST_PASSES = 3
+STRETCH_S = 600.0  # of the flight, on which hypotheses of noise are compared
+LINEAR_SHARE = 0.1  # of the sigma: what an angle's square may be
+OFFSET_LEFT_S = 5e-4
+WEAK = 0.5  # of the prior sigma: an estimate that keeps so much has learnt little
+OF_GNSS = (Kind.POSITION, Kind.VELOCITY, Kind.HEADING)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was found on the way.
+
+    Attributes:
+        passes: how many.
+        start_change_rad: (passes,) how far the smoothed attitude at the start was from the assumed one.
+        noise: of GNSS positions; None: not asked for, or given.
+        time_offset_s: of GNSS, all passes together; 0 where not estimated.
+        weak: estimates that the flight says little of, by name.
+        setup: that the flight was smoothed with.
+    """
+
+    passes: int
+    start_change_rad: tuple[float, ...]
+    noise: NoiseFound | None
+    time_offset_s: float
+    weak: tuple[str, ...]
+    setup: Setup
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A flight: by what was known at each moment, and by all of it.
+
+    Attributes:
+        run: of the filter, that was smoothed.
+    """
+
+    forward: Solution
+    smoothed: Solution
+    report: Report
+    run: FilterRun
+
+
+def solve(
+    inertial: Inertial,
+    observations: StructArray,
+    setup: Setup,
+    start: Start,
+    *,
+    noise_from_flight: bool = True,
+    storage: Storage = IN_MEMORY,
+) -> Solved:
+    """Filter and smooth a whole flight.
+
+    Args:
+        inertial, observations: of it, observations in any order.
+        setup, start: of the first pass.
+        noise_from_flight: look whether GNSS positions are as good as said, and go by what is found: a factor on their
+            sigmas, and, where the setup does not say it, which share of their errors lasts.
+        storage: where the runs and the solutions are kept.
+    """
+    run = run_filter(inertial, observations, setup, start, storage=storage)
+    as_said, found = setup, None
+    if noise_from_flight:
+        setup, found = _by_the_flight(inertial, observations, setup, start, run)
+    if setup is not as_said:
+        run = run_filter(inertial, observations, setup, start, storage=storage)
+    flown, nodes = forward(run), smooth_nodes(run)
+    changes, offset_s = [_change(nodes)], 0.0
+    while (_bent(nodes) or abs(nodes.state[0, TIME_OFFSET]) > OFFSET_LEFT_S) and len(changes) < MOST_PASSES:
+        offset_s += float(nodes.state[0, TIME_OFFSET])
+        start = replace(start, attitude_rad=_attitude(nodes))
+        run = run_filter(inertial, _shifted(observations, offset_s), setup, start, storage=storage)
+        nodes = smooth_nodes(run)
+        changes.append(_change(nodes))
+    smoothed = _unshifted(solution_of(run, nodes), offset_s)
+    whole_s = float(smoothed.time_offset_s[0])
+    report = Report(len(changes), tuple(changes), found, whole_s, _weak(smoothed, setup), setup)
+    return Solved(flown, smoothed, report, run)
+
+
+def _by_the_flight(
+    inertial: Inertial, observations: StructArray, setup: Setup, start: Start, run: FilterRun
+) -> tuple[Setup, NoiseFound | None]:
+    """The setup, or one that goes by the noise of GNSS positions that a run with it showed; and what was tried."""
+    if setup.gnss_correlated_share > 0.0:
+        scales = moment_scales(setup, run.innovations)
+        return (replace(setup, gnss_sigma_scale=setup.gnss_sigma_scale | scales) if scales else setup), None
+    if setup.gnss_sigma_scale:
+        return setup, None
+    found = _noise(inertial, observations, setup, start, run)
+    return (scaled(setup, found.best.scale, found.best.share) if found.changed else setup), found
+
+
+def _noise(inertial: Inertial, observations: StructArray, setup: Setup, start: Start, run: FilterRun) -> NoiseFound:
+    """Hypotheses compared on the first `STRETCH_S` seconds."""
+    end_ns = start.time_ns + round(STRETCH_S * SECOND_NS)
+    part = inertial.between(0, int(np.searchsorted(inertial.time_ns, end_ns)))
+    rows = observations[observations["time_ns"] < end_ns]
+
+    def stretch(asked: Setup) -> StructArray:
+        return run_filter(part, rows, asked, start).innovations
+
+    return find_noise(run.innovations, stretch, setup)
+
+
+def _attitude(nodes: SmoothedNodes) -> FloatArray:
+    """(3,) smoothed roll, pitch, heading of the first node."""
+    lat, lon, _ = geodetic_from_e(nodes.state[0, :3])
+    rot = rot_e_from_l(lat, lon).T @ rot_from_quaternion(nodes.state[0, ATTITUDE : ATTITUDE + 4])
+    return np.array(attitude_of(rot), dtype=np.float64)
+
+
+def _change(nodes: SmoothedNodes) -> float:
+    """Angle between the smoothed attitude at the start and the assumed one."""
+    return float(np.linalg.norm(nodes.leave[0, 6:]))
+
+
+def _bent(nodes: SmoothedNodes) -> bool:
+    """Whether the change at the start was too large for what is linear in it: its square against the sigma."""
+    return bool(_change(nodes) ** 2 > LINEAR_SHARE * nodes.sigma[0, 6:].min())
+
+
+def _of_gnss(kinds: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    return np.isin(kinds, [int(kind) for kind in OF_GNSS])
+
+
+def _shifted(observations: StructArray, offset_s: float) -> StructArray:
+    """Observations with the offset added to the times of GNSS."""
+    rows = observations.copy()
+    rows["time_ns"][_of_gnss(rows["kind"])] += round(offset_s * SECOND_NS)
+    return rows
+
+
+def _unshifted(solution: Solution, offset_s: float) -> Solution:
+    """Innovations at the observations' own times, the whole offset in the estimates."""
+    if offset_s == 0.0:
+        return solution
+    return replace(
+        solution,
+        innovations=_shifted(solution.innovations, -offset_s),
+        time_offset_s=solution.time_offset_s + offset_s,
+    )
+
+
+def _weak(solution: Solution, setup: Setup) -> tuple[str, ...]:
+    """Estimates of the installation that keep most of their prior sigma."""
+    last: list[tuple[str, float, float]] = []
+    if setup.estimate_lever_arm > 0.0:
+        for name, sigma in zip("xyz", solution.lever_arm_sigma[-1].tolist(), strict=True):
+            last.append((f"lever arm {name}", sigma, setup.estimate_lever_arm))
+    if setup.estimate_time_offset_s > 0.0:
+        last.append(("time offset", float(solution.time_offset_sigma_s[-1]), setup.estimate_time_offset_s))
+    return tuple(name for name, sigma, prior in last if sigma > WEAK * prior)

@@ -1,0 +1,103 @@
+"""Where a vehicle stands still, by its inertial unit and its receiver together; each such second is an observation.
+
+Neither tells it alone: straight flight at an even speed feels like standing, and a receiver's velocity of nothing may
+be a hover or a slow roll.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.navigation.gravity import EARTH_RATE_RADPS
+from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
+from georef.records import StructArray
+from georef.timescales import SECOND_NS
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+TURN_RADPS = 4e-3  # mean of a second: above it something turns; biases of a good unit are below
+FORCE_MPS2 = 0.08  # by which means of neighbouring seconds may differ
+SIGMAS = 3.0  # of a receiver's velocity or change of position: beyond them it moves, but
+MOVES_MPS = (0.05, 0.3)  # never below the first of these, and always above the second
+DRIFTS_M = (0.3, 1.0)  # the same of positions some epochs apart, where no velocity is said
+SIGMA_MPS = 0.02  # a standing aircraft sways in the wind, and a running engine shakes it
+BESIDE = 2  # seconds on either side that must be still too
+
+
+def still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
+    """Observations of no velocity, one in the middle of each whole second of GPS time that the vehicle stood.
+
+    Args:
+        inertial: of a piece without gaps.
+        observations: `OBSERVATION_DTYPE`; seconds without a receiver's position or velocity are never taken.
+
+    Returns:
+        `OBSERVATION_DTYPE` of Kind.ZERO_VELOCITY, sorted.
+    """
+    if len(inertial) < 2:
+        return np.zeros(0, OBSERVATION_DTYPE)
+    first, last = int(inertial.time_ns[0]) // SECOND_NS + 1, int(inertial.time_ns[-1]) // SECOND_NS
+    count = max(last - first, 0)
+    still = _feels_still(inertial, first, count) & _seen_still(observations, first, count)
+    around = np.ones(count, np.bool_)
+    for shift in range(-BESIDE, BESIDE + 1):
+        around &= np.roll(still, shift)
+    around[:BESIDE] = around[count - BESIDE :] = False
+    seconds = first + np.flatnonzero(around)
+    rows = np.zeros(len(seconds), OBSERVATION_DTYPE)
+    rows["time_ns"] = seconds * SECOND_NS + SECOND_NS // 2
+    rows["kind"], rows["sigma"] = Kind.ZERO_VELOCITY, SIGMA_MPS
+    return rows
+
+
+def with_still_seconds(inertial: Inertial, observations: StructArray) -> StructArray:
+    """The observations and those of standing still."""
+    return sort_observations(np.concatenate([observations, still_seconds(inertial, observations)]))
+
+
+def _feels_still(inertial: Inertial, first: int, count: int) -> BoolArray:
+    """(count,) of whole seconds from ``first`` on: no turn beside the earth's, and the same force as the neighbours."""
+    number = (inertial.time_ns - 1) // SECOND_NS - first
+    inside = (number >= 0) & (number < count)
+    number = number[inside]
+    time_s = np.bincount(number, inertial.interval_s[inside], count)
+    made_up = np.bincount(number, inertial.bridged[inside], count) > 0
+    known = (time_s > 0.5) & ~made_up
+    turn, force = (
+        np.stack([np.bincount(number, column[inside, axis], count) for axis in range(3)], axis=1)
+        / np.where(known, time_s, np.inf)[:, np.newaxis]
+        for column in (inertial.angle_b, inertial.velocity_b)
+    )
+    even = np.linalg.norm(np.diff(force, axis=0, prepend=force[:1]), axis=1) < FORCE_MPS2
+    still: BoolArray = known & even & (np.linalg.norm(turn, axis=1) < TURN_RADPS + EARTH_RATE_RADPS)
+    return still
+
+
+def _seen_still(observations: StructArray, first: int, count: int) -> BoolArray:
+    """(count,) a receiver's velocity says so, or its positions where it says none."""
+    seen, moves = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    for kind, moving in ((Kind.VELOCITY, _by_velocity), (Kind.POSITION, _by_position)):
+        rows = observations[observations["kind"] == kind]
+        rows = rows[np.isfinite(rows["value"]).all(axis=1) & np.isfinite(rows["sigma"]).all(axis=1)]
+        number = rows["time_ns"] // SECOND_NS - first
+        inside = (number >= 0) & (number < count)
+        if len(rows) and not seen.any():
+            seen[number[inside]] = True
+            moves[number[inside & moving(rows)]] = True
+    return seen & ~moves
+
+
+def _by_velocity(rows: StructArray) -> BoolArray:
+    limit = np.clip(SIGMAS * np.linalg.norm(rows["sigma"], axis=1), *MOVES_MPS)
+    moves: BoolArray = np.linalg.norm(rows["value"], axis=1) > limit
+    return moves
+
+
+def _by_position(rows: StructArray) -> BoolArray:
+    """Against the position some epochs before: less than noise, and than what a slow roll makes."""
+    back = np.maximum(np.arange(len(rows)) - BESIDE - 1, 0)
+    away = np.linalg.norm(rows["value"] - rows["value"][back], axis=1)
+    moves: BoolArray = away > np.clip(SIGMAS * np.linalg.norm(rows["sigma"], axis=1), *DRIFTS_M)
+    return moves

@@ -1,0 +1,67 @@
+"""Whether sigmas are what errors are: normalised estimation errors squared (NEES), over many flights with drawn noise.
+
+Errors of neighbouring moments are alike, so that a flight of many samples has few independent ones. Their number is
+found from the flights themselves: with v₁ the variance of the NEES at one moment and v the variance, from flight to
+flight, of its mean over a flight, a flight counts v₁ / v samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from georef.navigation.inputs import Solution
+from tests.georef.navigation.flights import Truth, errors
+from tests.georef.navigation.vehicles import BEGIN_NS
+
+FloatArray = NDArray[np.float64]
+PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
+
+
+@dataclass(frozen=True)
+class Honesty:
+    """Of one part of the state.
+
+    Attributes:
+        mean: NEES of three components over 3; 1 where sigmas are right.
+        low, high: of its 99.8 % interval.
+        independent: samples that it counts as, all flights together.
+    """
+
+    mean: float
+    low: float
+    high: float
+    independent: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the mean lies within."""
+        return self.low <= self.mean <= self.high
+
+
+def squares(truth: Truth, solution: Solution, from_s: float, step_s: float) -> FloatArray:
+    """(k, 9) squares of normalised errors, every so often."""
+    t = (solution.time_ns - BEGIN_NS) / 1e9
+    at = np.searchsorted(t, np.arange(max(from_s, t[0]), t[-1], step_s))
+    off = errors(truth, t[at], solution.position_e[at], solution.velocity_e[at], solution.q_e_from_b[at])
+    sigma = (solution.position_sigma_l, solution.velocity_sigma_l, solution.attitude_sigma_rad)
+    normalised: FloatArray = (off / np.concatenate([column[at] for column in sigma], axis=1)) ** 2
+    return normalised
+
+
+def judge(flights: list[FloatArray]) -> dict[str, Honesty]:
+    """Of the squares of many flights of one length."""
+    stacked = np.stack(flights)
+    found = {}
+    for name, part in PARTS.items():
+        nees = stacked[:, :, part].mean(axis=2)  # (flights, moments)
+        means = nees.mean(axis=1)
+        each = nees.var(axis=0, ddof=1).mean()
+        independent = len(means) * float(np.clip(each / means.var(ddof=1), 1.0, nees.shape[1]))
+        degrees = 2.0 / each * independent  # of a χ² whose mean is 1 and whose variance at one moment is that
+        low, high = chi2.ppf([0.001, 0.999], degrees) / degrees
+        found[name] = Honesty(float(means.mean()), float(low), float(high), independent)
+    return found

@@ -1,0 +1,49 @@
+"""Sigmas are what errors are: over seeds, with white and with lasting errors of GNSS (the long run is a benchmark)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.navigation.filter import run_filter
+from georef.navigation.inputs import GRADES, Fate
+from georef.navigation.smoother import forward, smooth
+from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
+from tests.georef.navigation.honesty import judge, squares
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+ARM = np.array([0.35, -0.12, -1.1])
+
+
+@cache
+def flight() -> Truth:
+    return fly(survey(), 240.0, 50.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7], ids=["white", "lasting"])
+@pytest.mark.parametrize("grade", ["tactical", "mems"])
+def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
+    """32 flights: NEES of position, velocity and attitude within 99.8 % of what chance allows, filtered and smoothed;
+    innovations likewise.
+    """
+    moments: list[float] = []
+    squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
+    for seed in range(32):
+        inertial, rows = noised(flight(), GRADES[grade], Fixes(share=share, tau_s=60.0), ARM, seed)
+        setup = replace(setup_for(GRADES[grade], ARM), gnss_correlated_share=share, position_floor_m=0.001)
+        run = run_filter(inertial, rows, setup, drawn_start(flight(), seed))
+        told = run.innovations[run.innovations["fate"] <= Fate.REACQUIRED]
+        moments.append(float(np.mean(told["normalised"] ** 2)))
+        for what, solution in (("filtered", forward(run)), ("smoothed", smooth(run))):
+            squared[what].append(squares(flight(), solution, 30.0, 0.5))
+    for what, flights in squared.items():
+        for name, honesty in judge(flights).items():
+            assert honesty.holds, (what, name, honesty)
+            assert honesty.independent > 40.0, (what, name, honesty)
+    assert 0.95 < np.mean(moments) < 1.05

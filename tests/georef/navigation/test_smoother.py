@@ -1,0 +1,153 @@
+"""The smoother: against Rauch, Tung and Striebel's own formulas, on the reference flights, and smooth between nodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.navigation.error_model import MOVED
+from georef.navigation.filter import FilterRun, run_filter
+from georef.navigation.inputs import GRADES, Kind, Solution
+from georef.navigation.smoother import forward, smooth, smooth_nodes, solution_of
+from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
+from tests.georef.navigation.scores import (
+    LINES_S,
+    OUTAGES_M,
+    SMOOTHER,
+    flight_errors,
+    of_maxima,
+    outages,
+    rms,
+    start_of,
+    without,
+)
+from tests.georef.navigation.vehicles import reference
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+ARM = np.array([0.35, -0.12, -1.1])
+
+
+@pytest.mark.parametrize("name", ["tactical", "mems"])
+def test_the_reference_flight_is_smoothed_as_well_as_can_be(name: str) -> None:
+    """Positions only; each figure within a tenth of the README's smoother, in outages too."""
+    flown, start = reference(name), start_of("reference_flight", name)
+    rows = flown.only(Kind.POSITION)
+    solution = smooth(run_filter(flown.inertial, rows, flown.setup, start))
+    _, off = flight_errors(name, solution, LINES_S)
+    assert (rms(off) <= 1.10 * np.array(SMOOTHER[name])).all(), rms(off)
+    inside = (solution.time_ns >= start.time_ns + 580 * 10**9) & (solution.time_ns <= start.time_ns + 1530 * 10**9)
+    predicted = rms(solution.position_sigma_l[inside])
+    assert (np.abs(rms(off)[:3] / predicted - 1.0) < 0.2).all()
+    spans = outages(name)
+    lost = smooth(run_filter(flown.inertial, without(rows, spans), flown.setup, start))
+    t, off = flight_errors(name, lost, (spans.min(), spans.max() + 1.0))
+    assert of_maxima(t, np.linalg.norm(off[:, :3], axis=1), spans) < 1.10 * OUTAGES_M[name][1]
+
+
+def flown(seed: int, **setup_keys: Any) -> FilterRun:
+    truth = fly(survey(), 60.0, 50.0)
+    inertial, rows = noised(truth, GRADES["mems"], Fixes(velocity_mps=0.05), ARM, seed)
+    rows = rows[(rows["time_ns"] % 10**10 < 3 * 10**9) | (rows["kind"] == Kind.POSITION)]
+    rows = rows[
+        (rows["time_ns"] < rows["time_ns"][0] + 20 * 10**9) | (rows["time_ns"] > rows["time_ns"][0] + 35 * 10**9)
+    ]
+    setup = replace(setup_for(GRADES["mems"], ARM), **setup_keys)
+    return run_filter(inertial, rows, setup, drawn_start(truth, seed))
+
+
+def dense(packed: FloatArray, n: int) -> FloatArray:
+    p = np.zeros((n, n))
+    p[np.tril_indices(n)] = packed
+    return p + np.tril(p, -1).T
+
+
+def rauch_tung_striebel(run: FilterRun) -> tuple[FloatArray, FloatArray]:
+    """Smoothed errors (m, n) and variances (m, n) by C = P Φᵀ P⁻¹, with inverses, from what the filter kept."""
+    n, [block] = run.layout.size, run.nodes
+    m = len(block.time_ns)
+    error, p = np.zeros(n), dense(block.covariance[m - 1], n)
+    out, variance = np.empty((m, n)), np.empty((m, n))
+    end = len(block.h)
+    for k in range(m - 1, -1, -1):
+        out[k], variance[k] = error, np.diag(p)
+        if k == 0:
+            break
+        ahead, correction = dense(block.covariance[k], n), np.zeros(n)
+        for i in range(block.first[k], end):
+            gain, (of_nu, inverse) = block.gain[i], block.weighed[i]
+            ahead += np.outer(gain, gain) / inverse
+            correction += gain * of_nu / inverse
+        end = block.first[k]
+        phi = np.diag(block.decay[k])
+        phi[:MOVED, : run.layout.core] = block.top[k]
+        behind = dense(block.covariance[k - 1], n)
+        scale = np.sqrt(np.diag(ahead))
+        gains = behind @ phi.T @ (np.linalg.inv(ahead / np.outer(scale, scale)) / np.outer(scale, scale))
+        error = gains @ (error + correction)
+        p = behind + gains @ (p - ahead) @ gains.T
+    return out, variance
+
+
+def test_the_adjoint_form_is_the_smoother_of_rauch_tung_and_striebel() -> None:
+    """With everything estimated, across an outage of 15 s: errors and sigmas of the formulas with inverses."""
+    run = flown(1, estimate_lever_arm=0.1, estimate_time_offset_s=0.01, gnss_correlated_share=0.4)
+    errors_there, variance = rauch_tung_striebel(run)
+    nodes = smooth_nodes(run)
+    size = np.sqrt(variance)
+    np.testing.assert_allclose(nodes.leave / size[:, :9], errors_there[:, :9] / size[:, :9], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(nodes.sensor_sigma, size[:, 9:], rtol=1e-4)
+    block = run.nodes[0]
+    learnt = nodes.state[:, 10:22] - block.after[:, 10:22]
+    np.testing.assert_allclose(learnt / size[:, 9:21], errors_there[:, 9:21] / size[:, 9:21], rtol=0, atol=1e-4)
+
+
+def test_a_sensor_without_errors_does_no_harm() -> None:
+    """Scale factors known perfectly: their covariance is singular, which a smoother with inverses could not bear."""
+    truth = fly(survey(), 40.0, 50.0)
+    noise = replace(GRADES["tactical"], gyro_scale=0.0, accel_scale=0.0)
+    inertial, rows = noised(truth, noise, Fixes(), ARM, 2)
+    solution = smooth(run_filter(inertial, rows, setup_for(noise, ARM), drawn_start(truth, 2)))
+    assert (solution.gyro_scale == 0.0).all()
+    assert (solution.accel_scale_sigma == 0.0).all()
+    off = errors(truth, truth.edges[1:], solution.position_e, solution.velocity_e, solution.q_e_from_b)
+    assert (rms(off[:, :3]) < 0.02).all()
+
+
+def test_between_nodes_the_path_is_smooth() -> None:
+    """No step at a node, where the filter jumps: what the position moves by in a sample is the velocity there."""
+    run = flown(3)
+
+    def steps(solution: Solution) -> float:
+        mean = (solution.velocity_e[1:] + solution.velocity_e[:-1]) / 2.0
+        return float(np.abs(np.diff(solution.position_e, axis=0) - 0.02 * mean).max())
+
+    assert steps(forward(run)) > 5e-3
+    assert steps(smooth(run)) < 2e-4
+
+
+def test_parts_of_a_run_are_the_whole() -> None:
+    """A long flight is written piece by piece."""
+    run = flown(4)
+    nodes = smooth_nodes(run)
+    whole = solution_of(run, nodes)
+    pieces = [solution_of(run, nodes, first, first + 999) for first in range(0, len(whole), 999)]
+    for column in ("time_ns", "position_e", "velocity_e", "q_e_from_b", "position_sigma_l", "attitude_sigma_rad"):
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(piece, column) for piece in pieces]), getattr(whole, column)
+        )
+
+
+def test_forward_and_smoothed_differ_by_as_much_as_they_say() -> None:
+    """Separation over its own sigma, √(P forward − P smoothed), over the whole flight: near 1."""
+    ratios = []
+    for seed in range(8):
+        solution = smooth(flown(seed))
+        inside = solution.separation_sigma[1:-1, :6] > 1e-6
+        ratios.append((solution.separation[1:-1, :6][inside] / solution.separation_sigma[1:-1, :6][inside]) ** 2)
+    assert 0.7 < np.concatenate(ratios).mean() < 1.35

@@ -1,0 +1,106 @@
+"""Whole flights: begun in the air, the real car's clock and outages, and noise that the flight itself tells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.navigation.inputs import GRADES, Inertial, Kind, Start
+from georef.navigation.solve import solve
+from georef.rotations import attitude_of
+from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, setup_for, survey
+from tests.georef.navigation.scores import flight_errors, of_maxima, off_fixes, rms, start_of, without
+from tests.georef.navigation.vehicles import NAVIGATION, car, ns, reference
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+ARM = np.array([0.35, -0.12, -1.1])
+CAR = NAVIGATION / "gnss_imu_drive"
+
+
+def test_a_flight_that_begins_in_the_air_is_as_good_at_its_begin() -> None:
+    """On a line, the heading wrong by 8° and known to 10°: the first minute is as good as the last."""
+    flown = reference("tactical").cut(100_640.0, 101_550.0)
+    assert flown.truth is not None
+    rot, velocity, place = (value[0] for value in flown.truth(np.array([100_640.5])))
+    start = Start(
+        int(ns(100_640.5)), place + np.array([1.0, -2.0, 1.0]), velocity + np.array([0.1, 0.2, -0.1]),
+        np.array(attitude_of(rot)) + np.radians([0.8, -0.7, 8.0]),
+        np.full(3, 3.0), np.full(3, 0.3), np.radians([1.0, 1.0, 10.0]),
+    )  # fmt: skip
+    solved = solve(flown.inertial, flown.only(Kind.POSITION), flown.setup, start)
+    assert solved.report.passes > 1
+    assert solved.report.start_change_rad[-1] < 1e-2 * solved.report.start_change_rad[0]
+    first = flight_errors("tactical", solved.smoothed, (100_641.0, 100_701.0))[1]
+    last = flight_errors("tactical", solved.smoothed, (101_480.0, 101_540.0))[1]
+    assert (rms(first[:, :3]) < 1.5 * np.maximum(rms(last[:, :3]), [0.004, 0.004, 0.006])).all()
+    assert (rms(first[:, 3:]) < 1.5 * np.maximum(rms(last[:, 3:]), [0.003, 0.003, 0.008])).all()
+
+
+def ticking(inertial: Inertial) -> Inertial:
+    """The car's samples at the times of the unit's own counter, raw: GNSS is 0.125 s early by them.
+
+    imu.txt has them stretched by 292 ppm, 0.16 s over the drive, which makes of a constant offset one that grows.
+    """
+    ticks = np.loadtxt(CAR / "raw" / "imu_1934.csv", delimiter=",", usecols=6).astype(np.int64)[1 : 1 + len(inertial)]
+    time_ns = inertial.time_ns[0] + 125_000_000 + (ticks - ticks[0]) * 1_000_000
+    interval_s = np.diff(time_ns, prepend=time_ns[0] - 10_000_000) / 1e9
+    return replace(inertial, time_ns=time_ns, interval_s=interval_s)
+
+
+def test_the_cars_logging_delay_is_found() -> None:
+    """0.125 s by its makers' configuration, within 10 ms; positions only, for its velocities are means over 0.25 s."""
+    drive, start = car(), start_of("gnss_imu_drive", "meta")
+    setup = replace(drive.setup, estimate_time_offset_s=0.3)
+    solved = solve(ticking(drive.inertial), drive.only(Kind.POSITION), setup, start)
+    assert solved.report.time_offset_s == pytest.approx(0.125, abs=0.010)
+    assert not solved.report.weak
+    np.testing.assert_array_equal(
+        np.sort(solved.smoothed.innovations["time_ns"]), np.sort(drive.only(Kind.POSITION)["time_ns"])
+    )
+
+
+@pytest.mark.parametrize(("raw", "filtered_m", "smoothed_m"), [(False, 11.5, 0.53), (True, 11.5, 0.53)])
+def test_the_cars_outages_are_bridged_as_by_others(raw: bool, filtered_m: float, smoothed_m: float) -> None:
+    """Thirteen of 15 s, horizontal, RMS of the largest errors; by the unit's own clock a third better."""
+    drive, start = car(), start_of("gnss_imu_drive", "meta")
+    fixes, spans = np.loadtxt(CAR / "gnss.txt"), np.loadtxt(CAR / "outages.txt")
+    rows = without(drive.only(Kind.POSITION), spans)
+    inertial, setup = drive.inertial, drive.setup
+    if raw:
+        inertial, setup = ticking(inertial), replace(setup, estimate_time_offset_s=0.3)
+    solved = solve(inertial, rows, setup, start)
+    for solution, allowed in ((solved.forward, filtered_m), (solved.smoothed, smoothed_m)):
+        t, off = off_fixes(solution, fixes, solved.report.time_offset_s)
+        assert of_maxima(t, np.linalg.norm(off[:, :2], axis=1), spans) < 1.10 * allowed
+    assert solved.smoothed.counts["position rejected"] == 0
+
+
+FLIGHT_S = 600.0
+
+
+@pytest.mark.parametrize(("scale", "share"), [(1.0, 0.0), (2.5, 0.0), (1.0, 0.8)])
+def test_noise_that_is_not_as_said_is_found(scale: float, share: float) -> None:
+    """Fixes as said, worse by 2.5, and with errors that last a minute: what they are is found, and used."""
+    truth = fly(survey(), FLIGHT_S, 50.0)
+    inertial, rows = noised(truth, GRADES["tactical"], Fixes(share=share), ARM, 11)
+    rows["sigma"] /= scale
+    setup, start = setup_for(GRADES["tactical"], ARM), drawn_start(truth, 11)
+    solved = solve(inertial, rows, setup, start)
+    assert solved.report.noise is not None
+    best = solved.report.noise.best
+    assert best.scale == pytest.approx(scale, rel=0.15) if share == 0.0 else best.share >= 0.5
+    assert (best.share > 0.0) == (share > 0.0)
+    assert solved.report.noise.changed == (scale != 1.0 or share > 0.0)
+
+
+def test_what_a_flight_says_nothing_of_is_told() -> None:
+    """Straight and level, a lever arm sought: along the flight it moves like the start, the flight cannot tell."""
+    truth = fly(survey(line_s=1000.0), 60.0, 50.0)
+    inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 12)
+    setup = replace(setup_for(GRADES["tactical"], ARM), estimate_lever_arm=0.05)
+    assert "lever arm x" in solve(inertial, rows, setup, drawn_start(truth, 12)).report.weak

@@ -1,0 +1,104 @@
+"""Standing still: a synthetic unit that stands, flies evenly, turns and rolls; and the reference flight's truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.earth import e_from_geodetic
+from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
+from georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
+from georef.timescales import SECOND_NS
+
+FLIGHT = Path(__file__).parents[4] / "shared" / "fixtures" / "navigation" / "reference_flight" / "mems.npz"
+EPOCH_NS = 1_447_000_000 * SECOND_NS
+RATE_HZ = 100
+
+
+def unit(seconds: int, force: NDArray[np.float64], turn: NDArray[np.float64]) -> Inertial:
+    """Mean force and turn by second."""
+    n = seconds * RATE_HZ
+    time_ns = EPOCH_NS + np.arange(1, n + 1) * (SECOND_NS // RATE_HZ)
+    each = np.repeat(np.arange(seconds), RATE_HZ)
+    noise = np.random.default_rng(5).normal(0.0, 0.05, (n, 3))
+    return Inertial(
+        time_ns, np.full(n, 1 / RATE_HZ), turn[each] / RATE_HZ, (force[each] + noise) / RATE_HZ, np.zeros(n, np.bool_)
+    )
+
+
+def velocities(speed: NDArray[np.float64], sigma: float) -> NDArray[np.void]:
+    rows = np.zeros(len(speed), OBSERVATION_DTYPE)
+    rows["time_ns"] = EPOCH_NS + np.arange(len(speed)) * SECOND_NS
+    rows["kind"], rows["sigma"], rows["value"][:, 0] = Kind.VELOCITY, sigma, speed
+    return rows
+
+
+def seconds_of(rows: NDArray[np.void]) -> list[int]:
+    return [int(number) for number in (rows["time_ns"] - EPOCH_NS) // SECOND_NS]
+
+
+@pytest.fixture
+def calm() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.tile([0.0, 0.0, -9.81], (40, 1)), np.zeros((40, 3))
+
+
+def test_a_vehicle_that_stands_is_seen_but_for_the_ends(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+    rows = still_seconds(unit(40, *calm), velocities(np.zeros(40), 0.02))
+    assert seconds_of(rows) == list(range(3, 38))
+    assert (rows["sigma"] == SIGMA_MPS).all()
+    assert not rows["value"].any()
+
+
+def test_even_straight_flight_feels_like_standing_and_is_not(
+    calm: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    assert not len(still_seconds(unit(40, *calm), velocities(np.full(40, 60.0), 0.02)))
+    assert not len(still_seconds(unit(40, *calm), velocities(np.full(40, 0.4), 2.0))), "whatever the receiver's sigma"
+    assert not len(still_seconds(unit(40, *calm), velocities(np.zeros(0), 0.02))), "nor where nobody sees it"
+
+
+@pytest.mark.parametrize("sensor", ["force", "turn"])
+def test_a_second_that_is_felt_and_its_neighbours_are_left_out(
+    sensor: str, calm: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> None:
+    force, turn = calm
+    (force if sensor == "force" else turn)[20, 1] = 0.2 if sensor == "force" else 0.01
+    missing = set(range(3, 38)) - set(seconds_of(still_seconds(unit(40, force, turn), velocities(np.zeros(40), 0.02))))
+    assert {18, 19, 20, 21, 22} <= missing <= set(range(18, 24))
+
+
+def test_positions_tell_it_where_no_velocity_is_said(calm: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+    for speed, expected in ((0.0, 35), (0.5, 0)):
+        rows = velocities(np.zeros(40), 0.05)
+        rows["kind"] = Kind.POSITION
+        rows["value"] = [6_378_137.0, 0.0, 0.0]
+        rows["value"][:, 1] = speed * np.arange(40)
+        assert len(still_seconds(unit(40, *calm), rows)) == expected
+
+
+def test_the_reference_flight_stands_where_its_truth_does() -> None:
+    flight = np.load(FLIGHT)
+    time_ns = np.rint(flight["imu_t"] * 1e9).astype(np.int64)
+    inertial = Inertial(
+        time_ns,
+        np.diff(time_ns, prepend=time_ns[0] - 5_000_000) / SECOND_NS,
+        flight["imu_dtheta"].astype(np.float64),
+        flight["imu_dv"].astype(np.float64),
+        np.zeros(len(time_ns), np.bool_),
+    )
+    fixes = flight["gnss"]
+    rows = np.zeros(len(fixes), OBSERVATION_DTYPE)
+    rows["time_ns"], rows["kind"] = np.rint(fixes[:, 0] * 1e9), Kind.POSITION
+    rows["value"] = e_from_geodetic(np.radians(fixes[:, 1]), np.radians(fixes[:, 2]), fixes[:, 3])
+    rows["sigma"] = fixes[:, 4:7]
+    truth = flight["truth"]
+    speed = np.linalg.norm(truth[:, 5:8], axis=1)
+    both = with_still_seconds(inertial, sort_observations(rows))
+    found_s = both["time_ns"][both["kind"] == Kind.ZERO_VELOCITY] / SECOND_NS
+    assert (np.diff(both["time_ns"]) >= 0).all()
+    assert np.interp(found_s, truth[:, 1], speed).max() < 1e-3
+    stands_s = np.count_nonzero(speed < 1e-3) * float(np.median(np.diff(truth[:, 1])))
+    assert len(found_s) > 0.9 * stands_s
