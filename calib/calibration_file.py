@@ -1,0 +1,203 @@
+"""A calibration as the text of its file (CONVENTIONS, "Calibration file"); `georef.calibration` reads it."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
+
+FloatArray = NDArray[np.float64]
+
+_DEG = math.pi / 180.0
+ROUNDING = 1e-9  # of a correlation with itself
+
+
+class CalibrationFileError(ValueError):
+    """A calibration that no file can hold; one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a calibration file says besides the calibration itself.
+
+    Attributes:
+        id: unique; goes into every product made with it.
+        created: with its time zone.
+        method: of `georef.calibration.METHODS`; empty: the calibration's own.
+        scanner_model, scanner_serial, imu_serial: whose calibration it is; empty: not compared.
+        installation: id of the mounting.
+        logs: name and SHA-256 (hex) of each.
+        variance_factor, redundancy: of the adjustment; None: there was none.
+    """
+
+    id: str
+    created: dt.datetime
+    method: str = ""
+    scanner_model: str = ""
+    scanner_serial: str = ""
+    imu_serial: str = ""
+    installation: str = ""
+    logs: tuple[tuple[str, str], ...] = ()
+    variance_factor: float | None = None
+    redundancy: float | None = None
+
+
+def calibration_text(calibration: Calibration, header: Header) -> str:
+    """The file: the same for the same calibration and header, byte for byte.
+
+    Numbers stand in the file's units with as few digits as read back to the number they were; a few numbers (one in
+    ten, of parameters in degrees and parts per million) are no product of a double and their unit: these read back as
+    the nearest that is, one unit of the last of 53 binary digits away, and stay what they are from then on.
+
+    Raises:
+        CalibrationFileError: what no reader would take: not finite, a negative sigma, no rotation, a time without zone.
+    """
+    blocks = [
+        _header(calibration, header),
+        _parameters(calibration),
+        *_estimated(calibration),
+        *_tables(calibration),
+    ]
+    text = "\n\n".join("\n".join(block) for block in blocks) + "\n"
+    try:
+        read_calibration(text, f"calibration {header.id}")
+    except CalibrationError as error:
+        raise CalibrationFileError(str(error).splitlines()[0]) from error
+    return text
+
+
+def _header(calibration: Calibration, header: Header) -> list[str]:
+    logs = ", ".join(f"{{ name = {_text(name)}, sha256 = {_text(sha256)} }}" for name, sha256 in header.logs)
+    rows: list[tuple[str, str | None]] = [
+        ("id", _text(header.id)),
+        ("scanner", _text(calibration.scanner)),
+        ("created", _time(header.created)),
+        ("conventions", str(CONVENTIONS)),
+        ("scanner_model", _text(header.scanner_model)),
+        ("scanner_serial", _text(header.scanner_serial)),
+        ("imu_serial", _text(header.imu_serial)),
+        ("installation", _text(header.installation)),
+        ("installation_matrix", _matrix(calibration.installation_matrix)),
+        ("mirror_factor", _optional(calibration.mirror_factor)),
+        ("ranges", _said(calibration.ranges)),
+        ("refraction", _said(calibration.refraction)),
+        ("method", _text(header.method or calibration.method)),
+        ("logs", f"[{logs}]"),
+        ("variance_factor", _optional(header.variance_factor)),
+        ("redundancy", None if header.redundancy is None else _number(header.redundancy)),
+    ]
+    return ["[calibration]", *(f"{key} = {value}" for key, value in rows if value is not None)]
+
+
+def _parameters(calibration: Calibration) -> list[str]:
+    values = calibration.parameters.tolist()
+    rows = zip(PARAMETERS, values, strict=True)
+    return ["[parameters]", *(f"{parameter.key} = {in_unit(value, parameter.factor)!r}" for parameter, value in rows)]
+
+
+def _estimated(calibration: Calibration) -> list[list[str]]:
+    """Tables [sigma] and [correlation] of what was estimated."""
+    sigmas = calibration.sigmas.tolist()
+    at = [index for index, sigma in enumerate(sigmas) if sigma != 0.0]
+    if not at:
+        return []
+    keys = [PARAMETERS[index].key for index in at]
+    rows = (f"{PARAMETERS[index].key} = {in_unit(sigmas[index], PARAMETERS[index].factor)!r}" for index in at)
+    matrix = calibration.correlation[np.ix_(at, at)]
+    np.fill_diagonal(matrix, np.where(np.abs(np.diag(matrix) - 1.0) < ROUNDING, 1.0, np.diag(matrix)))
+    names = ", ".join(_text(key) for key in keys)
+    return [["[sigma]", *rows], ["[correlation]", f"names = [{names}]", f"matrix = {_long_matrix(matrix)}"]]
+
+
+def _tables(calibration: Calibration) -> list[list[str]]:
+    blocks = []
+    if calibration.ibrc is not None:
+        intensity, correction_m = (_list(column.tolist()) for column in calibration.ibrc)
+        blocks.append(["[ibrc]", f"intensity = {intensity}", f"correction_m = {correction_m}"])
+    for offset in calibration.range_offsets:
+        rows = [("return_slot", offset.return_slot), ("mta_zone", offset.mta_zone)]
+        block = ["[[range_offset]]", *(f"{key} = {value:d}" for key, value in rows if value is not None)]
+        block += [f"prf_hz = {_number(offset.prf_hz)}"] if offset.prf_hz is not None else []
+        blocks.append([*block, f"offset_m = {in_unit(offset.offset_m, 1.0)!r}"])
+    for index, tilt_rad in sorted(calibration.facet_tilt_rad.items()):
+        blocks.append(["[[facet]]", f"index = {index:d}", f"tilt_deg = {in_unit(tilt_rad, _DEG, math.radians)!r}"])
+    for channel, beam in sorted(calibration.beams.items()):
+        angles = [("azimuth_deg", beam.azimuth_rad), ("elevation_deg", beam.elevation_rad)]
+        block = ["[[beam]]", f"channel = {channel:d}"]
+        block += [f"{key} = {in_unit(value, _DEG, math.radians)!r}" for key, value in angles]
+        blocks.append([*block, f"range_m = {in_unit(beam.range_m, 1.0)!r}"])
+    return blocks
+
+
+def in_unit(value: float, factor: float, back: Callable[[float], float] | None = None) -> float:
+    """A number in a file's unit: of those that read back as ``value``, the one with the fewest digits.
+
+    Args:
+        value: SI.
+        factor: SI units a unit of the file.
+        back: how a reader converts; None: times ``factor``.
+
+    Raises:
+        CalibrationFileError: the value is not finite.
+    """
+    if not math.isfinite(value):
+        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+    if value == 0.0:
+        return 0.0
+
+    def read(number: float) -> float:
+        return number * factor if back is None else back(number)
+
+    nearest = value / factor
+    around = [nearest, *(float(f"{nearest:.{digits}g}") for digits in (13, 14, 15, 16))]
+    return min(around, key=lambda number: (abs(read(number) - value), len(repr(number))))
+
+
+def _number(value: float) -> str:
+    """A whole number without a point, as counts and rates are written."""
+    if not math.isfinite(value):
+        raise CalibrationFileError(f"a calibration holds {value!r}; want finite numbers")
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
+
+
+def _optional(value: float | None) -> str | None:
+    return None if value is None else repr(in_unit(float(value), 1.0))
+
+
+def _said(value: str | None) -> str | None:
+    return None if value is None else _text(value)
+
+
+def _text(value: str) -> str:
+    """A basic string of TOML: JSON's escapes are among its own, but it wants DEL escaped too."""
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise CalibrationFileError(f"{value!r} is no text that UTF-8 can hold") from error
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _time(value: dt.datetime) -> str:
+    if value.utcoffset() is None:
+        raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; want UTC")
+    return value.astimezone(dt.UTC).replace(tzinfo=None).isoformat() + "Z"
+
+
+def _list(values: Iterable[float]) -> str:
+    return f"[{', '.join(_number(value) for value in values)}]"
+
+
+def _matrix(rows: Sequence[Sequence[float]] | FloatArray) -> str:
+    return f"[{', '.join(_list(row) for row in np.asarray(rows).tolist())}]"
+
+
+def _long_matrix(matrix: FloatArray) -> str:
+    """A row a line."""
+    return "".join(["[\n", *(f"  {_list(row)},\n" for row in matrix.tolist()), "]"])

@@ -1,0 +1,263 @@
+"""Calibrations of one mounting over time: has the boresight moved?
+
+Two calibrations are compared by their differences against the joint covariance of both; a trend is the weighted
+straight line through all of them.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from georef.calibration import INDEX, PARAMETERS, Calibration
+
+FloatArray = NDArray[np.float64]
+
+BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
+ALPHA = 0.001
+FEWEST_FOR_TREND = 3
+YEAR_S = 365.25 * 86_400.0
+
+
+class HistoryError(ValueError):
+    """Calibrations that are no history; one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Of one parameter, later − earlier, SI."""
+
+    name: str
+    difference: float
+    sigma: float
+
+    @property
+    def words(self) -> str:
+        """As ``phi_deg +0.0081 ± 0.0012 (6.8 σ)``."""
+        parameter = PARAMETERS[INDEX[self.name]]
+        value, sigma = self.difference / parameter.factor, self.sigma / parameter.factor
+        digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 6
+        times = abs(value) / sigma if sigma > 0.0 else math.inf
+        return f"{parameter.key} {value:+.{digits}f} ± {sigma:.{digits}f} ({times:.1f} σ)"
+
+    def record(self) -> dict[str, Any]:
+        """For JSON, in the unit of the key."""
+        parameter = PARAMETERS[INDEX[self.name]]
+        return {
+            "parameter": parameter.key,
+            "difference": self.difference / parameter.factor,
+            "sigma": self.sigma / parameter.factor,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """Two calibrations: differences of the parameters that both estimated, and χ² of all with their correlations."""
+
+    earlier: str
+    later: str
+    rows: tuple[Difference, ...]
+    chi2: float
+    freedom: int
+
+    @property
+    def p(self) -> float:
+        """Chance of so much where nothing has changed."""
+        return float(stats.chi2.sf(self.chi2, self.freedom)) if self.freedom else math.nan
+
+    @property
+    def moved(self) -> bool:
+        """Whether the difference is more than chance."""
+        return bool(self.freedom and self.p < ALPHA)
+
+
+def compare(earlier: Calibration, later: Calibration, names: Sequence[str] | None = None) -> Compared:
+    """Differences of two calibrations whose errors are independent.
+
+    Args:
+        earlier, later: of one scanner.
+        names: of parameters; None: all. Of them those count that both estimated.
+
+    Raises:
+        HistoryError: the installation matrices differ, so that angles mean different things.
+    """
+    if not np.allclose(earlier.installation_matrix, later.installation_matrix, atol=1e-9):
+        raise HistoryError(
+            f"calibrations {earlier.id} and {later.id} have different installation matrices: their angles cannot be "
+            "compared"
+        )
+    at = [
+        INDEX[name]
+        for name in (names or [parameter.name for parameter in PARAMETERS])
+        if earlier.sigmas[INDEX[name]] > 0.0 and later.sigmas[INDEX[name]] > 0.0
+    ]
+    difference = later.parameters[at] - earlier.parameters[at]
+    covariance = (earlier.covariance() + later.covariance())[np.ix_(at, at)]
+    sigmas = np.sqrt(np.diag(covariance))
+    rows = tuple(
+        Difference(PARAMETERS[index].name, float(value), float(sigma))
+        for index, value, sigma in zip(at, difference, sigmas, strict=True)
+    )
+    scaled = covariance / np.outer(sigmas, sigmas)
+    whole = float((difference / sigmas) @ np.linalg.pinv(scaled, hermitian=True) @ (difference / sigmas)) if at else 0.0
+    return Compared(earlier.id, later.id, rows, whole, len(at))
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """A straight line through a parameter's values: change a year and its sigma, SI; p of the change."""
+
+    name: str
+    per_year: float
+    sigma: float
+    p: float
+
+    def record(self) -> dict[str, Any]:
+        """For JSON, in the unit of the key."""
+        parameter = PARAMETERS[INDEX[self.name]]
+        return {
+            "parameter": parameter.key,
+            "per_year": self.per_year / parameter.factor,
+            "sigma": self.sigma / parameter.factor,
+            "p": self.p,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Calibrations of a scanner in one mounting.
+
+    Attributes:
+        scanner, installation: whose.
+        entries: in the order of time; times: (n,) seconds since 1970.
+        steps: each against the one before, boresight only.
+        trends: of the boresight; empty: too few calibrations.
+        sentences: the verdict.
+    """
+
+    scanner: str
+    installation: str
+    entries: tuple[Calibration, ...]
+    times: tuple[float, ...]
+    steps: tuple[Compared, ...]
+    trends: tuple[Trend, ...]
+    sentences: tuple[str, ...]
+
+    @property
+    def moved(self) -> bool:
+        """Whether the boresight has moved, at once or by and by."""
+        return any(step.moved for step in self.steps) or any(trend.p < ALPHA for trend in self.trends)
+
+    def table(self) -> list[dict[str, Any]]:
+        """A row a calibration: id, time, method, and the boresight with its sigmas, degrees."""
+        rows = []
+        for entry, time in zip(self.entries, self.times, strict=True):
+            row: dict[str, Any] = {"id": entry.id, "created": _date(time), "method": entry.method}
+            for name in BORESIGHT:
+                key = PARAMETERS[INDEX[name]].key
+                row[key] = math.degrees(entry.value(name))
+                row[f"{key}_sigma"] = math.degrees(float(entry.sigmas[INDEX[name]])) or None
+            rows.append(row)
+        return rows
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scanner": self.scanner,
+            "installation": self.installation,
+            "moved": self.moved,
+            "calibrations": self.table(),
+            "steps": [
+                {
+                    "earlier": step.earlier,
+                    "later": step.later,
+                    "chi2": step.chi2,
+                    "freedom": step.freedom,
+                    "p": None if math.isnan(step.p) else step.p,
+                    "differences": [row.record() for row in step.rows],
+                }
+                for step in self.steps
+            ],
+            "trends": [trend.record() for trend in self.trends],
+            "sentences": list(self.sentences),
+        }
+
+
+def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
+    """One history a scanner and installation, of calibrations in any order.
+
+    What was never estimated (``method = "nominal"``) has no sigmas and is listed, but not tested.
+
+    Raises:
+        HistoryError: a calibration does not say when it was made, or of which installation it is; one stands twice.
+    """
+    groups: dict[tuple[str, str], list[tuple[float, Calibration]]] = {}
+    seen: set[str] = set()
+    for one in calibrations:
+        installation, created = one.header.get("installation"), one.header.get("created")
+        if not installation:
+            raise HistoryError(f"calibration {one.id}: names no installation; a history wants calibration.installation")
+        if not isinstance(created, dt.datetime):
+            raise HistoryError(f"calibration {one.id}: calibration.created is no time; want 2026-11-21T10:15:00Z")
+        if one.id in seen:
+            raise HistoryError(f"calibration {one.id}: stands twice; want each once")
+        seen.add(one.id)
+        time = (created if created.tzinfo else created.replace(tzinfo=dt.UTC)).timestamp()
+        groups.setdefault((one.scanner, str(installation)), []).append((time, one))
+    return tuple(_history(key, sorted(group, key=lambda entry: entry[0])) for key, group in sorted(groups.items()))
+
+
+def _history(key: tuple[str, str], group: list[tuple[float, Calibration]]) -> History:
+    times, entries = tuple(time for time, _ in group), tuple(entry for _, entry in group)
+    tested = [(time, entry) for time, entry in group if compare(entry, entry, BORESIGHT).freedom]
+    steps = tuple(compare(one, two, BORESIGHT) for (_, one), (_, two) in pairwise(tested))
+    trends = tuple(_trend(name, tested) for name in BORESIGHT if _told(name, tested) >= FEWEST_FOR_TREND)
+    when = {entry.id: _date(time)[:10] for time, entry in group}
+    return History(*key, entries, times, steps, trends, tuple(_sentences(key[0], steps, trends, when)))
+
+
+def _told(name: str, tested: Sequence[tuple[float, Calibration]]) -> int:
+    return len({time for time, entry in tested if entry.sigmas[INDEX[name]] > 0.0})
+
+
+def _trend(name: str, tested: Sequence[tuple[float, Calibration]]) -> Trend:
+    """Weighted straight line; its sigma is that of the calibrations' own."""
+    rows = [(t, e.value(name), float(e.sigmas[INDEX[name]])) for t, e in tested if e.sigmas[INDEX[name]] > 0.0]
+    time, value, sigma = (np.array(column) for column in zip(*rows, strict=True))
+    weight, years = 1.0 / sigma**2, time / YEAR_S
+    years = years - (weight * years).sum() / weight.sum()
+    spread = float((weight * years**2).sum())
+    slope = float((weight * years * value).sum()) / spread
+    return Trend(name, slope, 1.0 / math.sqrt(spread), float(2.0 * stats.norm.sf(abs(slope) * math.sqrt(spread))))
+
+
+def _sentences(scanner: str, steps: Sequence[Compared], trends: Sequence[Trend], when: Mapping[str, str]) -> list[str]:
+    if not steps:
+        return [f"{scanner}: fewer than two calibrations with sigmas: no drift can be tested"]
+    found = []
+    for step in steps:
+        if step.moved:
+            largest = max(step.rows, key=lambda row: abs(row.difference) / row.sigma)
+            found.append(
+                f"{scanner}: the boresight has moved between {when[step.earlier]} and {when[step.later]}: "
+                f"{largest.words}; χ² {step.chi2:.1f} of {step.freedom}, p {step.p:.2g}"
+            )
+    for trend in trends:
+        if trend.p < ALPHA:
+            key = PARAMETERS[INDEX[trend.name]].key
+            per_year, sigma = math.degrees(trend.per_year), math.degrees(trend.sigma)
+            found.append(f"{scanner}: {key} drifts by {per_year:+.4f} ± {sigma:.4f} a year (p {trend.p:.2g})")
+    worst = min(step.p for step in steps)
+    return found or [f"{scanner}: the boresight has not moved: {len(steps)} steps, the least likely with p {worst:.2g}"]
+
+
+def _date(time_s: float) -> str:
+    return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

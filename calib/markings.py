@@ -1,0 +1,290 @@
+"""Tie points from intensity: road markings and other patterns on flat ground, found again in every swath.
+
+Ground is cut into squares. Where one is flat, and its pattern strong, in two swaths or more, the intensities of each
+become a smooth image, and the image of the swath that sees it best is looked for in the others' by normalised
+cross-correlation (Lewis 1995). The peak, between cells, is the shift; its curvature, and how much of the images the
+correlation leaves unexplained, give the covariance. Heights come from the plane of each swath's own returns.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.signal import fftconvolve
+
+from calib.features import Features, Sighting, TiePoint
+from calib.flight import Flight, Swath
+from calib.marking_squares import Grid, Square, grid_of, near, squares_of
+
+FloatArray = NDArray[np.float64]
+
+THIN = 0.05  # smoothed returns a cell below which an image has a hole, as a share of their mean
+
+BACK = 13.8  # χ²(2), 0.999: how far a shift and the one back may be apart
+
+
+@dataclass(frozen=True, slots=True)
+class MarkingSettings:
+    """What counts.
+
+    Attributes:
+        square_m: side of a square of ground.
+        cell_m: of the images; `smooth_m`: their smoothing (one sigma); grows where returns are sparse.
+        search_m: greatest shift between swaths.
+        least_density: returns a square metre.
+        rms_m, flat_slope: greatest scatter about the square's plane, and its slope.
+        least_contrast: standard deviation of intensities in a square, as a share of their mean.
+        least_correlation: of the peak.
+        unique: by how much the peak has to exceed the correlation of any place away from it.
+        greatest_sigma_m: of a shift in any direction: lines alone are not known along themselves.
+        most: squares, the strongest patterns first.
+    """
+
+    square_m: float = 12.0
+    cell_m: float = 0.25
+    smooth_m: float = 0.4
+    search_m: float = 3.0
+    least_density: float = 4.0
+    rms_m: float = 0.06
+    flat_slope: float = 0.15
+    least_contrast: float = 0.12
+    least_correlation: float = 0.6
+    unique: float = 0.1
+    greatest_sigma_m: float = 0.15
+    most: int = 300
+
+
+_DEFAULT = MarkingSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Intensities of one swath about a square.
+
+    Attributes:
+        value: (rows, columns), rows to the north, columns to the east; `middle` is that of the square.
+        smooth_m: of their smoothing, one sigma.
+        whole: whether there are no holes.
+    """
+
+    value: FloatArray
+    smooth_m: float
+    whole: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """Where an image lies in another: east and north (2,), covariance (2, 2) m², correlation."""
+
+    shift_m: FloatArray
+    covariance: FloatArray
+    correlation: float
+
+
+def find_markings(flight: Flight, settings: MarkingSettings = _DEFAULT) -> Features:
+    """Tie points of kind ``marking`` on flat ground; squares that gave none counted by reason.
+
+    Args:
+        flight: with points, whose swaths lie on each other within ``search_m``.
+        settings: what counts.
+    """
+    refused: Counter[str] = Counter()
+    grid = grid_of(flight, settings.square_m)
+    if grid is None:
+        return Features()
+    squares: dict[int, dict[int, Square]] = {}
+    for index, swath in enumerate(flight.swaths):
+        for square in squares_of(swath, grid, settings.least_density):
+            if not (square.rms_m <= settings.rms_m and square.slope <= settings.flat_slope):
+                refused["marking: ground not flat"] += 1
+            else:
+                squares.setdefault(square.number, {})[index] = square
+    shared = {number: seen for number, seen in squares.items() if len(seen) > 1}
+    strong = {n: min(one.contrast for one in seen.values()) for n, seen in shared.items()}
+    kept = [number for number in shared if strong[number] >= settings.least_contrast]
+    refused["marking: too little contrast"] += len(shared) - len(kept)
+    kept = sorted(kept, key=lambda number: (-strong[number], number))[: settings.most]
+    around = [near(swath, grid, [n for n in kept if index in shared[n]]) for index, swath in enumerate(flight.swaths)]
+    ties = []
+    for number in sorted(kept):
+        returns = {index: around[index][number] for index in shared[number]}
+        tie = _tie(flight, grid, number, shared[number], returns, settings, refused)
+        if tie is not None:
+            ties.append(tie)
+    return Features(ties=tuple(ties), refused=+refused)
+
+
+def _tie(
+    flight: Flight,
+    grid: Grid,
+    number: int,
+    seen: dict[int, Square],
+    returns: dict[int, NDArray[np.int64]],
+    settings: MarkingSettings,
+    refused: Counter[str],
+) -> TiePoint | None:
+    """The square's centre where the best swath has it, and where the others have what looks like it."""
+    centre = grid.centre(number)
+    smooth_m = max(settings.smooth_m, *(0.8 / np.sqrt(square.density) for square in seen.values()))
+    images = {i: _image(flight.swaths[i], returns[i], seen[i], centre, float(smooth_m), settings) for i in seen}
+    best = max(seen, key=lambda index: (seen[index].density, -index))
+    found: dict[int, Shift] = {}
+    for index in sorted(seen):
+        if index == best:
+            continue
+        shift = there_and_back(images[best], images[index], settings)
+        if isinstance(shift, str):
+            refused[f"marking: {shift}"] += 1
+        else:
+            found[index] = shift
+    if not found:
+        return None
+    mean = np.mean([shift.covariance for shift in found.values()], axis=0)
+    placed = {best: (centre, 0.5 * mean)}  # either image has its half of the noise
+    placed |= {index: (centre + shift.shift_m, 0.5 * shift.covariance) for index, shift in found.items()}
+    sightings = tuple(
+        _sighting(flight.swaths[index], index, returns[index], seen[index], *placed[index]) for index in sorted(placed)
+    )
+    return TiePoint(f"marking {number}", sightings, kind="marking")
+
+
+def _sighting(
+    swath: Swath,
+    index: int,
+    at: NDArray[np.int64],
+    square: Square,
+    place: FloatArray,
+    covariance: FloatArray,
+) -> Sighting:
+    """On the square's plane; what is wrong of its place is wrong of its height by the slope."""
+    points = np.asarray(swath.points_t[at, :2])
+    nearest = int(at[np.argmin(np.sum((points - place) ** 2, axis=1))])
+    to_plane = np.concatenate([np.eye(2), square.slopes[np.newaxis]])
+    whole = to_plane @ covariance @ to_plane.T
+    whole[2, 2] += square.sigma_m**2
+    point = np.array([place[0], place[1], square.height_at(place)])
+    return Sighting(index, nearest, point, whole)
+
+
+def _image(
+    swath: Swath,
+    at: NDArray[np.int64],
+    square: Square,
+    centre: FloatArray,
+    smooth_m: float,
+    settings: MarkingSettings,
+) -> Image:
+    """Mean intensities of cells, weighted by distance: of the square and what the search needs around it."""
+    points = np.asarray(swath.points_t[at])
+    on_ground = np.abs(points[:, 2] - square.heights_at(points[:, :2])) <= 5.0 * settings.rms_m
+    points, intensity = points[on_ground], swath.rows["intensity"][at][on_ground].astype(np.float64)
+    half = _cells(settings.square_m / 2.0 + settings.search_m, settings.cell_m)
+    border = half + _cells(4.0 * smooth_m, settings.cell_m)
+    sums, count = _spread((points[:, :2] - centre) / settings.cell_m + border, intensity, 2 * border + 1)
+    sigma = smooth_m / settings.cell_m
+    weight = gaussian_filter(count, sigma, mode="constant")
+    value = gaussian_filter(sums, sigma, mode="constant") / np.maximum(weight, 1e-12)
+    cut = slice(border - half, border + half + 1)
+    whole = bool((weight[cut, cut] > THIN * square.density * settings.cell_m**2).all())
+    return Image(value[cut, cut], smooth_m, whole)
+
+
+def _spread(place: FloatArray, values: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
+    """(side, side) sums of values (n,) and of ones, each shared among the four cells about its place (n, 2).
+
+    Shared linearly, so that where a pattern of scan lines falls in the cells does not move the image.
+    """
+    whole = np.floor(place).astype(np.int64)
+    share = place - whole
+    sums, count = np.zeros(side * side), np.zeros(side * side)
+    for east in (0, 1):
+        for north in (0, 1):
+            column, row = whole[:, 0] + east, whole[:, 1] + north
+            weight = np.abs(1.0 - east - share[:, 0]) * np.abs(1.0 - north - share[:, 1])
+            inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
+            cell = row[inside] * side + column[inside]
+            sums += np.bincount(cell, (weight * values)[inside], side * side)
+            count += np.bincount(cell, weight[inside], side * side)
+    return sums.reshape(side, side), count.reshape(side, side)
+
+
+def _cells(metres: float, cell_m: float) -> int:
+    return round(metres / cell_m)
+
+
+def shifted(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
+    """By how much the other image shows the same farther to the east and north; in words why that cannot be said."""
+    if not (image.whole and other.whole):
+        return "holes in the ground"
+    search = _cells(settings.search_m, settings.cell_m)
+    template = image.value[search:-search, search:-search]
+    if np.ptp(template) <= 0.0 or np.ptp(other.value) <= 0.0:
+        return "no pattern"
+    correlation = _correlations(template, other.value)
+    row, column = np.unravel_index(np.argmax(correlation), correlation.shape)
+    peak = float(correlation[row, column])
+    if peak < settings.least_correlation:
+        return "too little in common"
+    if not (1 <= row <= 2 * search - 1 and 1 <= column <= 2 * search - 1):
+        return "farther apart than the search"
+    surface = _surface(correlation[row - 1 : row + 2, column - 1 : column + 2])
+    curvature = -np.array([[2.0 * surface[3], surface[4]], [surface[4], 2.0 * surface[5]]])
+    if np.linalg.eigvalsh(curvature)[0] <= 0.0:
+        return "no single peak"
+    off = np.linalg.solve(curvature, surface[1:3])
+    if np.abs(off).max() > 1.0:
+        return "no single peak"
+    away = _away(correlation, int(row), int(column), settings)
+    if away > peak - settings.unique:
+        return "several places look alike"
+    area_m2 = (template.shape[0] * settings.cell_m) ** 2
+    unexplained = 2.0 * (1.0 - min(peak, 1.0)) * 4.0 * np.pi * image.smooth_m**2 / area_m2
+    covariance = unexplained * np.linalg.inv(curvature) * settings.cell_m**2
+    if np.sqrt(np.linalg.eigvalsh(covariance)[1]) > settings.greatest_sigma_m:
+        return "pattern without a second direction"
+    shift_m = settings.cell_m * (np.array([column - search, row - search]) + off)
+    return Shift(shift_m, covariance, peak)
+
+
+def there_and_back(image: Image, other: Image, settings: MarkingSettings) -> Shift | str:
+    """The shift, where that of the other image's middle is the same the other way."""
+    there, back = shifted(image, other, settings), shifted(other, image, settings)
+    if isinstance(there, str) or isinstance(back, str):
+        return there if isinstance(there, str) else str(back)
+    apart = there.shift_m + back.shift_m
+    if apart @ np.linalg.solve(there.covariance + back.covariance, apart) > BACK:
+        return "another place the other way"
+    return there
+
+
+def _correlations(template: FloatArray, image: FloatArray) -> FloatArray:
+    """Normalised cross-correlation at every place the template has in the image."""
+    zero_mean = template - template.mean()
+    size = template.shape[0]
+    image = image - image.mean()
+    cross = fftconvolve(image, zero_mean[::-1, ::-1], mode="valid")
+    inner = slice(size // 2, size // 2 + cross.shape[0])
+    mean = uniform_filter(image, size, mode="constant")[inner, inner]
+    square = uniform_filter(image**2, size, mode="constant")[inner, inner]
+    spread = np.sqrt(np.maximum(square - mean**2, 1e-12) * template.size * np.sum(zero_mean**2))
+    correlation: FloatArray = cross / spread
+    return correlation
+
+
+def _surface(values: FloatArray) -> FloatArray:
+    """(6,) of 1, x, y, x², xy, y² through (3, 3) values by least squares; x to the east, y to the north, in cells."""
+    y, x = (axis.ravel().astype(np.float64) for axis in np.mgrid[-1:2, -1:2])
+    design = np.stack([np.ones(9), x, y, x * x, x * y, y * y], axis=1)
+    solved: FloatArray = np.linalg.lstsq(design, values.ravel(), rcond=None)[0]
+    return solved
+
+
+def _away(correlation: FloatArray, row: int, column: int, settings: MarkingSettings) -> float:
+    """The greatest correlation beyond a metre from the peak."""
+    rows, columns = np.indices(correlation.shape)
+    far = np.hypot(rows - row, columns - column) * settings.cell_m > max(1.0, 3.0 * settings.smooth_m)
+    return float(np.max(correlation[far], initial=-1.0))

@@ -1,0 +1,315 @@
+"""What a flight determines, decided by the reduced normal matrix: what it does not is held, and said in plain words.
+
+A parameter is determined where its sigma is a stated fraction of what it may plausibly be, and where it can be told
+apart from every other of its head: |ρ| < 0.98. Which of several that look alike is held is a matter of physics, not of
+numbers: the boresight stays as long as possible, then what the other errors of a scanner are usually made of (`RULES`,
+from the top). The known sets are those of FORMULAS 5.5, by their effects on the ground (Skaloud and Lichti 2006; Filin
+2003).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.outcome import Held
+
+FloatArray = NDArray[np.float64]
+
+LARGEST_CORRELATION = 0.98
+ALIKE = 0.8  # from here on two parameters take each other's errors
+NOTHING = 300.0  # sigma in plausible sizes that is as good as none
+_WEAK = 1e-3  # 1 / plausible sizes: as little is known of each beforehand, so that nothing is singular
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """When a parameter counts as determined, and what to do where it is not.
+
+    Attributes:
+        plausible: what it may be off by before the calibration, one sigma, SI.
+        fraction: of that, which its sigma must be below.
+        looks: its effect on the ground, in words.
+        remedy: what would determine it.
+    """
+
+    plausible: float
+    fraction: float
+    looks: str
+    remedy: str
+
+    @property
+    def wanted(self) -> float:
+        """The sigma it must be below."""
+        return self.plausible * self.fraction
+
+
+_DEG = float(np.pi / 180.0)
+_HEIGHT = "fly the same area at a second height, at least 1.7 times the first above ground"
+_CONTROL = "ground control: at least 8 points at 1 cm on flat hard ground"
+_SPEED = "fly a second height at least 1.7 times the first, or one line at another speed"
+_EDGE = "lines of which the edge of one overlaps the middle of the other over flat ground, and ground control"
+
+RULES: Mapping[str, Rule] = {  # by how long it is kept: the last is held first
+    "omega_rad": Rule(
+        0.02 * _DEG, 0.25, "it tilts the swath", "fly a line and the same line in the opposite direction"
+    ),
+    "phi_rad": Rule(
+        0.02 * _DEG,
+        0.25,
+        "it shifts the swath along the track, which flat ground does not show",
+        "fly opposite lines over roofs or slopes that face along the track",
+    ),
+    "kappa_rad": Rule(
+        0.04 * _DEG,
+        0.25,
+        "it skews the swath, most at its edges, which flat ground does not show",
+        "fly parallel lines that overlap by half a swath over roofs or slopes that face along the track",
+    ),
+    "range_offset_m": Rule(
+        0.1,
+        0.4,
+        "it lowers all points alike, and roofs only by how steeply the beam meets them",
+        f"{_CONTROL}; or roofs seen from several lines with a side overlap of half a swath, and crossing lines",
+    ),
+    "range_scale": Rule(5e-5, 0.5, "it lowers points by their distance", f"{_HEIGHT}; or {_CONTROL} at both heights"),
+    "scan_angle_scale": Rule(3e-4, 0.4, "it bends the swath up at both edges", _EDGE),
+    "time_offset_s": Rule(1e-3, 0.25, "it shifts points along the track by the speed", _SPEED),
+    "scan_plane_tilt_rad": Rule(
+        0.02 * _DEG, 0.25, "it shifts points backwards, hardly more at the edges", "only a much wider swath shows it"
+    ),
+    "lever_arm_y_m": Rule(0.05, 0.5, "it shifts points across the track, as roll does at one height", _HEIGHT),
+    "lever_arm_x_m": Rule(0.05, 0.5, "it shifts points along the track, as pitch does at one height", _HEIGHT),
+    "lever_arm_z_m": Rule(0.05, 0.5, "it lowers all points alike, as a height error of GNSS does", _CONTROL),
+    "imu_latency_s": Rule(1e-3, 0.25, "it acts only while the aircraft turns", "roll and pitch gently on some lines"),
+    "encoder_latency_s": Rule(
+        2e-6, 0.25, "it tears lines of the two mirror directions apart", "a scan of both directions over flat ground"
+    ),
+    "torsion_s2": Rule(
+        2e-9, 0.25, "at one scan rate it bends the swath as a scale of the scan angle does", "fly a second scan rate"
+    ),
+    "range_offset_slot": Rule(0.02, 0.5, "it acts on returns of one number only", "more of such returns on planes"),
+    "range_offset_zone": Rule(
+        0.02, 0.5, "it acts on one number of pulses in air only", "lines over the same roofs in both zones"
+    ),
+    "ibrc": Rule(0.02, 0.5, "it acts on returns of one intensity only", "planes of that brightness in several strips"),
+    "beam.range_m": Rule(0.02, 0.5, "it acts on one beam only", "planes that this beam sees in several strips"),
+    "beam.azimuth_rad": Rule(0.05 * _DEG, 0.25, "it acts on one beam only", "roofs that this beam sees in many strips"),
+    "beam.elevation_rad": Rule(
+        0.05 * _DEG, 0.25, "it acts on one beam only", "roofs that this beam sees in many strips"
+    ),
+    "pitch_slope": Rule(
+        5e-4, 0.25, "it skews the swath as heading does", "nothing but a bench measurement of the mirror"
+    ),
+    "scan_angle_offset_rad": Rule(
+        0.02 * _DEG, 0.25, "it turns the swath about the track as roll does", "none is needed: roll takes it"
+    ),
+}
+_OTHER = Rule(1.0, 0.5, "", "")
+
+PAIRS: Mapping[frozenset[str], str] = {  # what tells two apart, where it is more than what determines the one
+    frozenset(("omega_rad", "scan_angle_offset_rad")): "none is needed: they are one and the same turn",
+    frozenset(("phi_rad", "scan_plane_tilt_rad")): "only a much wider swath: their difference grows as 1/cos θ",
+    frozenset(("kappa_rad", "pitch_slope")): "nothing but a bench measurement of the mirror",
+    frozenset(("phi_rad", "lever_arm_x_m")): _HEIGHT,
+    frozenset(("omega_rad", "lever_arm_y_m")): _HEIGHT,
+    frozenset(("phi_rad", "time_offset_s")): _SPEED,
+    frozenset(("lever_arm_x_m", "time_offset_s")): "fly one line at another speed, or turn on a line",
+    frozenset(("range_offset_m", "scan_angle_scale")): _EDGE,
+    frozenset(("range_offset_m", "range_scale")): _HEIGHT,
+    frozenset(("range_offset_m", "lever_arm_z_m")): f"{_CONTROL}, and roofs at the swath's edges",
+    frozenset(("scan_angle_scale", "torsion_s2")): "fly a second scan rate",
+}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """By what is decided.
+
+    Attributes:
+        table: rules by parameter, most wanted first.
+        correlation: two parameters whose correlation is larger cannot be told apart.
+    """
+
+    table: Mapping[str, Rule] = field(default_factory=lambda: RULES)
+    correlation: float = LARGEST_CORRELATION
+
+    def of(self, name: str) -> Rule:
+        """Of an unknown by its name, as ``left.ibrc.3``."""
+        return self.table.get(kind_of(name), _OTHER)
+
+    def rank(self, name: str) -> int:
+        """How soon it is given up: the largest first."""
+        kinds = list(self.table)
+        kind = kind_of(name)
+        return kinds.index(kind) if kind in self.table else len(kinds)
+
+
+RULES_OF_ALL = Rules()
+
+
+def kind_of(name: str) -> str:
+    """``left.omega_rad`` → ``omega_rad``; ``left.ibrc.3`` → ``ibrc``; ``left.beam.12.range_m`` → ``beam.range_m``."""
+    _, *rest = name.split(".")
+    if len(rest) == 3:
+        return f"{rest[0]}.{rest[2]}"
+    return rest[0] if rest else name
+
+
+def decide(
+    normal: FloatArray,
+    names: Sequence[str],
+    prior_sigmas: FloatArray | None = None,
+    rules: Rules = RULES_OF_ALL,
+) -> tuple[Held, ...]:
+    """Which unknowns are to be held.
+
+    The worst is held and all is reckoned anew, until every other is determined; at last those that are determined
+    after all come back, unless they would take the place of one that is held.
+
+    Args:
+        normal: (u, u) reduced normal matrix of the parameters: trajectory, planes and ties eliminated, their own
+            priors left out.
+        names: (u,) as ``left.omega_rad``.
+        prior_sigmas: (u,) of the user's priors, inf: none; what has one is never held.
+        rules: sizes and limits.
+
+    Returns:
+        In the order of the names; empty: all are determined.
+    """
+    case = _Case(normal, names, prior_sigmas, rules)
+    case.hold_the_worst()
+    case.take_back()
+    return tuple(case.told(at) for at in sorted(case.partner))
+
+
+class _Case:
+    """A decision under way; sigmas are in plausible sizes.
+
+    Attributes:
+        partner: of every unknown held so far: the one it was given up for; −1: none.
+    """
+
+    def __init__(self, normal: FloatArray, names: Sequence[str], prior_sigmas: FloatArray | None, rules: Rules) -> None:
+        self._names, self._rules = list(names), rules
+        size = np.array([rules.of(name).plausible for name in names])
+        self._size, self._limit = size, np.array([rules.of(name).fraction for name in names])
+        self._rank = np.array([rules.rank(name) for name in names])
+        # two heads of one aircraft share its trajectory's errors: that makes them alike, and neither undetermined
+        heads = np.array([name.partition(".")[0] for name in names])
+        self._of_one_head = heads[:, np.newaxis] == heads
+        sigmas = np.full(len(names), np.inf) if prior_sigmas is None else np.asarray(prior_sigmas, dtype=np.float64)
+        self._given = np.isfinite(sigmas)
+        own = np.where(self._given, size / np.where(self._given, sigmas, 1.0), _WEAK)
+        self._information = _positive(normal, size) + np.diag(own**2)
+        self.partner: dict[int, int] = {}
+
+    def hold_the_worst(self) -> None:
+        """Until what is left is determined."""
+        while True:
+            active = self._active()
+            sigma, rho = self._figures(active)
+            at = self._next(active, sigma, rho)
+            if at is None:
+                return
+            self.partner[at[0]] = at[1]
+
+    def take_back(self) -> None:
+        """What is determined beside all others after all, the most wanted first."""
+        for at in sorted(self.partner, key=lambda index: int(self._rank[index])):
+            if self.partner[at] in self.partner:
+                continue
+            active = sorted([*self._active(), at])
+            sigma, rho = self._figures(active)
+            if self._determined(active, sigma, rho).all():
+                del self.partner[at]
+
+    def told(self, at: int) -> Held:
+        """In words."""
+        active = sorted([*self._active(), at])
+        sigma, rho = self._figures(active)
+        here = active.index(at)
+        own = np.abs(rho[here]) * self._of_one_head[at, active]
+        alike = tuple(
+            (self._names[active[other]], float(rho[here, other])) for other in np.argsort(-own) if own[other] >= ALIKE
+        )
+        scanner, _, name = self._names[at].partition(".")
+        found = float(sigma[here] * self._size[at]) if sigma[here] < NOTHING else np.inf
+        others = [other for other, _ in alike]
+        return Held(scanner, name, self._why(at, found, alike), self._remedy(at, others), found, alike)
+
+    def _active(self) -> list[int]:
+        return [at for at in range(len(self._names)) if at not in self.partner]
+
+    def _figures(self, active: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Sigmas in plausible sizes, correlations with a zero diagonal."""
+        part = self._information[np.ix_(active, active)]
+        root = np.sqrt(np.diag(part))
+        covariance = np.linalg.inv(part / np.outer(root, root)) / np.outer(root, root) if active else part
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        rho = covariance / np.outer(sigma, sigma)
+        np.fill_diagonal(rho, 0.0)
+        return sigma, rho
+
+    def _determined(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> NDArray[np.bool_]:
+        own = np.abs(rho) * self._of_one_head[np.ix_(active, active)]
+        apart = own.max(axis=1, initial=0.0) < self._rules.correlation
+        found: NDArray[np.bool_] = self._given[active] | ((sigma <= self._limit[active]) & apart)
+        return found
+
+    def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:
+        """The unknown to hold, and for which; None: all are determined.
+
+        Of the worst and of those that look like it, the least wanted; of equals the worse one.
+        """
+        open_ = ~self._determined(active, sigma, rho)
+        if not open_.any():
+            return None
+        excess = np.where(open_, sigma / self._limit[active], 0.0)
+        worst = int(np.argmax(excess))
+        own = np.abs(rho[worst]) * self._of_one_head[active[worst], active]
+        alike = np.flatnonzero((own >= ALIKE) & ~self._given[active])
+        candidates = [worst, *alike.tolist()]
+        held = max(candidates, key=lambda at: (self._rank[active[at]], excess[at]))
+        kept = worst if held != worst else (int(np.argmax(own)) if len(alike) else -1)
+        return active[held], active[kept] if kept >= 0 else -1
+
+    def _why(self, at: int, sigma: float, alike: Sequence[tuple[str, float]]) -> str:
+        rule = self._rules.of(self._names[at])
+        if alike:
+            others = " and ".join(f"{other} (correlation {rho:+.3f})" for other, rho in alike[:3])
+            text = f"this flight cannot tell it apart from {others}"
+        elif np.isinf(sigma):
+            text = "nothing in this flight shows it"
+        else:
+            text = f"this flight would leave it {sigma / rule.wanted:.1f} times as uncertain as is of use"
+        return f"{text}: {rule.looks}" if rule.looks else text
+
+    def _remedy(self, at: int, others: Sequence[str]) -> str:
+        kind = kind_of(self._names[at])
+        for other in others:
+            found = PAIRS.get(frozenset((kind, kind_of(other))))
+            if found is not None:
+                return found
+        return self._rules.of(self._names[at]).remedy
+
+
+def _positive(normal: FloatArray, size: FloatArray) -> FloatArray:
+    """The normal matrix in plausible sizes, without what rounding made negative: it would pass for knowledge."""
+    scaled = np.asarray(normal, dtype=np.float64) * np.outer(size, size)
+    root = np.sqrt(np.maximum(np.diag(scaled), 0.0))
+    divisor = np.outer(root, root) + (np.outer(root, root) == 0.0)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T) / divisor)
+    clean: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(root, root)
+    return clean
+
+
+def spectrum(normal: FloatArray) -> FloatArray:
+    """(u,) eigenvalues of the normal matrix scaled to unit diagonal, rising; near 0: a combination nobody sees."""
+    root = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    divisor = np.where(root > 0.0, root, 1.0)
+    values: FloatArray = np.linalg.eigvalsh(normal / np.outer(divisor, divisor))
+    return values

@@ -1,0 +1,341 @@
+"""Which parameters of the sensor model a calibration estimates, and how they stand in one vector over all scanners.
+
+Beyond the model's sixteen (CONVENTIONS, "The beam") a scanner may have: a range offset of its own for each return slot
+or zone of pulses in air; a range correction by intensity, linear between knots; corrections of the beams of a spinning
+head. Of what only differences can be seen, one is held: the reference intensity's correction and the first beam's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.flight import Flight, Head
+from calib.outcome import Held
+from georef.beams import OusterGeometry, SpinningGeometry
+from georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
+from georef.records import Int64Array
+
+FloatArray = NDArray[np.float64]
+
+_BASIC = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
+_SCANNER = (*_BASIC, "scan_angle_scale", "range_scale", "scan_plane_tilt_rad", "time_offset_s")
+MODELS: Mapping[str, tuple[str, ...]] = {
+    "basic": _BASIC,
+    "scanner": _SCANNER,
+    "full": tuple(parameter.name for parameter in PARAMETERS),
+}
+# What a column of the design is, besides the places of PARAMETERS
+SLOT, ZONE, HAT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
+BEAM_PARTS = {"azimuth_rad": AZIMUTH, "elevation_rad": ELEVATION, "range_m": RANGE}
+_BY_CONVENTION = "scan_angle_offset_rad"
+
+
+class ParameterError(ValueError):
+    """A wish that cannot be met; one line for the user."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be estimated. Names are SI ones, of all scanners (``phi_rad``) or of one (``left.phi_rad``).
+
+    Attributes:
+        model: key of `MODELS`.
+        fix: parameters of the model that keep their value.
+        free: parameters beyond the model.
+        priors: one sigma by which a parameter is held to its start, SI; it is estimated, in the model or not.
+        ibrc_knots: rising intensities of a range correction by intensity; none: it is not estimated.
+        ibrc_reference: the knot whose correction is 0; None: the middle one.
+        ibrc_smoothness_m: one sigma of a knot's distance from the line through its neighbours.
+        beams: parts of a spinning head's beams that are estimated, keys of `BEAM_PARTS`.
+        range_offset_slots: return numbers with a range offset of their own, beside that of all.
+        range_offset_zones: numbers of pulses in air (from 0), likewise.
+    """
+
+    model: str = "basic"
+    fix: frozenset[str] = frozenset()
+    free: frozenset[str] = frozenset()
+    priors: Mapping[str, float] = field(default_factory=dict)
+    ibrc_knots: tuple[float, ...] = ()
+    ibrc_reference: float | None = None
+    ibrc_smoothness_m: float = 0.02
+    beams: frozenset[str] = frozenset()
+    range_offset_slots: tuple[int, ...] = ()
+    range_offset_zones: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One estimated parameter.
+
+    Attributes:
+        head: index in `Flight.heads`.
+        kind: place in `PARAMETERS`, or SLOT … RANGE.
+        argument: return slot, zone, knot or channel.
+        name: as ``left.omega_rad``.
+        start: its value before, SI.
+        prior_sigma: by which it is held to that; inf: free.
+    """
+
+    head: int
+    kind: int
+    argument: int
+    name: str
+    start: float
+    prior_sigma: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """The vector of the estimated parameters of all heads.
+
+    Attributes:
+        base: calibration of each head, with what is not estimated.
+        items: (u,).
+        held: parameters of the model that are not among them at the user's word or by convention.
+        smoothness_m: of the range correction by intensity.
+    """
+
+    base: tuple[Calibration, ...]
+    items: tuple[Unknown, ...]
+    held: tuple[Held, ...] = ()
+    smoothness_m: float = 0.02
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(u,) as ``left.omega_rad``."""
+        return tuple(item.name for item in self.items)
+
+    @property
+    def start(self) -> FloatArray:
+        """(u,) values before."""
+        return np.array([item.start for item in self.items], dtype=np.float64)
+
+    @property
+    def prior_sigmas(self) -> FloatArray:
+        """(u,) inf: none."""
+        return np.array([item.prior_sigma for item in self.items], dtype=np.float64)
+
+    def __len__(self) -> int:
+        """Number of unknowns."""
+        return len(self.items)
+
+    def of_head(self, head: int) -> tuple[Int64Array, Int64Array, Int64Array]:
+        """A head's unknowns (m,): where they stand in the vector, kinds, arguments."""
+        at = [index for index, item in enumerate(self.items) if item.head == head]
+        kinds = [self.items[index].kind for index in at]
+        arguments = [self.items[index].argument for index in at]
+        return np.array(at, dtype=np.int64), np.array(kinds, dtype=np.int64), np.array(arguments, dtype=np.int64)
+
+    def without(self, names: frozenset[str], held: Sequence[Held] = ()) -> Unknowns:
+        """The same, some of them held at their start."""
+        items = tuple(item for item in self.items if item.name not in names)
+        return replace(self, items=items, held=(*self.held, *held))
+
+    def calibrations(self, values: FloatArray) -> dict[str, Calibration]:
+        """By scanner, with values (u,)."""
+        return {base.scanner: self._with(head, values) for head, base in enumerate(self.base)}
+
+    def finished(self, values: FloatArray, covariance: FloatArray) -> dict[str, Calibration]:
+        """By scanner, with values (u,) and their covariance (u, u) as sigmas and correlations."""
+        done = {}
+        for head, base in enumerate(self.base):
+            at, kinds, _ = self.of_head(head)
+            at, kinds = at[kinds < SLOT], kinds[kinds < SLOT]
+            sigma = np.sqrt(np.diag(covariance)[at])
+            sigmas, correlation = np.zeros(len(PARAMETERS)), np.eye(len(PARAMETERS))
+            sigmas[kinds] = sigma
+            correlation[np.ix_(kinds, kinds)] = covariance[np.ix_(at, at)] / np.outer(sigma, sigma)
+            done[base.scanner] = replace(self._with(head, values), sigmas=sigmas, correlation=correlation)
+        return done
+
+    def pseudo(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pseudo-observations 0 = A x + w of values (u,), divided by their sigmas: A (m, u), w (m,).
+
+        A parameter's prior; and that the correction by intensity bends little between its knots.
+        """
+        rows, misclosures = [], []
+        for at, item in enumerate(self.items):
+            if np.isfinite(item.prior_sigma):
+                rows.append(np.eye(len(self.items))[at] / item.prior_sigma)
+                misclosures.append((values[at] - item.start) / item.prior_sigma)
+        for head in range(len(self.base)):
+            for row, misclosure in self._bends(head, values):
+                rows.append(row / self.smoothness_m)
+                misclosures.append(misclosure / self.smoothness_m)
+        return np.array(rows).reshape(len(rows), len(self.items)), np.array(misclosures, dtype=np.float64)
+
+    def _bends(self, head: int, values: FloatArray) -> Iterator[tuple[FloatArray, float]]:
+        """Of the inner knots: their corrections from the line through their neighbours."""
+        at, kinds, arguments = self.of_head(head)
+        place = dict(zip(arguments[kinds == HAT].tolist(), at[kinds == HAT].tolist(), strict=True))
+        table = self._with(head, values).ibrc
+        if not place or table is None:
+            return
+        knots, corrections = table
+        for knot in range(1, len(knots) - 1):
+            share = (knots[knot] - knots[knot - 1]) / (knots[knot + 1] - knots[knot - 1])
+            row = np.zeros(len(self.items))
+            factors = {knot - 1: share - 1.0, knot: 1.0, knot + 1: -share}
+            for other, factor in factors.items():
+                if other in place:
+                    row[place[other]] = factor
+            yield row, float(sum(factor * corrections[other] for other, factor in factors.items()))
+
+    def _with(self, head: int, values: FloatArray) -> Calibration:
+        base = self.base[head]
+        parameters, offsets, beams = base.parameters.copy(), list(base.range_offsets), dict(base.beams)
+        knots = None if base.ibrc is None else (base.ibrc[0], base.ibrc[1].copy())
+        for item, value in zip(self.items, values.tolist(), strict=True):
+            if item.head != head:
+                continue
+            if item.kind < SLOT:
+                parameters[item.kind] = value
+            elif item.kind in (SLOT, ZONE):
+                _put_offset(offsets, item, value)
+            elif item.kind == HAT and knots is not None:
+                knots[1][item.argument] = value
+            else:
+                part = item.name.rsplit(".", 1)[-1]
+                beams[item.argument] = replace(beams.get(item.argument, BeamCorrection()), **{part: value})
+        return replace(base, parameters=parameters, range_offsets=tuple(offsets), ibrc=knots, beams=beams)
+
+
+def unknowns(flight: Flight, wish: Wish, start: Mapping[str, Calibration] | None = None) -> Unknowns:
+    """The unknowns of a flight.
+
+    Args:
+        flight: whose heads they are.
+        wish: what is to be estimated.
+        start: calibrations to start from, by scanner; None: the heads' own.
+
+    Raises:
+        ParameterError: the wish names what is not known, or what such a scanner does not have.
+    """
+    _check(flight, wish)
+    bases, items, held = [], [], []
+    for index, head in enumerate(flight.heads):
+        calibration = head.start if start is None else start[head.name]
+        base = _with_knots(replace(calibration, scanner=head.name), wish)
+        bases.append(base)
+        for parameter in PARAMETERS:
+            word = _word(head, parameter.name, wish)
+            if word is None:
+                sigma = _prior(head, parameter.name, wish)
+                items.append(_parameter(index, base, parameter.name, sigma))
+            elif parameter.name in MODELS[wish.model]:
+                held.append(Held(head.name, parameter.name, word))
+        items += _extras(index, head, base, wish)
+    return Unknowns(tuple(bases), tuple(items), tuple(held), wish.ibrc_smoothness_m)
+
+
+def _named(head: Head, name: str, names: frozenset[str] | Mapping[str, float]) -> bool:
+    return name in names or f"{head.name}.{name}" in names
+
+
+def _prior(head: Head, name: str, wish: Wish) -> float:
+    return wish.priors.get(f"{head.name}.{name}", wish.priors.get(name, np.inf))
+
+
+def _word(head: Head, name: str, wish: Wish) -> str | None:
+    """Why a parameter is not estimated; None: it is."""
+    asked = _named(head, name, wish.free) or _named(head, name, wish.priors)
+    if name in head.geometry.without:
+        if asked:
+            raise ParameterError(f"{head.name}.{name}: cannot be freed: this scanner has no such parameter")
+        return "such a scanner has no such parameter"
+    if _named(head, name, wish.fix):
+        return "held at your word"
+    if asked:
+        return None
+    if name == _BY_CONVENTION:
+        return "held by convention: it cannot be told apart from the boresight; free it by name to estimate it"
+    return None if name in MODELS[wish.model] else "not in the model"
+
+
+def _parameter(index: int, base: Calibration, name: str, sigma: float) -> Unknown:
+    return Unknown(index, INDEX[name], 0, f"{base.scanner}.{name}", base.value(name), sigma)
+
+
+def _extras(index: int, head: Head, base: Calibration, wish: Wish) -> Iterator[Unknown]:
+    for kind, word, numbers in (
+        (SLOT, "range_offset_slot", wish.range_offset_slots),
+        (ZONE, "range_offset_zone", wish.range_offset_zones),
+    ):
+        for number in numbers:
+            name = f"{word}.{number}"
+            value = sum(row.offset_m for row in base.range_offsets if _is_own(row, kind, number))
+            yield Unknown(index, kind, number, f"{head.name}.{name}", value, _prior(head, name, wish))
+    if wish.ibrc_knots and base.ibrc is not None:
+        for knot, value in enumerate(base.ibrc[1].tolist()):
+            if knot != _reference(wish):
+                name = f"ibrc.{knot}"
+                yield Unknown(index, HAT, knot, f"{head.name}.{name}", value, _prior(head, name, wish))
+    if wish.beams and _spins(head):
+        for channel in range(1, len(head.geometry.deflection(base).table)):
+            for part, kind in BEAM_PARTS.items():
+                if part in wish.beams:
+                    name = f"beam.{channel}.{part}"
+                    value = getattr(base.beams.get(channel, BeamCorrection()), part)
+                    yield Unknown(
+                        index, kind, channel, f"{head.name}.{name}", value, _prior(head, f"beam.{part}", wish)
+                    )
+
+
+def _spins(head: Head) -> bool:
+    return isinstance(head.geometry, SpinningGeometry | OusterGeometry) and not head.mount.moves
+
+
+def _is_own(row: RangeOffset, kind: int, number: int) -> bool:
+    """Is this the offset of a slot, or zone, and of nothing else?"""
+    wanted = (number, None) if kind == SLOT else (None, number)
+    return row.prf_hz is None and (row.return_slot, row.mta_zone) == wanted
+
+
+def _put_offset(offsets: list[RangeOffset], item: Unknown, value: float) -> None:
+    own = RangeOffset(value, item.argument) if item.kind == SLOT else RangeOffset(value, None, item.argument)
+    offsets[:] = [row for row in offsets if not _is_own(row, item.kind, item.argument)] + [own]
+
+
+def _reference(wish: Wish) -> int:
+    """Index of the knot whose correction is 0."""
+    if wish.ibrc_reference is None:
+        return len(wish.ibrc_knots) // 2
+    return int(np.argmin(np.abs(np.array(wish.ibrc_knots) - wish.ibrc_reference)))
+
+
+def _with_knots(calibration: Calibration, wish: Wish) -> Calibration:
+    """With the correction by intensity at the wish's knots, 0 at the reference; what that takes goes to the offset."""
+    if not wish.ibrc_knots:
+        return calibration
+    knots = np.array(wish.ibrc_knots, dtype=np.float64)
+    if calibration.ibrc is None:
+        return replace(calibration, ibrc=(knots, np.zeros(len(knots))))
+    values = np.interp(knots, *calibration.ibrc)
+    away = float(values[_reference(wish)])
+    moved = calibration.changed(range_offset_m=calibration.value("range_offset_m") - away)
+    return replace(moved, ibrc=(knots, values - away))
+
+
+def _check(flight: Flight, wish: Wish) -> None:
+    if wish.model not in MODELS:
+        raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")
+    heads = [head.name for head in flight.heads]
+    known = set(INDEX) | {f"{head}.{name}" for head in heads for name in INDEX}
+    for name in sorted({*wish.fix, *wish.free} - known):
+        raise ParameterError(f"{name}: is no parameter; want one of {', '.join(INDEX)}, or with {heads[0]}. before it")
+    extra = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")
+    for name, sigma in wish.priors.items():
+        if name not in known and not name.split(".", 1)[-1].startswith(extra) and not name.startswith(extra):
+            raise ParameterError(f"prior {name}: is no parameter; want one of {', '.join(INDEX)}")
+        if not sigma > 0.0:
+            raise ParameterError(f"prior {name}: got {sigma:g}, want a sigma above 0")
+    if wish.ibrc_knots and (len(wish.ibrc_knots) < 2 or bool((np.diff(wish.ibrc_knots) <= 0.0).any())):
+        raise ParameterError("ibrc_knots: want at least two rising intensities")
+    for part in sorted(wish.beams - BEAM_PARTS.keys()):
+        raise ParameterError(f"beams: got {part!r}, want some of {', '.join(BEAM_PARTS)}")
+    if wish.beams and not any(_spins(head) for head in flight.heads):
+        raise ParameterError("beams: no scanner of this flight is a spinning head on a rigid mount; want none")

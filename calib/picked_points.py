@@ -1,0 +1,161 @@
+"""Tie points from a file: what a user picked in the points of several strips, by hand or with another program."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.features import Features, Sighting, TiePoint
+from calib.flight import Flight, Swath
+
+FloatArray = NDArray[np.float64]
+
+HEADER = ("name", "strip", "x", "y", "z", "sigma_m")
+CHUNK = 1_000_000
+
+
+class PickedError(ValueError):
+    """A file of picked points that cannot be used; one line for the user."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """A point as it was picked in one strip.
+
+    Attributes:
+        name: of the point, the same in every strip.
+        strip: number of the strip, or the swath's name.
+        place: (3,) of the file's coordinates; of those of t for `picked_ties`.
+        sigma_m: of each coordinate.
+        where: file and line, for messages.
+    """
+
+    name: str
+    strip: str
+    place: FloatArray
+    sigma_m: float
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class PickedSettings:
+    """What counts.
+
+    Attributes:
+        nearest_m: a return of the strip has to be within this.
+        apart_m: sightings of one point at most, before a calibration.
+    """
+
+    nearest_m: float = 3.0
+    apart_m: float = 50.0
+
+
+_DEFAULT = PickedSettings()
+
+
+def read_picked(text: str, name: str) -> tuple[Picked, ...]:
+    """A CSV with the columns name, strip, x, y, z, sigma_m; coordinates in the flight's CRS.
+
+    Args:
+        text: of the file.
+        name: of the file, for messages.
+
+    Raises:
+        PickedError: not such a file; line and what would be right.
+    """
+    rows = list(csv.reader(io.StringIO(text)))
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    if sorted(header) != sorted(HEADER):
+        raise PickedError(f"{name}: line 1: got {', '.join(header) or 'nothing'}; want the columns {', '.join(HEADER)}")
+    picked = [
+        _row(dict(zip(header, cells, strict=False)), f"{name}: line {number}")
+        for number, cells in enumerate(rows[1:], 2)
+        if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
+    ]
+    if not picked:
+        raise PickedError(f"{name}: no points; want at least one seen in two strips")
+    return tuple(picked)
+
+
+def _row(cells: dict[str, str], where: str) -> Picked:
+    values = {}
+    for key in HEADER:
+        cell = cells.get(key, "").strip()
+        if not cell:
+            raise PickedError(f"{where}: {key} is missing; want {', '.join(HEADER)}")
+        values[key] = cell
+    numbers = []
+    for key in HEADER[2:]:
+        try:
+            number = float(values[key])
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise PickedError(f"{where}: {key}: got {values[key]!r}, want a number")
+        numbers.append(number)
+    if numbers[3] <= 0.0:
+        raise PickedError(f"{where}: sigma_m: got {numbers[3]:g}, want more than 0")
+    return Picked(values["name"], values["strip"], np.array(numbers[:3]), numbers[3], where)
+
+
+def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettings = _DEFAULT) -> Features:
+    """Tie points of picked points whose places stand in t; what cannot be one is counted by reason.
+
+    Raises:
+        PickedError: a strip that the flight does not have, or that several scanners have.
+    """
+    refused: Counter[str] = Counter()
+    named: dict[str, dict[int, Sighting]] = {}
+    for one in picked:
+        index = _swath(flight, one)
+        at, away_m = _nearest(flight.swaths[index], one.place, settings.nearest_m)
+        if not away_m <= settings.nearest_m:
+            refused["picked: no return of the strip near it"] += 1
+        elif index in named.setdefault(one.name, {}):
+            refused["picked: twice in one strip"] += 1
+        else:
+            named[one.name][index] = Sighting(index, at, one.place, one.sigma_m**2 * np.eye(3))
+    ties = []
+    for name, sightings in named.items():
+        seen = [sightings[index] for index in sorted(sightings)]
+        places = np.array([one.point_t for one in seen]).reshape(-1, 3)
+        near = np.linalg.norm(places - np.median(places, axis=0), axis=1) <= settings.apart_m if len(seen) else []
+        kept = tuple(one for one, good in zip(seen, near, strict=True) if good)
+        refused["picked: far from its other sightings"] += len(seen) - len(kept)
+        if len(kept) > 1:
+            ties.append(TiePoint(name, kept, kind="picked"))
+        else:
+            refused["picked: seen in one strip only"] += 1
+    return Features(ties=tuple(ties), refused=+refused)
+
+
+def _swath(flight: Flight, one: Picked) -> int:
+    names = [swath.name for swath in flight.swaths]
+    if one.strip in names:
+        return names.index(one.strip)
+    numbered = [index for index, swath in enumerate(flight.swaths) if str(swath.strip) == one.strip.lstrip("0")]
+    if len(numbered) == 1:
+        return numbered[0]
+    got = "is none of the flight's" if not numbered else "is of several scanners"
+    choice = ", ".join(names if not numbered else [names[index] for index in numbered])
+    raise PickedError(f"{one.where}: strip {one.strip} {got}; want one of {choice}")
+
+
+def _nearest(swath: Swath, place_t: FloatArray, within_m: float) -> tuple[int, float]:
+    """The return nearest to a place, and how far it is; inf where none is about."""
+    best, least = -1, math.inf
+    for begin in range(0, len(swath), CHUNK):
+        off = np.asarray(swath.points_t[begin : begin + CHUNK]) - place_t
+        near = np.flatnonzero((np.abs(off) <= within_m).all(axis=1))
+        if len(near):
+            away = np.linalg.norm(off[near], axis=1)
+            if away.min() < least:
+                best, least = begin + int(near[np.argmin(away)]), float(away.min())
+    return best, least

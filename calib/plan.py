@@ -1,0 +1,321 @@
+"""What a planned flight would determine, before take-off: predicted sigmas, and what would have to be held.
+
+Returns are made where each line's scan would meet the flat pieces of the terrain, and go through the rows and normal
+equations of the adjustment as measured ones do, with the trajectory's errors as far as they are expected; only their
+misclosures are missing, which no sigma needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import adjust as adjustment
+from calib.adjust import AS_USUAL
+from calib.features import ControlPoint, Features, Patch, Plane
+from calib.flight import Flight, FlightError, Head, Swath, Tangent
+from calib.outcome import Held
+from calib.parameters import Wish
+from calib.solve import Settings
+from calib.trajectory_errors import TrajectoryPrior
+from georef.calibration import Calibration
+from georef.records import RETURN_DTYPE, Int64Array
+from georef.rotations import boresight, rot_from_quaternion
+from georef.timescales import SECOND_NS
+from georef.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+LEAST_POINTS = 10  # on a patch, for it to be found in a flight (FORMULAS 6.6)
+LEAST_MADE, MOST_POINTS = (
+    4,
+    24,
+)  # made of a patch: more would only lessen the noise, which the trajectory's errors exceed by far
+STEEPEST_COS = 0.17  # of the incidence: flatter than 80° nothing comes back
+_COARSE_NS = SECOND_NS // 2
+_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A flat piece of the terrain, as a roof's side.
+
+    Attributes:
+        name, kind: as of `calib.features.Plane`.
+        normal_t: (3,) unit, outwards.
+        points_t: (m, 3) spread evenly over it.
+        area_m2: seen from above.
+        control: surveyed points on it, in t.
+    """
+
+    name: str
+    normal_t: FloatArray
+    points_t: FloatArray
+    area_m2: float
+    kind: str = "roof"
+    control: tuple[ControlPoint, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A flight line: which trajectory, its number, from when to when (GPS time)."""
+
+    name: str
+    flown: int
+    strip: int
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """How a line scanner scans.
+
+    Attributes:
+        half_angle_rad: from the middle.
+        rate_hz: pulses a second within the scan.
+        scan_hz: oscillations, or turns, a second.
+        motion: ``sine``, ``triangle`` or ``turning``.
+    """
+
+    half_angle_rad: float
+    rate_hz: float
+    scan_hz: float = 0.0
+    motion: str = "turning"
+
+    def encoder_motion(self, angle_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) rate and acceleration of the encoder at angles; one return goes out, the next comes back."""
+        back = np.where(np.arange(len(angle_rad)) % 2, -1.0, 1.0)
+        turns = 2.0 * np.pi * self.scan_hz
+        if self.motion == "sine":
+            square = np.maximum(self.half_angle_rad**2 - angle_rad**2, 0.0)
+            return back * turns * np.sqrt(square), -(turns**2) * angle_rad
+        if self.motion == "triangle":
+            return back * 4.0 * self.scan_hz * self.half_angle_rad, np.zeros_like(angle_rad)
+        return np.full_like(angle_rad, turns), np.zeros_like(angle_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """What a flight would determine.
+
+    Attributes:
+        names: (u,) of what it would estimate, as ``left.omega_rad``.
+        sigmas: (u,) SI.
+        correlation: (u, u).
+        held: what it would not, and what to fly for it.
+        planes, returns: that it is predicted by.
+    """
+
+    names: tuple[str, ...]
+    sigmas: FloatArray
+    correlation: FloatArray
+    held: tuple[Held, ...]
+    planes: int
+    returns: int
+
+
+def planned(
+    frame: Tangent,
+    heads: Sequence[Head],
+    scans: Sequence[Scan],
+    trajectories: Sequence[Trajectory],
+    lines: Sequence[Line],
+    surfaces: Sequence[Surface],
+) -> tuple[Flight, Features]:
+    """The flight as it would be read, and its planes.
+
+    Args:
+        frame: t.
+        heads: line scanners; their starting calibration says where they look.
+        scans: of each head.
+        trajectories: planned, with the sigmas that are expected of them.
+        lines: to be flown.
+        surfaces: flat pieces of the terrain.
+
+    Raises:
+        FlightError: no surface is seen by two swaths.
+    """
+    swaths: list[Swath] = []
+    patches: list[list[Patch]] = [[] for _ in surfaces]
+    several = len(heads) > 1
+    for line in lines:
+        for number, (head, scan) in enumerate(zip(heads, scans, strict=True)):
+            shots = _shots(frame, head, scan, trajectories[line.flown], line, surfaces)
+            if not len(shots.time_ns):
+                continue
+            for surface in np.unique(shots.surface).tolist():
+                patches[surface].append(Patch(len(swaths), np.flatnonzero(shots.surface == surface)))
+            name = f"{head.name} {line.name}" if several else line.name
+            swaths.append(_swath(name, number, line, head.start, scan, shots))
+    planes = tuple(
+        Plane(
+            surface.name,
+            surface.points_t.mean(axis=0),
+            surface.normal_t,
+            tuple(mine),
+            control=surface.control,
+            kind=surface.kind,
+        )
+        for surface, mine in zip(surfaces, patches, strict=True)
+        if len(mine) > 1 or (mine and surface.control)
+    )
+    if not planes:
+        raise FlightError("no roof and no ground is seen from two lines; want lines that overlap over buildings")
+    return Flight(frame, tuple(heads), tuple(trajectories), tuple(swaths)), Features(planes)
+
+
+def predict(
+    flight: Flight, features: Features, wish: Wish, prior: TrajectoryPrior | None, settings: Settings = AS_USUAL
+) -> Predicted:
+    """Sigmas and what is held, by the adjustment's own equations.
+
+    Args:
+        flight, features: planned or flown.
+        wish: what is to be estimated.
+        prior: of the trajectory's errors.
+        settings: of the adjustment, with the rules of what counts as determined.
+
+    Raises:
+        ParameterError, NormalError: as of `calib.adjust.predict`.
+    """
+    left, covariance = adjustment.predict(flight, features, wish, prior, settings)
+    sigmas = np.sqrt(np.diag(covariance))
+    planes = [plane for plane in features.planes if plane.points]
+    returns = sum(plane.points for plane in planes)
+    return Predicted(left.names, sigmas, covariance / np.outer(sigmas, sigmas), left.held, len(planes), returns)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shots:
+    """Returns of one line: (n,) surface, GPS time, ρ, θ, and (n, 3) where they meet it; by time."""
+
+    surface: Int64Array
+    time_ns: Int64Array
+    range_m: FloatArray
+    angle_rad: FloatArray
+    points_t: FloatArray
+
+    def at(self, chosen: NDArray[np.bool_] | Int64Array) -> _Shots:
+        """Some of them."""
+        return _Shots(
+            self.surface[chosen],
+            self.time_ns[chosen],
+            self.range_m[chosen],
+            self.angle_rad[chosen],
+            self.points_t[chosen],
+        )
+
+
+def _shots(
+    frame: Tangent, head: Head, scan: Scan, trajectory: Trajectory, line: Line, surfaces: Sequence[Surface]
+) -> _Shots:
+    """Where a line's scan meets the surfaces: the moment at which each point lies in the plane of the scan."""
+    surface = np.concatenate([np.full(len(one.points_t), index) for index, one in enumerate(surfaces)])
+    points_t = np.concatenate([one.points_t for one in surfaces])
+    points_e = frame.e_from_t(points_t)
+    time_ns, crossed = _crossings(trajectory, head.start, points_e, line)
+    beam_s, beam_e = _beams(trajectory, head.start, points_e, time_ns)
+    range_m, angle = np.linalg.norm(beam_s, axis=1), np.arctan2(beam_s[:, 1], beam_s[:, 2])
+    normals_t = np.stack([one.normal_t for one in surfaces])[surface]
+    towards = np.einsum("na,na->n", normals_t, beam_e @ frame.rot_t_from_e.T) / range_m
+    low_m, high_m = head.range_gate
+    met = crossed & (np.abs(angle) <= scan.half_angle_rad) & (towards < -STEEPEST_COS)
+    met &= (range_m >= low_m) & (range_m <= high_m)
+    shots = _Shots(surface, time_ns, range_m, angle, points_t).at(met)
+    kept = _thinned(shots, surface, surfaces, _density(trajectory, line, scan, shots))
+    shots = shots.at(kept)
+    return shots.at(np.argsort(shots.time_ns, kind="stable"))
+
+
+def _crossings(
+    trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, line: Line
+) -> tuple[Int64Array, NDArray[np.bool_]]:
+    """When points (n, 3) pass through the plane of the scan; whether they do.
+
+    Looked for on a coarse grid, then by false position (the Illinois rule, Dowell and Jarratt 1971).
+    """
+    count = int((line.end_ns - line.begin_ns) // _COARSE_NS) + 2
+    grid = line.begin_ns + np.rint(np.linspace(0, line.end_ns - line.begin_ns, count)).astype(np.int64)
+    origin_e, ahead_e = _plane_of_scan(trajectory, calibration, grid)
+    ahead = points_e @ ahead_e.T - np.sum(origin_e * ahead_e, axis=1)
+    passed = (ahead[:, :-1] > 0.0) & (ahead[:, 1:] <= 0.0)
+    crossed = np.asarray(passed.any(axis=1), dtype=np.bool_)
+    at, step = np.flatnonzero(crossed), passed.argmax(axis=1)[crossed]
+    low, high = np.zeros(len(at)), (grid[step + 1] - grid[step]).astype(np.float64)
+    before, behind, since = ahead[at, step], ahead[at, step + 1], high
+    for _ in range(_STEPS):
+        since = low + (high - low) * before / (before - behind)
+        origin_e, ahead_e = _plane_of_scan(trajectory, calibration, grid[step] + np.rint(since).astype(np.int64))
+        found = np.sum((points_e[at] - origin_e) * ahead_e, axis=1)
+        front = found > 0.0
+        before, behind = np.where(front, found, 0.5 * before), np.where(front, 0.5 * behind, found)
+        low, high = np.where(front, since, low), np.where(front, high, since)
+    time_ns = np.full(len(points_e), line.begin_ns, dtype=np.int64)
+    time_ns[at] = grid[step] + np.rint(since).astype(np.int64)
+    return time_ns, crossed
+
+
+def _plane_of_scan(
+    trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) the scanner's place in e and the axis that its scan turns about, at times (n,)."""
+    origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
+    return origin_e, rot_e_from_s[:, :, 0]
+
+
+def _scanner(trajectory: Trajectory, calibration: Calibration, time_ns: Int64Array) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) place of the scanner, (n, 3, 3) of s to e, at times of its stamps."""
+    value = calibration.value
+    offset_ns = round(value("time_offset_s") * SECOND_NS)
+    poses = trajectory.poses(np.clip(time_ns + offset_ns, *trajectory.span))
+    rot_e_from_b = rot_from_quaternion(poses.q_e_from_b)
+    angles = boresight(value("omega_rad"), value("phi_rad"), value("kappa_rad"))
+    origin_e = poses.position_e + rot_e_from_b @ calibration.lever_arm_b
+    return origin_e, rot_e_from_b @ (angles @ calibration.installation_matrix)
+
+
+def _beams(
+    trajectory: Trajectory, calibration: Calibration, points_e: FloatArray, time_ns: Int64Array
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) from the scanner to points at times, in s and in e."""
+    origin_e, rot_e_from_s = _scanner(trajectory, calibration, time_ns)
+    beam_e = points_e - origin_e
+    return np.einsum("nij,ni->nj", rot_e_from_s, beam_e), beam_e
+
+
+def _density(trajectory: Trajectory, line: Line, scan: Scan, shots: _Shots) -> FloatArray:
+    """(n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
+    ends = trajectory.poses(np.array([line.begin_ns, line.end_ns], dtype=np.int64)).position_e
+    speed_mps = float(np.linalg.norm(ends[1] - ends[0])) / ((line.end_ns - line.begin_ns) / SECOND_NS)
+    width_m = 2.0 * shots.range_m * np.cos(shots.angle_rad) * np.tan(scan.half_angle_rad)
+    per_m2: FloatArray = scan.rate_hz / (speed_mps * width_m)
+    return per_m2
+
+
+def _thinned(shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], density: FloatArray) -> NDArray[np.bool_]:
+    """Which to keep: as many as would come back, at most `MOST_POINTS` a surface, none of what is hardly seen."""
+    keep = np.zeros(len(shots.surface), dtype=np.bool_)
+    asked = np.bincount(surface, minlength=len(surfaces))
+    for index in np.unique(shots.surface).tolist():
+        at = np.flatnonzero(shots.surface == index)
+        share = len(at) / asked[index]
+        expected = float(density[at].mean()) * surfaces[index].area_m2 * share
+        if expected >= LEAST_POINTS and len(at) >= LEAST_MADE:
+            wanted = int(min(expected, MOST_POINTS, len(at)))
+            keep[at[np.linspace(0, len(at) - 1, wanted).astype(np.int64)]] = True
+    return keep
+
+
+def _swath(name: str, head: int, line: Line, calibration: Calibration, scan: Scan, shots: _Shots) -> Swath:
+    """Readings that give these ranges and angles."""
+    value = calibration.value
+    rows = np.zeros(len(shots.time_ns), RETURN_DTYPE)
+    rows["range_m"] = (shots.range_m - value("range_offset_m")) / (1.0 + value("range_scale"))
+    rows["encoder_rad"] = shots.angle_rad / (1.0 + value("scan_angle_scale")) + value("scan_angle_offset_rad")
+    rows["return_number"] = rows["number_of_returns"] = 1
+    rate, acceleration = scan.encoder_motion(shots.angle_rad)
+    return Swath(name, head, line.strip, line.flown, rows, shots.time_ns, shots.points_t, rate, acceleration)

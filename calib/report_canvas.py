@@ -1,0 +1,177 @@
+"""What a report's pictures are drawn on: the same picture wide, narrow and on paper."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+INK, MUTED, LINE, PALE = "#1d242b", "#5d6770", "#b9bdb8", "#eef0ec"
+BEFORE, AFTER, GOOD, BAD = "#b8860b", "#0b5e8a", "#2f7d4f", "#b3261e"
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
+LIMITS_CM = (2.0, 3.0, 5.0)
+CLASSES = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")  # up to each of the limits, and above
+SETTINGS: Any = {
+    "svg.hashsalt": "calibration",  # the same picture gives the same text
+    "svg.fonttype": "path",
+    "pdf.fonttype": 42,
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "path.simplify": True,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """Width of a picture, how many panels stand beside each other, and ticks on an axis."""
+
+    width_in: float
+    columns: int
+    ticks: int
+    narrow: bool = False
+
+
+WIDE, NARROW, PAPER = Format(10.4, 2, 8), Format(4.1, 1, 4, narrow=True), Format(7.1, 2, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One picture of a report.
+
+    Attributes:
+        title, words: above it.
+        height_in: of a format.
+        draw: onto a canvas of that height.
+    """
+
+    title: str
+    words: str
+    height_in: Callable[[Format], float]
+    draw: Callable[[Canvas], None]
+
+    def svg(self, form: Format) -> bytes:
+        """Drawn alone; the same bytes each time."""
+        with rc_context(SETTINGS):
+            height_in = self.height_in(form)
+            figure = Figure(figsize=(form.width_in, height_in), facecolor="white")
+            self.draw(Canvas(figure, form, height_in))
+            held = io.BytesIO()
+            figure.savefig(held, format="svg", metadata={"Date": None, "Creator": None}, dpi=150)
+        return held.getvalue()
+
+
+class Canvas:
+    """A figure, or a place on a page, measured in inches from its left upper corner.
+
+    Attributes:
+        figure: Matplotlib's.
+        form, height_in: its size.
+    """
+
+    def __init__(
+        self, figure: Figure, form: Format, height_in: float, corner_in: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        self.figure, self.form, self.height_in = figure, form, height_in
+        self._corner_in = corner_in
+        self._page_in = float(figure.get_figwidth()), float(figure.get_figheight())
+
+    def place(self, left: float, top: float) -> tuple[float, float]:
+        """A place in the figure's own measure, 0 … 1 from its left lower corner."""
+        (across, up), (x, y) = self._page_in, self._corner_in
+        return (x + left) / across, 1.0 - (y + top) / up
+
+    def panel(self, left: float, top: float, width: float, height: float, **more: Any) -> Axes:
+        """Axes of this size, dressed."""
+        x, y = self.place(left, top + height)
+        axes: Axes = self.figure.add_axes((x, y, width / self._page_in[0], height / self._page_in[1]), **more)
+        dress(axes)
+        return axes
+
+    def text(self, left: float, top: float, words: str, **style: Any) -> Any:
+        """Words whose upper left corner is there."""
+        look: dict[str, Any] = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left"} | style
+        return self.figure.text(*self.place(left, top), words, **look)
+
+    def legend(self, handles: Sequence[Any], columns: int | None = None, top: float = 0.0) -> None:
+        """Along the upper edge."""
+        most = columns or (3 if self.form.narrow else 9)
+        rows = -(-len(handles) // most)
+        across = -(-len(handles) // rows)
+        filled = [*handles, *[Line2D([], [], ls="", label=" ") for _ in range(rows * across - len(handles))]]
+        self.figure.legend(
+            handles=[filled[row * across + column] for column in range(across) for row in range(rows)],
+            loc="upper left",
+            bbox_to_anchor=self.place(0.0, top),
+            ncols=across,
+            frameon=False,
+            fontsize=8,
+            labelcolor=INK,
+            handlelength=1.3,
+            handletextpad=0.5,
+            columnspacing=1.3,
+            borderaxespad=0.0,
+            borderpad=0.1,
+        )
+
+
+class Panels:
+    """Equal panels in rows and columns, as many beside each other as the format takes.
+
+    Attributes:
+        axes: one a title.
+    """
+
+    GAP_IN, LEFT_IN, BOTTOM_IN = 0.62, 0.58, 0.5
+
+    def __init__(
+        self, canvas: Canvas, titles: Sequence[str], panel_in: float, top: float, columns: int | None = None
+    ) -> None:
+        across = min(columns or canvas.form.columns, len(titles))
+        width = (canvas.form.width_in - 0.1) / across - self.LEFT_IN - 0.08
+        self.axes: list[Axes] = []
+        for i, title in enumerate(titles):
+            row, column = divmod(i, across)
+            left = self.LEFT_IN + column * (width + self.LEFT_IN + 0.08)
+            axes = canvas.panel(left, top + 0.25 + row * (panel_in + self.GAP_IN), width, panel_in)
+            axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
+            axes.xaxis.set_major_locator(MaxNLocator(canvas.form.ticks // (2 if across > 1 else 1) + 1))
+            self.axes.append(axes)
+
+    @classmethod
+    def height_in(cls, form: Format, count: int, panel_in: float, columns: int | None = None) -> float:
+        """Of all rows together, without what stands above."""
+        rows = -(-count // min(columns or form.columns, count))
+        return 0.25 + rows * (panel_in + cls.GAP_IN) - cls.GAP_IN + cls.BOTTOM_IN
+
+
+def dress(axes: Axes) -> None:
+    """A panel's colours."""
+    axes.tick_params(labelsize=8, colors=MUTED, length=3)
+    axes.spines[:].set_color(LINE)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#7c858c", lw=0.4, alpha=0.3)
+    axes.set_axisbelow(True)
+
+
+def colour_of(index: int) -> str:
+    """The same one for a swath in every picture."""
+    return SERIES[index % len(SERIES)]
+
+
+def class_of(value_cm: float) -> str:
+    """Colour of a residual's class."""
+    return CLASSES[sum(value_cm > limit for limit in LIMITS_CM)]
+
+
+def class_words() -> list[tuple[str, str]]:
+    """Colour and words of each class."""
+    low, middle, high = (f"{limit:g}" for limit in LIMITS_CM)
+    words = (f"≤ {low} cm", f"{low}–{middle} cm", f"{middle}–{high} cm", f"> {high} cm")
+    return list(zip(CLASSES, words, strict=True))

@@ -1,0 +1,139 @@
+"""Numbers and names as a report says them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from calib.outcome import Held
+from georef.calibration import PARAMETERS
+
+MINUS, THIN, SPACE = "−", "\u202f", "\u00a0"  # spaces at which no line ends
+_LABELS: dict[str, tuple[str, str]] = {  # words, symbol
+    "omega_rad": ("boresight ω (roll)", "ω"),
+    "phi_rad": ("boresight φ (pitch)", "φ"),
+    "kappa_rad": ("boresight κ (heading)", "κ"),
+    "range_offset_m": ("range offset", "Δρ"),
+    "range_scale": ("range scale", "sρ"),
+    "scan_angle_offset_rad": ("scan angle offset", "Δθ"),
+    "scan_angle_scale": ("scan angle scale", "sθ"),
+    "scan_plane_tilt_rad": ("scan plane tilt Δη", "Δη"),
+    "lever_arm_x_m": ("lever arm x", "ax"),
+    "lever_arm_y_m": ("lever arm y", "ay"),
+    "lever_arm_z_m": ("lever arm z", "az"),
+    "time_offset_s": ("time offset", "δt"),
+    "imu_latency_s": ("IMU latency", "τi"),
+    "encoder_latency_s": ("encoder latency", "τe"),
+    "torsion_s2": ("torsion", "τt"),
+    "pitch_slope": ("pitch slope", "m"),
+}
+_UNITS = {"deg": "°", "m": "m", "ppm": "ppm", "us": "µs", "us2": "µs²"}
+_BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+_NAMED = re.compile(rf"\b([\w-]+)\.({'|'.join(sorted(_LABELS, key=len, reverse=True))})\b")
+_SUFFIXES = (("_rad", "°", 180.0 / math.pi), ("_m", "m", 1.0), ("_s", "µs", 1e6))
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """An unknown of the adjustment as people name it.
+
+    Attributes:
+        scanner: whose.
+        name: of the parameter or of the table's entry.
+        words, symbol: long and short.
+        unit: in which reports give it; factor: units of reports a unit in SI.
+    """
+
+    scanner: str
+    name: str
+    words: str
+    symbol: str
+    unit: str
+    factor: float
+
+    @property
+    def is_parameter(self) -> bool:
+        """One of the model's sixteen, not an entry of a table."""
+        return self.name in _BY_NAME
+
+
+def unknown(name: str) -> Unknown:
+    """Of names as ``left.omega_rad``, ``left.ibrc.3``, ``left.beam.12.azimuth_rad``."""
+    scanner, _, own = name.partition(".")
+    if own in _BY_NAME:
+        parameter = _BY_NAME[own]
+        words, symbol = _LABELS[own]
+        return Unknown(scanner, own, words, symbol, _UNITS[parameter.key.rpartition("_")[2]], 1.0 / parameter.factor)
+    kind, _, rest = own.partition(".")
+    words = f"{kind.replace('_', ' ').replace('ibrc', 'IBRC')} {rest.replace('.', ' ')}".strip()
+    for suffix, unit, factor in _SUFFIXES:
+        if own.endswith(suffix):
+            return Unknown(scanner, own, words.removesuffix(suffix), rest.removesuffix(suffix), unit, factor)
+    return Unknown(scanner, own, words, f"{kind[:2]}{rest}", "m", 1.0)
+
+
+def words_of(scanner: str, name: str, *, several: bool) -> str:
+    """A parameter's words, with its scanner where there are several."""
+    words = unknown(f"{scanner}.{name}").words
+    return f"{words} of {scanner}" if several else words
+
+
+def plain(text: str, *, several: bool) -> str:
+    """A sentence in which parameters go by their words, not by names as ``left.omega_rad``."""
+    return _NAMED.sub(lambda found: words_of(found[1], found[2], several=several), text)
+
+
+def is_undetermined(held: Held) -> bool:
+    """Held because the flight does not tell it, not because the user said so."""
+    return bool(held.remedy or held.with_others)
+
+
+def decimals_of(sigma: float, most: int = 9) -> int:
+    """Digits after the point that show two digits of a sigma."""
+    if not math.isfinite(sigma) or sigma <= 0.0:
+        return 4
+    return min(max(1 - math.floor(math.log10(sigma)), 0), most)
+
+
+def number(value: float | None, pattern: str = ".3g") -> str:
+    """With a real minus; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = format(value, pattern)
+    return text.replace("-", MINUS) if float(text.replace(",", "")) else text.replace("-", "")
+
+
+def thousands(value: float, digits: int = 0) -> str:
+    """A number whose thousands stand apart."""
+    return f"{value:,.{digits}f}".replace(",", THIN).replace("-", MINUS)
+
+
+def length(metres: float | None) -> str:
+    """Of a sigma or a difference: millimetres below a centimetre, centimetres below a metre."""
+    if metres is None or not math.isfinite(metres):
+        return "–"
+    size = abs(metres)
+    if size >= 1.0:
+        return number(metres, ".2f") + SPACE + "m"
+    if size >= 0.00995:
+        return number(100.0 * metres, ".1f") + SPACE + "cm"
+    return number(1000.0 * metres, ".0f" if size >= 0.00095 else ".1f") + SPACE + "mm"
+
+
+def degrees(value_deg: float | None) -> str:
+    """Of a small angle's sigma."""
+    if value_deg is None or not math.isfinite(value_deg):
+        return "–"
+    return number(value_deg, f".{max(4, decimals_of(value_deg) - 1)}f" if value_deg < 0.1 else ".2f") + "°"
+
+
+def share(value: float) -> str:
+    """Per cent; what is not nothing is not 0 %."""
+    return "0 %" if value <= 0.0 else "< 0.01 %" if value < 1e-4 else f"{100.0 * value:.2f} %"
+
+
+def listed(words: list[str], most: int = 6) -> str:
+    """Joined as a sentence lists things."""
+    shown = words if len(words) <= most else [*words[: most - 1], f"{len(words) - most + 1} more"]
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}" if shown else ""

@@ -1,0 +1,151 @@
+"""What the loops over rows are given and fill, as tuples that numba knows by their names."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from georef.kernels.types import ByteArray, FloatArray, Track
+from georef.records import Int64Array, StructArray
+
+STATES, OF_PLANE = 8, 3  # columns of a row
+
+
+class Beam(NamedTuple):
+    """The second half of `georef.points.Rays` of a batch of one swath, vectors as columns, and its rows."""
+
+    rows: StructArray
+    fate: ByteArray
+    time_ns: Int64Array
+    points_e: FloatArray
+    angle_rad: FloatArray
+    range_m: FloatArray
+    q_e_from_b: FloatArray
+    epoch: Int64Array
+    arm_b: FloatArray
+    range_axis_b: FloatArray
+    angle_axis_b: FloatArray
+    tilt_axis_b: FloatArray
+    encoder_rad: FloatArray
+    encoder_rate: FloatArray
+    encoder_acceleration: FloatArray
+
+
+class Head(NamedTuple):
+    """A scanner with its calibration.
+
+    Attributes:
+        at, kind, argument: (m,) of its unknowns (`calib.parameters.Unknowns.of_head`).
+        value: (16,) of its calibration.
+        outer: (1, 3, 3) Rx(ω) Ry(φ).
+        spin_b: (1, 3) a spinning head's axis.
+        before_m: of the range that lies before the beam's start; nan: the start turns with the beam.
+        knots: (k,) intensities.
+        range_m, angle_rad, time_s, divergence_rad: sigmas of a return, and its beam.
+    """
+
+    at: Int64Array
+    kind: Int64Array
+    argument: Int64Array
+    value: FloatArray
+    outer: FloatArray
+    spin_b: FloatArray
+    before_m: float
+    knots: FloatArray
+    range_m: float
+    angle_rad: float
+    time_s: float
+    divergence_rad: float
+
+
+class Planes(NamedTuple):
+    """(q, 3) normals, centres and two directions in each plane, in e; (q,) offsets."""
+
+    normal_e: FloatArray
+    centre_e: FloatArray
+    first_e: FloatArray
+    second_e: FloatArray
+    offset: FloatArray
+
+
+class Knots(NamedTuple):
+    """Trajectory states: (k,) times; (k, 6) shift and turn in e; where the first stands among all unknowns."""
+
+    time_ns: Int64Array
+    state: FloatArray
+    first: int
+
+
+class Sigmas(NamedTuple):
+    """Of a trajectory whose errors are not estimated: (n, 3) north, east, down; roll, pitch, heading; none: (0, 3)."""
+
+    position_l: FloatArray
+    attitude: FloatArray
+
+
+class Groups(NamedTuple):
+    """Runs of rows of one plane between two knots.
+
+    Attributes:
+        begin, end: (g,) in the batch.
+        plane, before, after: (g,) indexes; knots −1: none.
+        place_before, place_after: (g,) of the knots' states in the plane's own list of unknowns.
+        channel: (g,) −1: any.
+    """
+
+    begin: Int64Array
+    end: Int64Array
+    plane: Int64Array
+    before: Int64Array
+    after: Int64Array
+    place_before: Int64Array
+    place_after: Int64Array
+    channel: Int64Array
+
+
+class Sums(NamedTuple):
+    """Normal equations before planes are eliminated.
+
+    Attributes:
+        normal, right: (u, u), (u,) of parameters and states.
+        mixed: (entries, 3) plane by plane, a row an unknown in the plane's list; first: (q,) where each begins.
+        plane, plane_right: (q, 3, 3), (q, 3).
+        square: (1,) Σ p f².
+        counts: (1,) rows.
+    """
+
+    normal: FloatArray
+    right: FloatArray
+    mixed: FloatArray
+    first: Int64Array
+    plane: FloatArray
+    plane_right: FloatArray
+    square: FloatArray
+    counts: Int64Array
+
+
+class Looks(NamedTuple):
+    """Of each row of a batch (n,): f, M, n · beam, q = A Q Aᵀ; Q (g, c, c) of the groups; the design (n, c + 1)."""
+
+    misclosure: FloatArray
+    variance: FloatArray
+    along: FloatArray
+    spread: FloatArray
+    cofactor: FloatArray
+    design: FloatArray
+
+
+class Task(NamedTuple):
+    """A batch of one swath: its returns, their runs, and what they are placed with.
+
+    Attributes:
+        rot_l_from_e: (3, 3) somewhere on the way; counts where the trajectory's own sigmas do.
+    """
+
+    beam: Beam
+    groups: Groups
+    head: Head
+    planes: Planes
+    knots: Knots
+    sigmas: Sigmas
+    track: Track
+    rot_l_from_e: FloatArray

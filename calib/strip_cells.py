@@ -1,0 +1,182 @@
+"""Cells in which strips overlap, and the returns that strips have in them.
+
+Strips are read block by block, from memory, mapped files or LAZ, so that only what lies in chosen cells is held.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.flight import Swath
+from georef.records import Int64Array
+
+FloatArray = NDArray[np.float64]
+
+BLOCK = 1_000_000  # returns that are looked through at a time
+RETURNS_A_CELL = 16.0
+FINEST_CELL_M, COARSEST_CELL_M = 0.5, 20.0
+DENSITY_BLOCKS, DENSITY_CELL_M = 2, 5.0  # what a strip's density is taken from
+
+
+@dataclass(frozen=True, slots=True)
+class StripRules:
+    """What is compared.
+
+    Attributes:
+        cell_m: side of a cell; None: of a size that holds `RETURNS_A_CELL` of the thinnest strip.
+        most_cells: cells that are looked into, spread over the whole overlap.
+        fewest: returns of a plane.
+        roughest_m: √λ0 of a plane.
+        steepest_deg: slope of a plane.
+    """
+
+    cell_m: float | None = None
+    most_cells: int = 20_000
+    fewest: int = 6
+    roughest_m: float = 0.06
+    steepest_deg: float = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class StripBlock:
+    """Some returns of a strip: places (n, 3) in metres, GPS times, whether each is its pulse's only one, and the scan's
+    direction there (+1 towards positive angles, −1, 0: not known)."""
+
+    points: FloatArray
+    time_ns: Int64Array
+    single: NDArray[np.bool_]
+    direction: NDArray[np.int8]
+
+
+class Strip(Protocol):
+    """A strip that can be read block by block, more than once."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+
+    def blocks(self) -> Iterator[StripBlock]:
+        """All of it; the same points every time."""
+
+
+@dataclass(frozen=True)
+class FlightStrip:
+    """A swath of a flight."""
+
+    swath: Swath
+
+    @property
+    def name(self) -> str:
+        """The swath's."""
+        return self.swath.name
+
+    def blocks(self) -> Iterator[StripBlock]:
+        """All of it."""
+        swath = self.swath
+        for begin in range(0, len(swath), BLOCK):
+            rows = slice(begin, begin + BLOCK)
+            single = np.asarray(swath.rows["number_of_returns"][rows] <= 1)
+            rate = np.zeros(len(single)) if swath.encoder_rate is None else swath.encoder_rate[rows]
+            yield StripBlock(
+                np.asarray(swath.points_t[rows]), swath.time_ns[rows], single, np.sign(rate).astype(np.int8)
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of the overlap: side, numbers (n,), rising, as of `numbers_of`, and where they count from (east, north)."""
+
+    cell_m: float
+    numbers: Int64Array
+    origin: tuple[float, float] = (0.0, 0.0)
+
+
+def numbers_of(points: FloatArray, cell_m: float, origin: tuple[float, float] = (0.0, 0.0)) -> Int64Array:
+    """The number (n,) of the cell of each place (n, ≥ 2): one for every two whole numbers of cells north and east."""
+    east, north = (np.floor((points[:, axis] - origin[axis]) / cell_m).astype(np.int64) for axis in (0, 1))
+    return np.asarray((north << 32) + east, np.int64)
+
+
+def overlap_cells(strips: Sequence[Strip], rules: StripRules) -> Cells:
+    """Cells in which two strips or more have returns, thinned evenly to as many as are wanted."""
+    fine = rules.cell_m or _cell_for(strips)
+    found = [_occupied(strip, fine) for strip in strips]
+    numbers, strips_there = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]), return_counts=True)
+    return thinned(Cells(fine, numbers[strips_there > 1]), rules)
+
+
+def thinned(cells: Cells, rules: StripRules) -> Cells:
+    """As many as are wanted, drawn evenly; the same ones every time."""
+    if len(cells.numbers) <= rules.most_cells:
+        return cells
+    chosen = np.random.default_rng(19159).choice(len(cells.numbers), rules.most_cells, replace=False)
+    return Cells(cells.cell_m, cells.numbers[np.sort(chosen)], cells.origin)
+
+
+def _occupied(strip: Strip, cell_m: float) -> Int64Array:
+    found = [np.unique(numbers_of(_singles(block).points, cell_m)) for block in strip.blocks()]
+    return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+
+
+def _cell_for(strips: Sequence[Strip]) -> float:
+    """A side that holds enough returns of the thinnest strip, by the area that each covers in coarse cells."""
+    densities = [_density(strip) for strip in strips]
+    least = min((one for one in densities if one > 0.0), default=4.0)
+    return float(np.clip(math.sqrt(RETURNS_A_CELL / least), FINEST_CELL_M, COARSEST_CELL_M))
+
+
+def _density(strip: Strip) -> float:
+    """Single returns a square metre, by the median of covered cells at its beginning."""
+    side_m = DENSITY_CELL_M
+    numbers = [numbers_of(_singles(block).points, side_m) for block in islice(strip.blocks(), DENSITY_BLOCKS)]
+    counts = np.unique(np.concatenate([*numbers, np.zeros(0, np.int64)]), return_counts=True)[1]
+    return float(np.median(counts)) / side_m**2 if len(counts) else 0.0
+
+
+def _singles(block: StripBlock) -> StripBlock:
+    kept = block.single & np.isfinite(block.points).all(axis=1)
+    return StripBlock(block.points[kept], block.time_ns[kept], block.single[kept], block.direction[kept])
+
+
+# ---------------------------------------------------------------------- returns in the cells
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Single returns in the cells, ordered by cell, then by strip (n,) or (n, 3)."""
+
+    cell: Int64Array
+    strip: Int64Array
+    points: FloatArray
+    time_ns: Int64Array
+    direction: NDArray[np.int8]
+
+
+def blocks_of(strips: Sequence[Strip]) -> Iterator[tuple[int, StripBlock]]:
+    """All blocks of strips, each with its strip's index."""
+    return ((number, block) for number, strip in enumerate(strips) for block in strip.blocks())
+
+
+def gather(blocks: Iterable[tuple[int, StripBlock]], cells: Cells) -> Gathered:
+    """What lies in the cells, of blocks with the index of their strip."""
+    none = np.zeros(0, np.int64)
+    pieces = [(none, none, np.zeros((0, 3)), none, np.zeros(0, np.int8))]
+    for number, raw in blocks:
+        block = _singles(raw)
+        if not len(block.points) or not len(cells.numbers):
+            continue
+        numbers = numbers_of(block.points, cells.cell_m, cells.origin)
+        at = np.minimum(np.searchsorted(cells.numbers, numbers), len(cells.numbers) - 1)
+        kept = np.flatnonzero(cells.numbers[at] == numbers)
+        strip = np.full(len(kept), number)
+        pieces.append((at[kept], strip, block.points[kept], block.time_ns[kept], block.direction[kept]))
+    columns = [np.concatenate(column) for column in zip(*pieces, strict=True)]
+    order = np.lexsort((columns[1], columns[0]))
+    return Gathered(*(column[order] for column in columns))

@@ -1,0 +1,360 @@
+"""Strip adjustment after the calibration: corrections of each strip's trajectory, and no parameter of the scanner.
+
+The calibration is held; each strip gets the simplest correction that its returns ask for (ISO/TS 19159-2, 6.3.3,
+Eq. 12, as corrections of the trajectory; FORMULAS 7.3):
+
+    none        0
+    constant    a
+    linear      a + b τ,  τ = −1 … 1 along the strip
+    spline      a + b τ + what bends between knots, its second differences held to 0
+
+of position (north, east, down) and of small turns about these axes. All have priors, as a common shift of all strips is
+seen by nobody without control. Which strip gets which is chosen by an information criterion (Schwarz 1978; AIC of
+Akaike 1974 as corrected by Hurvich and Tsai 1989), with the number of parameters that the returns determine, the trace
+of N (N + P)⁻¹. The equations are those of the adjustment (`calib.normals`) with states of the trajectory alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.features import Features
+from calib.flight import Flight
+from calib.normals import Normals, TrajectoryWeight, normals
+from calib.outcome import TrajectoryFit
+from calib.parameters import Wish, unknowns
+from calib.rows import Rows, SingleArray, State
+from calib.tie_rows import Ties
+from calib.trajectory_errors import ERRORS, TrajectoryPrior, apply, knots_of
+from georef.calibration import Calibration
+from georef.records import Int64Array
+from georef.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+MODELS = ("none", "constant", "linear", "spline")
+MOST_CHOSEN_SINGLY = 30  # strips; with more, all get one model
+MOST_SWEEPS = 5
+
+
+class StripError(ValueError):
+    """Strips that cannot be adjusted; one line for the user."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of the strip adjustment.
+
+    Attributes:
+        knot_s: distance of a spline's knots.
+        position_m, turn_rad: prior sigmas of a strip's constant correction; of its drift half as much.
+        bend_m, bend_rad: prior sigmas of a spline's second differences.
+        criterion: ``bic`` or ``aicc``.
+        models: that may be chosen.
+        huber: returns farther off than so many sigmas lose weight.
+        linearisations: how often.
+    """
+
+    knot_s: float = 10.0
+    position_m: float = 0.2
+    turn_rad: float = float(np.radians(0.02))
+    bend_m: float = 0.03
+    bend_rad: float = float(np.radians(0.003))
+    criterion: str = "bic"
+    models: tuple[str, ...] = MODELS
+    huber: float = 3.0
+    linearisations: int = 3
+
+
+DEFAULTS = Settings()
+
+
+@dataclass(frozen=True, slots=True)
+class StripChoice:
+    """What one strip got.
+
+    Attributes:
+        flown, strip: of the strip.
+        model: of `MODELS`.
+        gains: by model: criterion of this strip with it minus with the one chosen, the others as chosen; 0: chosen.
+    """
+
+    flown: int
+    strip: int
+    model: str
+    gains: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class StripAdjusted:
+    """The result; no calibration is in it.
+
+    Attributes:
+        choices: a strip each, by time.
+        fit: the corrections along, to be added to the trajectory, with their sigmas.
+        trajectories: corrected.
+        parameters: number of parameters the returns determined.
+        variance_before, variance_after: mean square of misclosures in sigmas.
+        observations: number of rows.
+        notes: for people.
+    """
+
+    choices: tuple[StripChoice, ...]
+    fit: TrajectoryFit
+    trajectories: tuple[Trajectory, ...]
+    parameters: float
+    variance_before: float
+    variance_after: float
+    observations: int
+    notes: tuple[str, ...]
+
+
+def adjust_strips(
+    flight: Flight,
+    features: Features,
+    calibrations: Mapping[str, Calibration],
+    settings: Settings = DEFAULTS,
+    row_weight: SingleArray | None = None,
+) -> StripAdjusted:
+    """Correct each strip's trajectory by what its features say.
+
+    Args:
+        flight: as measured.
+        features: seen by several strips; control makes the corrections absolute.
+        calibrations: by scanner; they are held.
+        settings: of it.
+        row_weight: (n,) of the rows on planes, in the order of `calib.rows`, as the calibration left them; None: 1.
+
+    Raises:
+        StripError: an unknown model or criterion; `FlightError`: there is no strip.
+    """
+    _check(settings)
+    knots = knots_of(flight, settings.knot_s)
+    free = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(ERRORS * len(knots)))
+    case = _Equations(flight, features, calibrations, free, settings, row_weight)
+    choice = _Choice(knots.flown, knots.strip, settings)
+    state, before = case.start(), None
+    for _ in range(settings.linearisations):
+        quadratic = case.at(state)
+        before = quadratic if before is None else before
+        choice.choose(quadratic)
+        along = choice.solved(quadratic)[0]
+        state = case.moved(along)
+    last = case.at(state)
+    along, sigma, parameters = choice.solved(last)
+    assert before is not None
+    return StripAdjusted(
+        choice.told(last),
+        _fit(free, along, sigma, choice.prior_sigmas()),
+        tuple(apply(one, number, free, along) for number, one in enumerate(flight.trajectories)),
+        parameters,
+        before.square(np.zeros(ERRORS * len(knots))) / before.observations,
+        last.square(along.ravel()) / last.observations,
+        last.observations,
+        choice.notes(),
+    )
+
+
+def _check(settings: Settings) -> None:
+    if not settings.models:
+        raise StripError(f"strip model: got none at all, want some of {', '.join(MODELS)}")
+    for model in settings.models:
+        if model not in MODELS:
+            raise StripError(f"strip model: got {model!r}, want some of {', '.join(MODELS)}")
+    if settings.criterion not in ("bic", "aicc"):
+        raise StripError(f"criterion: got {settings.criterion!r}, want bic or aicc")
+
+
+def _fit(free: TrajectoryPrior, along: FloatArray, sigma: FloatArray, prior: FloatArray) -> TrajectoryFit:
+    return TrajectoryFit(
+        free.flown, free.time_ns, free.strip,
+        along[:, :3], along[:, 3:], sigma[:, :3], sigma[:, 3:], prior[:, :3], prior[:, 3:],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Quadratic:
+    """χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l, all else eliminated."""
+
+    normal: FloatArray
+    right: FloatArray
+    constant: float
+    observations: int
+
+    def square(self, x: FloatArray) -> float:
+        """χ²."""
+        return float(self.constant - 2.0 * self.right @ x + x @ self.normal @ x)
+
+
+class _Equations:
+    """The adjustment's own equations with nothing but states."""
+
+    def __init__(
+        self,
+        flight: Flight,
+        features: Features,
+        calibrations: Mapping[str, Calibration],
+        free: TrajectoryPrior,
+        settings: Settings,
+        row_weight: SingleArray | None,
+    ) -> None:
+        planes = tuple(plane for plane in features.planes if plane.points)
+        self._rows = Rows(flight, planes, unknowns(flight, Wish(), calibrations), free)
+        self._ties = Ties(self._rows, features.ties, None)
+        self._weight = TrajectoryWeight(self._rows)
+        self._weight.normal = np.zeros_like(self._weight.normal)
+        self._row_weight = np.ones(self._rows.count, np.float32) if row_weight is None else row_weight
+        self._tie_weight = np.ones(sum(len(tie.sightings) for tie in features.ties), np.float32)
+        self._huber = settings.huber
+
+    def start(self) -> State:
+        """No corrections."""
+        return self._rows.start(len(self._ties.ties))
+
+    def at(self, state: State) -> _Quadratic:
+        """Linearised there."""
+        found = normals(self._rows, self._ties, self._weight, state, self._row_weight, self._tie_weight, self._huber)
+        x, p = state.knots.reshape(-1, 1), found.parameters  # these are held: their rows and columns fall away
+        normal, right = found.normal[p:, p:], found.right[p:].reshape(-1, 1)
+        constant = _reduced_square(found) - 2.0 * float((right * x).sum()) + float((x * (normal @ x)).sum())
+        to_l = self._weight.to_l
+        turned = to_l(to_l(normal).T)
+        return _Quadratic(
+            (turned + turned.T) / 2.0, to_l(normal @ x - right).ravel(), constant, found.observations - len(x)
+        )
+
+    def moved(self, along: FloatArray) -> State:
+        """With corrections (k, 6) in l; planes as the first adjustment found them."""
+        return replace(self.start(), knots=self._weight.to_e(along.reshape(-1, 1)).reshape(-1, ERRORS))
+
+
+def _reduced_square(found: Normals) -> float:
+    """Σ p w² with planes and tie points where they are best."""
+    features = (*found.planes, *found.ties)
+    return found.square - sum(float(one.right @ one.inverse @ one.right) for one in features)
+
+
+class _Choice:
+    """Which strip gets which model."""
+
+    def __init__(self, flown: Int64Array, strip: Int64Array, settings: Settings) -> None:
+        self._settings = settings
+        keys = sorted(
+            {(int(a), int(b)) for a, b in zip(flown, strip, strict=True)},
+            key=lambda key: self._first(flown, strip, key),
+        )
+        self._keys = keys
+        self._at = [np.flatnonzero((flown == key[0]) & (strip == key[1])) for key in keys]
+        self._bases = [{model: _basis(model, len(at), settings) for model in settings.models} for at in self._at]
+        self.models = [settings.models[0]] * len(keys)
+        self._size = ERRORS * len(flown)
+
+    @staticmethod
+    def _first(flown: Int64Array, strip: Int64Array, key: tuple[int, int]) -> int:
+        return int(np.flatnonzero((flown == key[0]) & (strip == key[1]))[0])
+
+    def choose(self, quadratic: _Quadratic) -> None:
+        """By the criterion: all alike first, then strip by strip until no strip wants another."""
+        alike = [[model] * len(self._keys) for model in self._settings.models]
+        self.models = min([self.models, *alike], key=lambda models: self._criterion(quadratic, models))
+        if len(self._keys) > MOST_CHOSEN_SINGLY:
+            return
+        for _ in range(MOST_SWEEPS):
+            before = list(self.models)
+            for number in range(len(self._keys)):
+                found = self._tried(quadratic, number)
+                self.models[number] = min(found, key=lambda model: found[model])
+            if self.models == before:
+                return
+
+    def solved(self, quadratic: _Quadratic) -> tuple[FloatArray, FloatArray, float]:
+        """(k, 6) corrections, their sigmas, and the number of parameters determined."""
+        basis, weight = self._whole(self.models)
+        x, covariance, parameters = _solution(quadratic, basis, weight)
+        spread = np.sqrt(np.maximum(np.einsum("ia,ab,ib->i", basis, covariance, basis), 0.0))
+        factor = np.sqrt(max(1.0, quadratic.square(x) / max(quadratic.observations - parameters, 1.0)))
+        return x.reshape(-1, ERRORS), factor * spread.reshape(-1, ERRORS), parameters
+
+    def prior_sigmas(self) -> FloatArray:
+        """(k, 6) of the models chosen."""
+        basis, weight = self._whole(self.models)
+        sigmas: FloatArray = np.sqrt((basis**2) @ (1.0 / weight)) if len(weight) else np.zeros(self._size)
+        return sigmas.reshape(-1, ERRORS)
+
+    def told(self, quadratic: _Quadratic) -> tuple[StripChoice, ...]:
+        """A strip each."""
+        singly = len(self._keys) <= MOST_CHOSEN_SINGLY
+        told = []
+        for number, (flown, strip) in enumerate(self._keys):
+            found = self._tried(quadratic, number) if singly else {}
+            chosen = found.get(self.models[number], 0.0)
+            gains = {model: value - chosen for model, value in found.items()}
+            told.append(StripChoice(flown, strip, self.models[number], gains))
+        return tuple(told)
+
+    def notes(self) -> tuple[str, ...]:
+        """For people."""
+        name = "Schwarz's" if self._settings.criterion == "bic" else "Akaike's corrected"
+        notes = [f"models chosen by {name} information criterion; the calibration was held"]
+        if len(self._keys) > MOST_CHOSEN_SINGLY:
+            notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}: all got the same model")
+        return tuple(notes)
+
+    def _tried(self, quadratic: _Quadratic, number: int) -> dict[str, float]:
+        """Criterion by model of one strip, the others as they are."""
+        found = {}
+        for model in self._settings.models:
+            models = [*self.models[:number], model, *self.models[number + 1 :]]
+            found[model] = self._criterion(quadratic, models)
+        return found
+
+    def _criterion(self, quadratic: _Quadratic, models: Sequence[str]) -> float:
+        x, _, k = _solution(quadratic, *self._whole(models))
+        n = quadratic.observations
+        fit = n * np.log(max(quadratic.square(x), 1e-12 * n) / n)
+        if self._settings.criterion == "bic":
+            return float(fit + k * np.log(n))
+        return float(fit + 2.0 * k + 2.0 * k * (k + 1.0) / max(n - k - 1.0, 1.0))
+
+    def _whole(self, models: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """(6k, u) what each parameter does; (u,) weights of their priors."""
+        bases, weights = [], []
+        for at, own, model in zip(self._at, self._bases, models, strict=True):
+            shape, weight = own[model]
+            rows = np.zeros((self._size, shape.shape[1]))
+            rows[(ERRORS * at[:, np.newaxis] + np.arange(ERRORS)).ravel()] = shape
+            bases.append(rows)
+            weights.append(weight)
+        return np.concatenate(bases, axis=1), np.concatenate(weights)
+
+
+def _basis(model: str, knots: int, settings: Settings) -> tuple[FloatArray, FloatArray]:
+    """Of one strip: (6 knots, u), and weights 1 / σ² (u,)."""
+    constant = np.repeat([settings.position_m, settings.turn_rad], 3)
+    tau = np.linspace(-1.0, 1.0, knots)[:, np.newaxis]
+    shapes = {"none": [], "constant": [np.ones((knots, 1))], "linear": [np.ones((knots, 1)), tau]}
+    sigmas = [constant, 0.5 * constant]
+    if model == "spline":
+        bends = np.diff(np.eye(knots), n=2, axis=0)
+        along = [np.ones((knots, 1)), tau, *np.split(np.linalg.pinv(bends), max(knots - 2, 1), axis=1)][: max(knots, 2)]
+        sigmas += [np.repeat([settings.bend_m, settings.bend_rad], 3)] * (len(along) - 2)
+    else:
+        along = shapes[model]
+    basis = [np.kron(shape, np.eye(ERRORS)) for shape in along]
+    if not basis:
+        return np.zeros((ERRORS * knots, 0)), np.zeros(0)
+    return np.concatenate(basis, axis=1), np.concatenate([sigma**-2.0 for sigma in sigmas[: len(basis)]])
+
+
+def _solution(quadratic: _Quadratic, basis: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Corrections (6k,), covariance of the parameters (u, u), and how many of them the returns determine."""
+    if not len(weight):
+        return np.zeros(len(basis)), np.zeros((0, 0)), 0.0
+    data = basis.T @ quadratic.normal @ basis
+    scale = np.sqrt(np.diag(data) + weight)
+    inverse = np.linalg.inv((data + np.diag(weight)) / np.outer(scale, scale)) / np.outer(scale, scale)
+    return basis @ (inverse @ (basis.T @ quadratic.right)), inverse, float(np.sum(inverse * data))

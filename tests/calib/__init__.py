@@ -1,0 +1,1 @@
+"""Calibration: observations, adjustment, proof."""

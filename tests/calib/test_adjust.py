@@ -1,0 +1,398 @@
+"""The adjustment: FORMULAS' worked numbers, a dense solution, true errors over many runs, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from calib.adjust import adjust, predict
+from calib.features import ControlPoint, Features, Sighting, TiePoint
+from calib.flight import Flight
+from calib.normals import NormalError, TrajectoryWeight, moved, normals
+from calib.outcome import Adjusted
+from calib.parameters import Wish, unknowns
+from calib.rows import Rows, State
+from calib.solve import Settings
+from calib.tie_rows import Ties
+from calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
+from georef.trajectory import Trajectory
+from tests.calib.printed import TRUTH, Printed, printed
+from tests.calib.roofs import LINES, Made, made, roofs
+from tests.calib.test_rows import design
+
+pytestmark = pytest.mark.xdist_group("kernels")
+FloatArray = NDArray[np.float64]
+PLAIN = Settings(huber=0.0, family=0.0, tolerance=1e-7)
+
+
+@cache
+def worked() -> Printed:
+    return printed()
+
+
+@cache
+def adjusted_as_printed() -> Adjusted:
+    flight, features = worked().flight()
+    return adjust(flight, features, Wish(), None, PLAIN)
+
+
+def test_the_printed_adjustment() -> None:
+    found = adjusted_as_printed()
+    assert found.names == ("left.omega_rad", "left.phi_rad", "left.kappa_rad", "left.range_offset_m")
+    assert len(worked().observed) == 1522
+    printed_values = [0.003665169848263187, -0.006111363445060003, 0.0021017691137531266, 0.18402286108779703]
+    printed_sigmas = [4.190375990579231e-06, 4.519601098956462e-06, 2.6157347643027155e-05, 0.021912635891225555]
+    np.testing.assert_allclose(found.sigmas, printed_sigmas, rtol=2e-4)
+    # FORMULAS linearises at the adjusted observations: within a hundredth of a sigma
+    np.testing.assert_allclose((found.values - printed_values) / found.sigmas, 0.0, atol=1e-2)
+    np.testing.assert_allclose((found.values - np.array(TRUTH)) / found.sigmas, 0.0, atol=3.0)
+    assert found.redundancy == pytest.approx(1443.0, abs=1e-3)
+    assert found.variance_factor == pytest.approx(1.0417581361552588, rel=2e-4)
+    assert not found.scaled
+    assert found.global_test == pytest.approx(stats.chi2.sf(1443 * 1.0417581361552588, 1443), rel=0.02)
+    (residuals,) = found.residuals
+    np.testing.assert_allclose(residuals.redundancy.min(), 0.8469059274646641, rtol=5e-4)
+    assert np.sqrt((residuals.normalised.astype(float) ** 2).mean()) == pytest.approx(1.0205406770769523, rel=2e-4)
+    assert np.abs(residuals.normalised).max() == pytest.approx(3.598971266583061, rel=1e-3)
+    mdb = 4.13 * residuals.sigma_m.astype(float) / np.sqrt(residuals.redundancy.astype(float))
+    assert mdb.mean() == pytest.approx(0.24292794322106298, rel=2e-4)
+    assert any("independent from return to return" in note for note in found.notes)
+
+
+def test_the_printed_blunder_is_the_largest_w_and_is_taken_out() -> None:
+    flight, features = worked().with_blunder().flight()
+    plain = adjust(flight, features, Wish(), None, PLAIN)
+    (residuals,) = plain.residuals
+    worst = int(np.abs(residuals.normalised).argmax())
+    assert abs(residuals.normalised[worst]) == pytest.approx(7.980954746253744, rel=3e-3)
+    line = np.flatnonzero(worked().line == residuals.swath[worst])
+    assert line[residuals.at[worst]] == 137
+    kept = adjust(flight, features, Wish())
+    (residuals,) = kept.residuals
+    assert residuals.weight[worst] == 0.0
+    assert residuals.weight.sum() == 1521
+    clean = adjusted_as_printed()
+    assert (np.abs(kept.values - clean.values) / clean.sigmas < 0.35).all()
+
+
+NO_TIES = np.zeros(0, np.float32)
+
+
+def block(
+    flight: Flight, features: Features, wish: Wish, prior: TrajectoryPrior | None
+) -> tuple[Rows, Ties, TrajectoryWeight]:
+    rows = Rows(flight, features.planes, unknowns(flight, wish), prior)
+    return rows, Ties(rows, features.ties, None), TrajectoryWeight(rows)
+
+
+def knots(flown: Trajectory, every_s: float = 6.0) -> TrajectoryPrior:
+    """A dense prior that is no model's."""
+    g = np.random.default_rng(8)
+    starts = flown.time_ns[np.concatenate([[True], np.diff(flown.time_ns) > 1_000_000_000])]
+    times = np.concatenate([start + np.arange(3) * int(every_s * 1e9) for start in starts])
+    count = len(times)
+    sigma = np.tile([0.02, 0.02, 0.03, 3e-5, 3e-5, 8e-5], count)
+    mixed = np.eye(6 * count) + 0.3 * g.normal(size=(6 * count, 6 * count)) / np.sqrt(6 * count)
+    covariance = mixed @ mixed.T * np.outer(sigma, sigma)
+    return TrajectoryPrior(np.zeros(count, np.int64), times, np.repeat(np.arange(len(starts)) + 1, 3), covariance)
+
+
+@cache
+def small() -> Made:
+    return made(lines=LINES[:3], points=6)
+
+
+def in_planes(rows: Rows, state: State) -> tuple[FloatArray, list[int]]:
+    """(r, 2) places of points, as adjusted, in their planes, and which plane each is of."""
+    places, planes = [], []
+    for batch, looks in rows.looks(state):
+        begin = 0
+        for run in batch.runs:
+            first = rows.expansion(run, state.normal_e[run.plane])[1].shape[1]
+            places.append(looks.design[begin : begin + len(run.at), first : first + 2])
+            planes += [run.plane] * len(run.at)
+            begin += len(run.at)
+    return np.concatenate(places), planes
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_reduced_equations_give_the_whole_dense_solution(weighted: bool) -> None:
+    built, prior = small(), knots(small().flight.trajectories[0])
+    rows, ties, weight = block(built.flight, built.features, Wish(priors={"range_offset_m": 0.05}), prior)
+    state = rows.start()
+    share = np.ones(rows.count, np.float32)
+    state = moved(state, normals(rows, ties, weight, state, share, NO_TIES, 0.0).step())
+    if weighted:
+        share = np.random.default_rng(4).uniform(0.2, 1, rows.count).astype(np.float32)
+    equations = normals(rows, ties, weight, state, share, NO_TIES, 0.0)
+    columns, misclosure, variance, _ = design(rows, state)
+    own = np.zeros((rows.count, 3 * len(rows.planes)))
+    for row, (place, which) in enumerate(zip(*in_planes(rows, state), strict=True)):
+        own[row, 3 * which : 3 * which + 3] = *place, 1.0
+    whole = np.hstack([columns, own])
+    p = share / variance
+    normal, right = (whole.T * p) @ whole, (whole.T * p) @ misclosure
+    u, rot = rows.size, np.kron(np.eye(len(prior.time_ns)), np.kron(np.eye(2), np.eye(3)))
+    rot = weight.to_e(rot)
+    inverse = np.linalg.inv(rot @ prior.covariance @ rot.T)
+    states = state.knots.reshape(-1)
+    normal[4:u, 4:u] += inverse
+    right[4:u] += inverse @ states
+    normal[3, 3] += 1 / 0.05**2
+    right[3] += state.values[3] / 0.05**2
+    scale = 1 / np.sqrt(np.diag(normal))
+    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    sigma = np.sqrt(np.diag(covariance))
+    scaled = covariance / np.outer(sigma, sigma)
+    np.testing.assert_allclose(equations.covariance() / np.outer(sigma[:u], sigma[:u]), scaled[:u, :u], atol=1e-8)
+    done, of_planes, _ = equations.step()
+    step = -covariance @ right
+    np.testing.assert_allclose(done / sigma[:u], step[:u] / sigma[:u], atol=1e-6)
+    np.testing.assert_allclose(of_planes.ravel() / sigma[u:], step[u:] / sigma[u:], atol=1e-6)
+
+
+def test_the_hard_constraint_is_the_limit_of_a_weighted_one() -> None:
+    """Four unknowns a plane and s1² + s2² + s3² = 1 with σ = 1e-7 (ISO/TS 19159-2 Eq. 18, 20)."""
+    built = small()
+    rows, ties, weight = block(built.flight, built.features, Wish(priors={"range_offset_m": 0.05}), None)
+    ones, none = np.ones(rows.count, np.float32), NO_TIES
+    state = rows.start()
+    for _ in range(2):
+        state = moved(state, normals(rows, ties, weight, state, ones, none, 0.0).step())
+    equations = normals(rows, ties, weight, state, ones, none, 0.0)
+    columns, misclosure, variance, plane = design(rows, state)
+    places, _ = in_planes(rows, state)
+    table = rows.plane_table(state)
+    own = np.zeros((rows.count, 4 * len(rows.planes)))
+    for row, which in enumerate(plane):
+        away = places[row] @ np.stack([table.first_e[which], table.second_e[which]])
+        own[row, 4 * which : 4 * which + 4] = *away, 1.0
+    whole, p = np.hstack([columns, own]), 1.0 / variance
+    normal, right = (whole.T * p) @ whole, (whole.T * p) @ misclosure
+    normal[3, 3] += 1 / 0.05**2
+    right[3] += state.values[3] / 0.05**2
+    for index, mine in enumerate(state.normal_e):
+        constraint = np.zeros(len(normal))
+        constraint[4 + 4 * index : 7 + 4 * index] = 2.0 * mine
+        normal += np.outer(constraint, constraint) * 1e14
+    scale = 1 / np.sqrt(np.diag(normal))
+    step = -np.linalg.solve(normal * np.outer(scale, scale), right * scale) * scale
+    sigma = np.sqrt(np.diag(equations.covariance()))
+    np.testing.assert_allclose(equations.step()[0] / sigma, step[:4] / sigma, atol=1e-4)
+    assert np.abs(np.linalg.norm(moved(state, equations.step()).normal_e, axis=1) - 1.0).max() < 1e-15
+
+
+def tied(built: Made, noise_m: float, seed: int) -> tuple[TiePoint, ...]:
+    """The planes' middles as points: each where a return of every swath near it shows it."""
+    g, ties = np.random.default_rng(seed), []
+    truth, flight = built.truth, built.flight
+    for plane in built.features.planes:
+        sightings = []
+        for patch in plane.patches:
+            at = int(patch.at[0])
+            swath = flight.swaths[patch.swath]
+            there = flight.place(swath, truth, np.array([at]))[0]
+            point = swath.points_t[at] + (plane.centre_t - there) + noise_m * g.normal(size=3)
+            sightings.append(Sighting(patch.swath, at, point, np.eye(3) * max(noise_m, 1e-3) ** 2))
+        ties.append(TiePoint(plane.name, tuple(sightings)))
+    return tuple(ties)
+
+
+def test_tie_points_alone_find_the_truth() -> None:
+    built = made(noise=0.0)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    control = ControlPoint("a", built.features.planes[0].centre_t, 0.01)
+    ties = tied(built, 0.0, 1)
+    ties = (replace(ties[0], control=control), *ties[1:])
+    exact = adjust(built.flight, Features(ties=ties), Wish(), prior, Settings(tolerance=1e-6))
+    np.testing.assert_allclose(exact.values, built.truth.parameters[:4], atol=1e-9)
+    sightings = sum(len(tie.sightings) for tie in ties)
+    assert exact.redundancy == pytest.approx(3 * sightings + 3 - 3 * len(ties) - 4, abs=1e-6)
+    noisy = adjust(built.flight, Features(ties=tied(built, 0.05, 2)), Wish(), prior)
+    assert (np.abs(noisy.values - built.truth.parameters[:4]) < 3.5 * noisy.sigmas).all()
+    assert 0.8 < noisy.variance_factor < 1.2
+
+
+def test_a_wrong_sighting_is_taken_out() -> None:
+    built = made(noise=0.0)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    ties = list(tied(built, 0.05, 2))
+    good = adjust(built.flight, Features(ties=tuple(ties)), Wish(), prior)
+    first = ties[3].sightings[0]
+    wrong = replace(first, point_t=first.point_t + np.array([0.0, 2.0, 0.5]))
+    ties[3] = replace(ties[3], sightings=(wrong, *ties[3].sightings[1:]))
+    found = adjust(built.flight, Features(ties=tuple(ties)), Wish(), prior)
+    (residuals,) = (one for one in found.residuals if one.group == "ties")
+    taken = np.flatnonzero(residuals.weight == 0.0)
+    assert set(residuals.feature[taken]) == {3}
+    assert set(residuals.swath[taken]) == {first.swath}
+    assert (np.abs(found.values - good.values) < 0.5 * good.sigmas).all()
+
+
+def controlled(built: Made, seed: int = 9) -> Features:
+    """Ten surveyed points at 1 cm on the flat planes, two a plane."""
+    g, planes = np.random.default_rng(seed), list(built.features.planes)
+    for index in range(0, 25, 5):
+        points = []
+        for number in range(2):
+            at = planes[index].centre_t + np.array([*g.uniform(-5, 5, 2), 0.01 * g.normal()])
+            points.append(ControlPoint(f"p{index}.{number}", at, 0.01))
+        planes[index] = replace(planes[index], control=tuple(points))
+    return Features(tuple(planes))
+
+
+def test_control_determines_the_range_offset_and_says_what_each_point_does() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    features = controlled(built)
+    without = adjust(built.flight, built.features, Wish(), prior, PLAIN)
+    found = adjust(built.flight, features, Wish(), prior, PLAIN)
+    assert found.sigmas[3] < 0.9 * without.sigmas[3]
+    assert abs(found.values[3] - built.truth.parameters[3]) < 3 * found.sigmas[3]
+    planes = list(features.planes)
+    left_out = planes[5].control[1]
+    planes[5] = replace(planes[5], control=planes[5].control[:1])
+    again = adjust(built.flight, Features(tuple(planes)), Wish(), prior, PLAIN)
+    (fit,) = (one for one in found.control if one.name == left_out.name)
+    change = (again.values - found.values) / found.sigmas
+    np.testing.assert_allclose([fit.influence[name] for name in found.names], change, atol=1e-4)
+    assert np.abs(change).max() > 1e-3
+    assert len(found.control) == 10
+
+
+def test_control_that_is_too_high_is_seen() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    features = controlled(built)
+    planes = list(features.planes)
+    point = planes[10].control[0]
+    high = replace(point, position_t=point.position_t + np.array([0.0, 0.0, 0.3]))
+    planes[10] = replace(planes[10], control=(high, planes[10].control[1]))
+    found = adjust(built.flight, Features(tuple(planes)), Wish(), prior)
+    worst = max(found.control, key=lambda fit: abs(fit.normalised))
+    assert worst.name == point.name
+    assert worst.misclosure_m > 0.1
+    assert worst.normalised > 5.0
+
+
+def test_a_surveyed_plane_gives_the_height() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    given = tuple(replace(plane, given_sigma_m=0.005, given_sigma_rad=1e-4) for plane in built.features.planes)
+    free = adjust(built.flight, built.features, Wish(), prior)
+    found = adjust(built.flight, Features(given), Wish(), prior)
+    assert found.sigmas[3] < 0.7 * free.sigmas[3]
+    assert (np.abs(found.values - built.truth.parameters[:4]) < 3.5 * found.sigmas).all()
+
+
+def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    good = adjust(built.flight, built.features, Wish(), prior)
+    g, swaths, wrong = np.random.default_rng(6), [], 0
+    for swath in built.flight.swaths:
+        rows = swath.rows.copy()
+        hit = g.uniform(size=len(rows)) < 0.1
+        rows["range_m"][hit] += g.uniform(0.5, 6.0, int(hit.sum()))
+        wrong += int(hit.sum())
+        swaths.append(replace(swath, rows=rows))
+    found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, Wish(), prior)
+    (residuals,) = found.residuals
+    assert (np.abs(found.values - good.values) < good.sigmas).all()
+    assert 0.97 * wrong <= (residuals.weight == 0.0).sum() <= 1.02 * wrong
+    assert 0.9 < found.variance_factor < 1.1
+
+
+def test_sigmas_grow_where_the_observations_are_worse_than_they_say() -> None:
+    built = made(noise=2.0)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior, Settings(family=0.0))
+    said = adjust(built.flight, built.features, Wish(), prior, Settings(family=0.0, test_level=0.0))
+    assert found.scaled
+    assert not said.scaled
+    assert 3.5 < found.variance_factor < 4.2
+    np.testing.assert_allclose(found.sigmas, said.sigmas * np.sqrt(found.variance_factor), rtol=1e-9)
+
+
+def test_what_is_not_determined_is_held_at_its_start() -> None:
+    built = made(lines=LINES[:2], planes=roofs(0.0))
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior)
+    held = {one.name for one in found.held}
+    assert {"phi_rad", "kappa_rad", "range_offset_m"} <= held
+    assert found.names == ("left.omega_rad",)
+    assert found.calibrations["left"].value("phi_rad") == 0.0
+    assert found.calibrations["left"].sigmas[0] == found.sigmas[0] > 0.0
+
+
+def test_prediction_is_what_the_adjustment_finds() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    at_truth = {"left": built.truth}
+    asked, covariance = predict(built.flight, built.features, Wish(), prior, start=at_truth)
+    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, at_truth)
+    assert asked.names == found.names
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), found.sigmas, rtol=1e-3)
+
+
+def test_correspondences_are_found_anew_until_they_are_stable() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    asked = []
+
+    def rematch(calibrations: object) -> Features:
+        asked.append(calibrations)
+        return built.features
+
+    found = adjust(built.flight, built.features, Wish(), prior, rematch=rematch)
+    assert found.matchings == 2
+    assert len(asked) == 1
+    coarse = Features(tuple(built.features.planes[:12]))
+    more = adjust(built.flight, coarse, Wish(), prior, rematch=rematch)
+    np.testing.assert_allclose(more.values, found.values, atol=0.02 * found.sigmas.min())
+    assert more.matchings == 3
+
+
+def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior).trajectory
+    assert found is not None
+    assert found.position_l.shape == (len(prior.time_ns), 3)
+    assert (found.attitude_sigma_rad <= found.prior_attitude_sigma_rad * (1 + 1e-9)).all()
+    assert (found.attitude_sigma_rad < 0.7 * found.prior_attitude_sigma_rad).any()
+    assert (np.abs(found.position_l) < 5 * found.prior_position_sigma_l).all()
+
+
+def test_without_observations_there_is_one_plain_line() -> None:
+    with pytest.raises(NormalError, match="nothing to adjust; want strips that overlap"):
+        adjust(made(lines=LINES[:1]).flight, Features(), Wish())
+
+
+def test_where_nothing_is_determined_all_is_held() -> None:
+    built = made(lines=LINES[:1], planes=roofs(0.0))
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior)
+    assert found.names == ()
+    assert {one.name for one in found.held} == {"omega_rad", "phi_rad", "kappa_rad", "range_offset_m"}
+    assert found.calibrations["left"].value("omega_rad") == 0.0
+
+
+def test_a_correction_by_intensity_is_found_and_none_is_not_invented() -> None:
+    knots = np.array([0.0, 30.0, 60.0, 100.0])
+    wish = Wish(ibrc_knots=tuple(knots.tolist()), ibrc_reference=60.0, ibrc_smoothness_m=0.1)
+    for correction in (np.array([-0.06, -0.02, 0.0, 0.05]), np.zeros(4)):
+        built = made(ibrc=(knots, correction))
+        prior = gauss_markov(built.flight, Taus(), 4.0)
+        found = adjust(built.flight, built.features, wish, prior)
+        at = [found.names.index(f"left.ibrc.{knot}") for knot in (0, 1, 3)]
+        assert (found.sigmas[at] < 0.01).all()
+        assert (np.abs(found.values[at] - correction[[0, 1, 3]]) < 3.5 * found.sigmas[at]).all()
+        table = found.calibrations["left"].ibrc
+        assert table is not None
+        assert table[1][2] == 0.0

@@ -1,0 +1,284 @@
+"""Control: what its file may say, the planes it lies on, and what speaks against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from calib.control import HEADER, ControlError, ControlRules, control_planes, in_t, read_control
+from calib.control_doubts import Doubt, doubts
+from calib.features import ControlPoint
+from calib.flight import Flight
+from calib.local_plane import PlaneRules, is_inside, robust_plane
+from tests.calib.surface_flight import FRAME, surface_flight, swath_of
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+ROW = "GCP1,47.4001,8.9001,512.34,0.02"
+
+
+def unknown(position_e: FloatArray) -> None:
+    """Nobody knows the undulation."""
+    return
+
+
+def rolling(east: FloatArray, north: FloatArray) -> FloatArray:
+    """Ground with slopes of every aspect, up to 12 %."""
+    up: FloatArray = 500.0 + 1.2 * np.sin(east / 10.0) + 1.0 * np.cos(north / 9.0)
+    return up
+
+
+def surveyed(flight_height: FloatArray, shift: FloatArray, count: int = 12) -> list[ControlPoint]:
+    """Points on the rolling ground, said to be somewhere else by a shift (3,)."""
+    draws = np.random.default_rng(3)
+    places = draws.uniform(-50.0, 50.0, (count, 2))
+    up = rolling(*places.T) + flight_height
+    true = np.column_stack([places, up + draws.normal(0.0, 0.01, count)])
+    return [ControlPoint(f"P{number}", place + shift, 0.01) for number, place in enumerate(true)]
+
+
+def flight() -> Flight:
+    """Two swaths over it."""
+    return surface_flight([rolling, rolling])
+
+
+# ---------------------------------------------------------------------- the file
+
+
+def test_a_file_is_read_with_comments_blanks_and_a_byte_order_mark() -> None:
+    text = f"\ufeff# survey of June\n\n{HEADER}\n{ROW}\n GCP2 , -47.5 , 8.95 , 510.0 , 0.01 \n"
+    first, second = read_control(text, "control.csv")
+    assert (first.name, second.name) == ("GCP1", "GCP2")
+    assert np.degrees([first.lat_rad, first.lon_rad, second.lat_rad]) == pytest.approx([47.4001, 8.9001, -47.5])
+    assert (first.height_m, first.sigma_m, second.height_m) == (512.34, 0.02, 510.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "control.csv: is empty; want the header"),
+        (f"{HEADER}\n", "no points behind the header"),
+        (HEADER.replace(",", ";") + f"\n{ROW}", "line 1: want the header .*columns apart by commas"),
+        (HEADER.replace("h_ellipsoidal_m", "h_m") + f"\n{ROW}", "line 1: want .*h_ellipsoidal_m not there"),
+        (f"{HEADER}\n{ROW}\nG2,47.4,8.9,500", "line 3: 4 fields, want 5"),
+        (f"{HEADER}\nG1,47,4,8,9,500,0.01", "line 2: 7 fields, want 5"),
+        (f"{HEADER}\n,47.4,8.9,500,0.01", "line 2: the point has no name"),
+        (f"{HEADER}\nG1,abc,8.9,500,0.01", 'line 2: lat_deg: got "abc", want degrees from -90 to 90'),
+        (f"{HEADER}\nG1,5250000.0,8.9,500,0.01", "line 2: lat_deg: .*metres of a map"),
+        (f"{HEADER}\nG1,47.4,8.9,nan,0.01", 'line 2: h_ellipsoidal_m: got "nan", want metres from -9000'),
+        (f"{HEADER}\nG1,47.4,8.9,500,0", 'line 2: sigma_m: got "0", want metres above 0, at most 10'),
+        (f"{HEADER}\nG1,47.4,8.9,500,-1", "line 2: sigma_m"),
+        (f"{HEADER}\n{ROW}\n\n{ROW}", "line 4: GCP1 stands in line 2 already"),
+        (f"{HEADER}\n{ROW}\n{ROW.replace('GCP1', 'GCP9')}", "line 3: GCP9 is where GCP1 of line 2 is"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_where(text: str, said: str) -> None:
+    with pytest.raises(ControlError, match=said) as caught:
+        read_control(text, "control.csv")
+    assert all(line.startswith("control.csv: ") for line in str(caught.value).splitlines())
+
+
+def test_all_mistakes_are_told_at_once_a_line_each() -> None:
+    text = f"{HEADER}\nG1,abc,8.9,500,0.01\nG2,47.4,8.9,500\n{ROW}"
+    with pytest.raises(ControlError) as caught:
+        read_control(text, "c")
+    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == ["line 2", "line 3"]
+
+
+def test_points_come_to_the_tangent_frame() -> None:
+    (point,) = in_t(read_control(f"{HEADER}\n{ROW}", "c"), FRAME)
+    x, y, z = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(8.9001, 47.4001, 512.34)
+    assert FRAME.e_from_t(point.position_t) == pytest.approx([x, y, z], abs=1e-6)
+    assert point.sigma_m == 0.02
+    assert point.position_t[0] == pytest.approx(7.548, abs=0.01)  # 0.0001° of longitude: cos(47.4°) · 11.13 m
+    assert in_t((), FRAME) == ()
+
+
+# ---------------------------------------------------------------------- planes
+
+
+def test_a_plane_a_point_with_the_returns_of_every_swath() -> None:
+    found = control_planes(flight(), surveyed(np.zeros(1), np.zeros(3)))
+    assert [plane.name for plane in found.planes] == [f"control P{number}" for number in range(12)]
+    assert not found.refused
+    for plane in found.planes:
+        (point,) = plane.control
+        assert [patch.swath for patch in plane.patches] == [0, 1]
+        assert plane.kind == "control"
+        assert plane.points > 30
+        assert plane.rms_m < 0.03
+        gradient = np.array([0.12 * np.cos(point.position_t[0] / 10.0), -np.sin(point.position_t[1] / 9.0) / 9.0])
+        assert -plane.normal_t[:2] / plane.normal_t[2] == pytest.approx(gradient, abs=0.02)
+        assert plane.normal_t @ (point.position_t - plane.centre_t) == pytest.approx(0.0, abs=0.03)
+
+
+def test_returns_that_are_no_ground_are_left_out_and_their_indexes_are_right() -> None:
+    made = surface_flight([lambda east, north: 0.0 * east])
+    points = made.swaths[0].points_t.copy()
+    bush = (np.hypot(points[:, 0], points[:, 1]) < 1.4) & (np.arange(len(points)) % 4 == 0)
+    points[bush, 2] += 0.7
+    swath = swath_of(points)
+    found = control_planes(Flight(FRAME, (), (), (swath,)), [ControlPoint("A", np.array([0.1, 0.1, 0.0]), 0.01)])
+    at = found.planes[0].patches[0].at
+    assert not bush[at].any()
+    assert (np.diff(at) > 0).all()
+    assert np.hypot(*(points[at, :2] - 0.1).T).max() < 1.5
+    assert abs(found.planes[0].centre_t[2]) < 0.01
+
+
+def tilted(slope: float, roughness_m: float) -> Flight:
+    """One swath on a slope to the north."""
+    return surface_flight([lambda east, north: slope * north], noise_m=roughness_m, half_m=6.0)
+
+
+@pytest.mark.parametrize(
+    ("made", "place", "reason"),
+    [
+        (tilted(0.0, 0.3), (0.0, 0.0, 0.0), "control: no plane|control: too rough"),
+        (tilted(1.5, 0.01), (0.0, 0.0, 0.0), "control: too steep"),
+        (tilted(0.0, 0.01), (-6.9, 0.0, 0.0), "control: not within the returns"),
+        (tilted(0.0, 0.01), (-8.5, 0.0, 0.0), "control: no returns"),
+        (tilted(0.0, 0.01), (-6.9, -6.9, 0.0), "control: too few returns"),
+        (tilted(0.0, 0.01), (0.0, 0.0, 30.0), "control: far above or below"),
+    ],
+)
+def test_what_is_refused_is_counted_by_reason(made: Flight, place: tuple[float, ...], reason: str) -> None:
+    found = control_planes(made, [ControlPoint("A", np.array(place), 0.01)], ControlRules(widest_m=1.5))
+    assert found.planes == ()
+    assert sum(found.refused.values()) == 1
+    assert next(iter(found.refused)) in reason.split("|")
+
+
+def test_a_swath_that_shows_another_surface_is_not_joined() -> None:
+    made = surface_flight([lambda e, n: 0.0 * e, lambda e, n: 0.0 * e, lambda e, n: 0.0 * e + 4.0], half_m=6.0)
+    found = control_planes(made, [ControlPoint("A", np.zeros(3), 0.01)])
+    assert [patch.swath for patch in found.planes[0].patches] == [0, 1]
+    assert found.refused == {"control: another surface": 1}
+
+
+def test_no_return_has_a_place_no_plane_and_no_complaint() -> None:
+    empty = Flight(FRAME, (), (), (swath_of(np.full((5, 3), np.nan)),))
+    found = control_planes(empty, [ControlPoint("A", np.zeros(3), 0.01)])
+    assert found.refused == {"control: no returns": 1}
+
+
+def test_a_robust_plane_stands_a_third_of_outliers() -> None:
+    draws = np.random.default_rng(1)
+    places = draws.uniform(-1.0, 1.0, (60, 2))
+    up = 0.2 * places[:, 0] - 0.1 * places[:, 1] + draws.normal(0.0, 0.01, 60)
+    up[:20] += draws.uniform(0.3, 2.0, 20)
+    plane, kept, reason = robust_plane(np.column_stack([places, up]), PlaneRules())
+    assert plane is not None
+    assert reason == ""
+    assert kept[20:].sum() > 37
+    assert not kept[:20].any()
+    assert -plane.normal_t[:2] / plane.normal_t[2] == pytest.approx([0.2, -0.1], abs=0.01)
+
+
+@pytest.mark.parametrize(("place", "inside"), [((0.2, 0.2), True), ((0.9, 0.9), False), ((1.0, 0.0), True)])
+def test_a_place_is_within_a_triangle(place: tuple[float, float], inside: bool) -> None:
+    assert is_inside(np.array(place), np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])) is inside
+
+
+# ---------------------------------------------------------------------- doubts
+
+
+def only(found: tuple[Doubt, ...]) -> Doubt:
+    """The one there is."""
+    (doubt,) = found
+    return doubt
+
+
+def test_good_control_raises_no_doubt() -> None:
+    assert doubts(flight(), surveyed(np.zeros(1), np.zeros(3)), undulation=unknown) == ()
+
+
+def test_orthometric_heights_are_named_with_the_undulation_of_the_geoid() -> None:
+    points = surveyed(np.zeros(1), np.array([0.0, 0.0, -48.3]))
+    doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
+    assert (doubt.kind, doubt.refuses) == ("orthometric", True)
+    assert "control lies 48.3 m below the laser's ground everywhere, as orthometric heights would" in doubt.text
+    assert "undulation there 48.1 m (EGM96)" in doubt.text
+
+
+def test_without_a_geoid_the_constant_is_named() -> None:
+    doubt = only(doubts(flight(), surveyed(np.zeros(1), np.array([0.0, 0.0, 31.2])), undulation=unknown))
+    assert doubt.kind == "orthometric"
+    assert "31.2 m above" in doubt.text
+    assert "undulation is -31.2 m" in doubt.text
+
+
+def test_a_constant_that_is_no_undulation_is_another_height_reference() -> None:
+    points = surveyed(np.zeros(1), np.array([0.0, 0.0, 0.8]))
+    doubt = only(doubts(flight(), points, undulation=lambda position_e: (48.1, "EGM96")))
+    assert doubt.kind == "height"
+    assert "0.80 m above" in doubt.text
+    assert "48.1 m there" in doubt.text
+
+
+def test_heights_in_feet_are_told() -> None:
+    points = [
+        ControlPoint(point.name, point.position_t * [1.0, 1.0, 1.0 / 0.3048], 0.01)
+        for point in surveyed(np.zeros(1), np.zeros(3))
+    ]
+    doubt = only(doubts(flight(), points, undulation=unknown))
+    assert doubt.kind == "height"
+    assert "feet" in doubt.text
+
+
+def test_another_datum_is_found_by_the_slopes() -> None:
+    points = surveyed(np.zeros(1), np.array([0.9, 0.9, 0.0]), count=30)
+    doubt = only(doubts(flight(), points, undulation=unknown))
+    assert (doubt.kind, doubt.refuses) == ("shift", True)
+    assert "to the north-east" in doubt.text
+    found = float(doubt.text.split("control lies ")[1].split(" m")[0])
+    assert found == pytest.approx(0.9 * np.sqrt(2.0), abs=0.2)
+
+
+def test_on_level_ground_no_shift_is_claimed() -> None:
+    level = surface_flight([lambda east, north: 0.0 * east])
+    places = np.random.default_rng(2).uniform(-50.0, 50.0, (20, 2))
+    points = [ControlPoint(f"P{k}", np.array([*place, 0.01 * (k % 3)]), 0.01) for k, place in enumerate(places)]
+    assert doubts(level, points, undulation=unknown) == ()
+
+
+def test_a_single_point_that_disagrees_is_named_and_refuses_nothing() -> None:
+    points = surveyed(np.zeros(1), np.zeros(3))
+    points[4] = ControlPoint("P4", points[4].position_t + np.array([0.0, 0.0, 0.6]), 0.01)
+    doubt = only(doubts(flight(), points, undulation=unknown))
+    assert (doubt.kind, doubt.points, doubt.refuses) == ("point", ("P4",), False)
+    assert "P4 lies 0.59 m above" in doubt.text
+    assert "2 swaths" in doubt.text
+
+
+def test_points_outside_the_flight_are_told_and_all_of_them_refuse_it() -> None:
+    points = surveyed(np.zeros(1), np.zeros(3))
+    points[0] = ControlPoint("P0", np.array([900.0, 0.0, 500.0]), 0.01)
+    one = only(doubts(flight(), points, undulation=unknown))
+    assert (one.kind, one.refuses) == ("point", False)
+    assert "P0 lies outside the flight: 84" in one.text
+    elsewhere = surveyed(np.zeros(1), np.array([9000.0, 0.0, 0.0]))
+    everyone = only(doubts(flight(), elsewhere, undulation=unknown))
+    assert (everyone.kind, everyone.refuses) == ("outside", True)
+    assert "km from its returns" in everyone.text
+
+
+def test_where_returns_are_thin_the_circle_grows_to_its_limit() -> None:
+    thin = surface_flight([lambda east, north: 0.1 * east], step_m=1.5)
+    point = ControlPoint("A", np.array([0.0, 0.0, 0.0]), 0.01)
+    at = control_planes(thin, [point]).planes[0].patches[0].at
+    away = np.hypot(*thin.swaths[0].points_t[at, :2].T)
+    assert len(at) == 12
+    assert 1.5 < away.max() < 4.0
+    assert control_planes(thin, [point], ControlRules(widest_m=1.5)).refused == {"control: too few returns": 1}
+
+
+def test_a_wider_circle_takes_more_returns() -> None:
+    points = [ControlPoint("A", np.array([0.0, 0.0, 501.0]), 0.01)]
+    narrow, wide = (
+        control_planes(flight(), points, ControlRules(radius_m=radius)).planes[0].points for radius in (1.0, 2.0)
+    )
+    assert wide > 3 * narrow

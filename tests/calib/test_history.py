@@ -1,0 +1,151 @@
+"""Histories of calibrations: what counts as a move, with correlations; a slow drift; files that are no history."""
+
+from __future__ import annotations
+
+import datetime as dt
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.history import BORESIGHT, HistoryError, compare, history
+from calib.history_plots import history_png
+from georef.calibration import INDEX, Calibration, nominal
+
+SIGMAS = np.radians([0.001, 0.001, 0.002])
+AT = [INDEX[name] for name in BORESIGHT]
+
+
+def made(
+    number: int,
+    angles_deg: tuple[float, float, float] = (0.25, -0.4, 0.6),
+    *,
+    month: int | None = None,
+    sigmas: np.ndarray | None = None,
+    correlation: float = 0.0,
+    installation: str = "HB-ABC/left/2026-03",
+) -> Calibration:
+    """A calibration of the boresight, made in a month."""
+    values = dict(zip(BORESIGHT, np.radians(angles_deg), strict=True))
+    one = nominal("left", np.zeros(3), np.eye(3)).changed(**values)
+    whole, matrix = np.zeros(len(INDEX)), np.eye(len(INDEX))
+    whole[AT] = SIGMAS if sigmas is None else sigmas
+    matrix[AT[0], AT[1]] = matrix[AT[1], AT[0]] = correlation
+    created = dt.datetime(2026, month or number, 1, 12, tzinfo=dt.UTC)
+    header = {"created": created, "installation": installation}
+    return replace(one, id=f"cal-{number}", method="planes", sigmas=whole, correlation=matrix, header=header)
+
+
+def test_differences_are_tested_against_the_joint_sigma() -> None:
+    told = compare(made(1), made(2, (0.253, -0.4, 0.6)))
+    row = told.rows[0]
+    assert np.degrees(row.difference) == pytest.approx(0.003)
+    assert np.degrees(row.sigma) == pytest.approx(0.001 * np.sqrt(2.0))
+    assert told.chi2 == pytest.approx(4.5)  # (3 / √2)²
+    assert told.freedom == 3
+    assert told.p == pytest.approx(0.2123, abs=1e-4)  # χ² of 3: tables
+    assert not told.moved
+    assert row.words == "omega_deg +0.0030 ± 0.0014 (2.1 σ)"
+
+
+def test_correlation_counts() -> None:
+    """Differences along the direction that is known worse are no surprise, across it they are."""
+    along = compare(made(1, correlation=0.9), made(2, (0.253, -0.397, 0.6), correlation=0.9))
+    across = compare(made(1, correlation=0.9), made(2, (0.253, -0.403, 0.6), correlation=0.9))
+    assert along.chi2 == pytest.approx(9.0 / (1.0 + 0.9), rel=1e-6)
+    assert across.chi2 == pytest.approx(9.0 / (1.0 - 0.9), rel=1e-6)
+    assert across.moved
+    assert not along.moved
+
+
+def test_what_only_one_of_them_estimated_is_not_compared() -> None:
+    held = made(2, sigmas=np.array([SIGMAS[0], 0.0, SIGMAS[2]]))
+    assert [row.name for row in compare(made(1), held).rows] == ["omega_rad", "kappa_rad"]
+    assert compare(made(1), made(2, sigmas=np.zeros(3))).freedom == 0
+    assert not compare(made(1), made(2, sigmas=np.zeros(3))).moved
+
+
+def test_other_installation_matrices_cannot_be_compared() -> None:
+    turned = replace(made(2), installation_matrix=np.diag([-1.0, -1.0, 1.0]))
+    with pytest.raises(HistoryError, match="cal-1 and cal-2 have different installation matrices"):
+        compare(made(1), turned)
+
+
+def test_a_jump_is_told_with_its_dates_and_size() -> None:
+    (one,) = history([made(3, (0.25, -0.392, 0.6)), made(1), made(2)])
+    assert [entry.id for entry in one.entries] == ["cal-1", "cal-2", "cal-3"]
+    assert [step.moved for step in one.steps] == [False, True]
+    assert one.moved
+    text = " ".join(one.sentences)
+    assert "left: the boresight has moved between 2026-02-01 and 2026-03-01: phi_deg +0.0080 ± 0.0014" in text
+
+
+def test_a_slow_drift_is_found_by_the_line_though_no_step_shows_it() -> None:
+    entries = [made(number, (0.25, -0.4 + 0.0008 * number, 0.6)) for number in range(1, 11)]
+    (one,) = history(entries)
+    assert not any(step.moved for step in one.steps)
+    trend = next(trend for trend in one.trends if trend.name == "phi_rad")
+    times = np.array(one.times) / (365.25 * 86400.0)
+    slope, covariance = np.polyfit(
+        times - times.mean(),
+        [entry.value("phi_rad") for entry in entries],
+        1,
+        w=np.full(10, 1.0 / SIGMAS[1]),
+        cov="unscaled",
+    )
+    assert trend.per_year == pytest.approx(slope[0], rel=1e-6)
+    assert trend.sigma == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-6)
+    assert trend.p < 1e-3
+    assert one.moved
+    assert any("phi_deg drifts by +0.009" in line for line in one.sentences)
+
+
+def test_noise_is_no_move_at_the_rate_that_is_promised() -> None:
+    draws = np.random.default_rng(4)
+    moved = 0
+    for _ in range(400):
+        noise = np.degrees(draws.normal(0.0, 1.0, (3, 3)) * SIGMAS)
+        values = [(0.25 + a, -0.4 + b, 0.6 + c) for a, b, c in noise]
+        (one,) = history([made(number + 1, angles) for number, angles in enumerate(values)])
+        moved += one.moved
+    assert moved <= 8  # 5 tests of 0.1 % each: 2 expected
+
+
+def test_nominal_values_are_listed_and_not_tested() -> None:
+    (one,) = history([made(1, sigmas=np.zeros(3)), made(2)])
+    assert [row["omega_deg_sigma"] for row in one.table()] == [None, pytest.approx(0.001)]
+    assert one.steps == ()
+    assert "fewer than two calibrations with sigmas" in one.sentences[0]
+    assert not one.moved
+
+
+def test_each_installation_has_its_own_history() -> None:
+    found = history([made(1), made(2), made(3, installation="HB-XYZ"), made(4, installation="HB-XYZ")])
+    assert [(one.installation, len(one.entries)) for one in found] == [("HB-ABC/left/2026-03", 2), ("HB-XYZ", 2)]
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ({"created": dt.datetime(2026, 1, 1, tzinfo=dt.UTC)}, "names no installation"),
+        ({"installation": "a"}, "created is no time"),
+    ],
+)
+def test_what_is_no_history_is_one_line(header: dict[str, object], said: str) -> None:
+    with pytest.raises(HistoryError, match=said):
+        history([replace(made(1), header=header)])
+    with pytest.raises(HistoryError, match="stands twice"):
+        history([made(1), made(1)])
+
+
+def test_the_record_and_the_picture_have_every_calibration() -> None:
+    found = history([made(number) for number in range(1, 5)])
+    record = found[0].record()
+    assert [row["id"] for row in record["calibrations"]] == ["cal-1", "cal-2", "cal-3", "cal-4"]
+    assert len(record["steps"]) == len(record["trends"]) == 3
+    png = history_png(found)
+    width, height = struct.unpack(">II", png[16:24])
+    assert png[:4] == b"\x89PNG"
+    assert width > 500
+    assert height > 500

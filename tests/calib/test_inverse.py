@@ -1,0 +1,44 @@
+"""Inverses of matrices of mixed units, against numpy's; the trajectory's prior and variances, turned between frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.inverse import inverted
+from calib.normals import TrajectoryWeight
+from calib.parameters import Wish, unknowns
+from calib.rows import Rows
+from calib.trajectory_errors import gauss_markov
+from tests.calib.roofs import LINES, made
+
+
+def test_an_inverse_is_that_of_numpy_in_spite_of_its_units() -> None:
+    g = np.random.default_rng(8)
+    unit = 10.0 ** g.uniform(-8.0, 3.0, 40)
+    root = g.normal(size=(40, 60))
+    plain = root @ root.T
+    found = inverted(plain * np.outer(unit, unit)) * np.outer(unit, unit)
+    np.testing.assert_allclose(found, np.linalg.inv(plain), rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(found, found.T)
+
+
+@pytest.mark.parametrize("last", [1.0, 2.0, np.nan])
+def test_what_is_not_positive_definite_has_none(last: float) -> None:
+    matrix = np.array([[1.0, last], [last, 1.0]])
+    with pytest.raises(np.linalg.LinAlgError):
+        inverted(matrix)
+
+
+def test_the_trajectorys_weight_and_variances_are_turned_with_the_axes() -> None:
+    flight = made(lines=LINES[:2], points=2).flight
+    prior = gauss_markov(flight, knot_s=5.0)
+    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, Wish()), prior))
+    turn = np.zeros((len(prior), 2, 3, len(prior), 2, 3))
+    for knot in range(len(prior)):
+        turn[knot, 0, :, knot, 0] = turn[knot, 1, :, knot, 1] = weight.rot_e_from_l[knot]
+    whole = turn.reshape(6 * len(prior), -1)
+    covariance_e = whole @ prior.covariance @ whole.T
+    unit = np.sqrt(np.outer(np.diag(covariance_e), np.diag(covariance_e)))
+    np.testing.assert_allclose(weight.normal * unit, np.linalg.inv(covariance_e / unit), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(weight.variances_l(covariance_e), np.diag(prior.covariance), rtol=1e-9)

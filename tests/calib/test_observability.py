@@ -1,0 +1,322 @@
+"""What is determined: the table of FORMULAS 5.5 from a design of georef's model, and normal matrices made by hand."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.observability import RULES, Rules, decide, kind_of, spectrum
+from calib.outcome import Held
+from georef.beams import LineGeometry
+from georef.calibration import INDEX, PARAMETERS, nominal
+from georef.earth import e_from_geodetic, rot_e_from_l
+from georef.jacobian import observation_columns_e, parameter_columns_e
+from georef.records import RETURN_DTYPE
+from georef.rotations import quaternion_from_rot, rot_l_from_b
+from georef.sensor_model import SensorModel
+from georef.trajectory import Trajectory
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+SECOND, BEGIN = 10**9, 1_400_000_000 * 10**9
+LEVER_ARM = np.array([0.15, -0.08, 0.42])
+SPEED_MPS, HALF_ANGLE = 60.0, np.radians(30.0)
+POSITION_SIGMA = np.array([0.03, 0.03, 0.05])
+OTHER_SIGMA = np.array([*np.radians([0.003, 0.003, 0.007]), 0.02, np.radians(0.001)])  # roll, pitch, heading, ρ, θ
+
+# heading, height, offset to the right of the middle
+OPPOSITE = [(0.0, 800.0, 0.0), (np.pi, 800.0, 0.0)]
+PARALLEL = [*OPPOSITE, (0.0, 800.0, 250.0), (0.0, 800.0, -250.0)]
+ONE_HEIGHT = [*PARALLEL, (np.pi / 2, 800.0, 0.0), (3 * np.pi / 2, 800.0, 0.0)]
+TWO_HEIGHTS = [*ONE_HEIGHT, (0.0, 1500.0, 0.0), (np.pi / 2, 1500.0, 0.0)]
+DESIGNS = {
+    "one line": OPPOSITE[:1],
+    "opposite": OPPOSITE,
+    "one height": ONE_HEIGHT,
+    "two heights": TWO_HEIGHTS,
+}
+BASIC = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
+ARC = float(np.radians(1 / 3600))
+ANGLES = dict.fromkeys(("omega_rad", "phi_rad", "kappa_rad"), ARC)
+
+
+def planes(roofs: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """25 of them, 125 m apart: centre and normal, north, east, down; of roofs every fifth is flat."""
+    made = []
+    for index, (north, east) in enumerate((n, e) for n in np.linspace(-250, 250, 5) for e in np.linspace(-250, 250, 5)):
+        azimuth, slope = index % 4 * np.pi / 2 + 0.3, np.radians(35.0 if roofs and index % 5 else 0.0)
+        level = np.sin(slope) * np.array([np.cos(azimuth), np.sin(azimuth)])
+        made.append((np.array([north, east, 0.0]), np.array([*level, -np.cos(slope)])))
+    return made
+
+
+@cache
+def design(name: str, roofs: bool) -> tuple[FloatArray, FloatArray, NDArray[np.int64], FloatArray]:
+    """Rows of all returns that hit: normal · columns (n, 16), variance (n,), plane (n,), place on it (n, 3)."""
+    rng = np.random.default_rng(3)
+    targets, poses, normals, plane_of, places = [], [], [], [], []
+    for index, (centre, normal) in enumerate(planes(roofs)):
+        first = np.cross(normal, [1.0, 0.0, 0.0])
+        first /= np.linalg.norm(first)
+        second = np.cross(normal, first)
+        for heading, height, offset in DESIGNS[name]:
+            for _ in range(12):
+                a, b = rng.uniform(-6, 6), rng.uniform(-6, 6)
+                targets.append(centre + a * first + b * second)
+                poses.append([heading, height, offset, *rng.normal(0.0, np.radians(1.0), 2)])
+                normals.append(normal)
+                plane_of.append(index)
+                places.append([a, b, 1.0])
+    position, rot, range_m, angle = aimed(np.array(targets), np.array(poses))
+    hit = np.abs(angle) <= HALF_ANGLE
+    columns, variance = rows(position[hit], rot[hit], range_m[hit], angle[hit], np.array(normals)[hit])
+    return columns, variance, np.array(plane_of)[hit], np.array(places)[hit]
+
+
+def aimed(targets: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Where on its line the body was when its beam met the target, (n,) range and angle: Newton on three equations."""
+    heading, height, offset, roll, pitch = poses.T
+    rot = rot_l_from_b(roll, pitch, heading)
+    along = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1)
+    across = np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=1)
+    at, angle, range_m = np.sum(targets * along, axis=1), 0.0 * height, height.copy()
+    for _ in range(20):
+        position = along * at[:, None] + across * offset[:, None]
+        position[:, 2] = -height
+        beam, turned = np.zeros((2, len(at), 3))
+        beam[:, 1], beam[:, 2] = np.sin(angle), np.cos(angle)
+        turned[:, 1], turned[:, 2] = np.cos(angle), -np.sin(angle)
+        met = position + np.einsum("nij,nj->ni", rot, LEVER_ARM + range_m[:, None] * beam)
+        sides = [along, np.einsum("nij,nj->ni", rot, range_m[:, None] * turned), np.einsum("nij,nj->ni", rot, beam)]
+        step = np.linalg.solve(np.stack(sides, axis=2), (targets - met)[..., None])[..., 0]
+        at, angle, range_m = at + step[:, 0], angle + step[:, 1], range_m + step[:, 2]
+    assert np.abs(step).max() < 1e-9
+    return position, rot, range_m, angle
+
+
+def rows(
+    position: FloatArray, rot: FloatArray, range_m: FloatArray, angle: FloatArray, normals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Georef's columns of shots in a flat local frame, each between two epochs of its own."""
+    count, rot_e_l = len(angle), rot_e_from_l(np.radians(47.0), np.radians(9.0))
+    origin = e_from_geodetic(np.radians(47.0), np.radians(9.0), 0.0)
+    shot_ns = BEGIN + np.arange(count) * SECOND
+    way = rot[:, :, 0] * SPEED_MPS * 1e-3
+    way[:, 2] = 0.0
+    way *= SPEED_MPS * 1e-3 / np.linalg.norm(way, axis=1, keepdims=True)
+    ends = np.stack([position - way, position + way], axis=1).reshape(-1, 3)
+    unsaid = np.full((2 * count, 3), np.nan)
+    path = Trajectory(
+        np.stack([shot_ns - 10**6, shot_ns + 10**6], axis=1).ravel(),
+        origin + ends @ rot_e_l.T,
+        quaternion_from_rot(rot_e_l @ np.repeat(rot, 2, axis=0)),
+        unsaid,
+        unsaid,
+        unsaid,
+        max_gap_ns=3 * 10**6,
+    )
+    model = SensorModel(nominal("left", LEVER_ARM, np.eye(3)), LineGeometry())
+    returns = np.zeros(count, RETURN_DTYPE)
+    returns["range_m"], returns["encoder_rad"] = range_m, angle
+    rays = model.rays(returns, shot_ns, path, with_axes=True)
+    normals_e = normals @ rot_e_l.T
+    by_parameter = np.einsum("nka,na->nk", parameter_columns_e(rays, model, path), normals_e)
+    by_observation = np.einsum("nka,na->nk", observation_columns_e(rays, model, path)[:, 3:], normals_e)
+    variance = (normals * POSITION_SIGMA) ** 2 @ np.ones(3) + (by_observation * OTHER_SIGMA) ** 2 @ np.ones(5)
+    return by_parameter, variance
+
+
+def reduced(name: str, roofs: bool, names: tuple[str, ...]) -> FloatArray:
+    """The normal matrix of some parameters with all planes eliminated (FORMULAS 6.4)."""
+    columns, variance, plane_of, places = design(name, roofs)
+    chosen = columns[:, [INDEX[parameter] for parameter in names]] / np.sqrt(variance)[:, None]
+    places = places / np.sqrt(variance)[:, None]
+    normal = np.zeros((len(names), len(names)))
+    for plane in np.unique(plane_of):
+        mine = plane_of == plane
+        own, a = places[mine], chosen[mine]
+        normal += a.T @ (a - own @ np.linalg.lstsq(own, a, rcond=None)[0])
+    return normal
+
+
+TABLE = [  # row, lines, roofs, what is added, printed sigmas (unit, print's last digit), printed correlations, held
+    ("A", "one line", True, (), {"omega_rad": (811, 1), "phi_rad": (63, 1), "kappa_rad": (139, 1),
+     "range_offset_m": (0.61, 0.01)}, {}, {"omega_rad", "phi_rad", "kappa_rad", "range_offset_m"}),
+    ("B", "opposite", False, (), {"omega_rad": (2.8, 0.1), "phi_rad": (35, 1), "kappa_rad": (162, 1),
+     "range_offset_m": (12.6, 0.1)}, {}, {"phi_rad", "kappa_rad", "range_offset_m"}),
+    ("C", "opposite", True, (), {"omega_rad": (1.5, 0.1), "phi_rad": (1.7, 0.1), "kappa_rad": (89, 1),
+     "range_offset_m": (0.42, 0.01)}, {}, {"kappa_rad", "range_offset_m"}),
+    ("D", "one height", True, (), {"omega_rad": (0.9, 0.1), "phi_rad": (1.0, 0.1), "kappa_rad": (4.6, 0.1),
+     "range_offset_m": (0.018, 0.001)}, {}, set()),
+    ("E", "one height", True, ("lever_arm_x_m", "lever_arm_y_m"), {},
+     {("phi_rad", "lever_arm_x_m"): -1.000, ("omega_rad", "lever_arm_y_m"): 0.85}, {"lever_arm_x_m"}),
+    ("F", "two heights", True, ("lever_arm_x_m", "lever_arm_y_m"), {"lever_arm_x_m": (0.012, 0.001)},
+     {("phi_rad", "lever_arm_x_m"): -0.955, ("omega_rad", "lever_arm_y_m"): 0.85}, set()),
+    ("G", "two heights", True, ("scan_angle_scale", "scan_plane_tilt_rad"), {},
+     {("phi_rad", "scan_plane_tilt_rad"): 1.000, ("range_offset_m", "scan_angle_scale"): -0.93},
+     {"scan_angle_scale", "scan_plane_tilt_rad"}),
+    ("H", "two heights", True, ("lever_arm_z_m",), {"lever_arm_z_m": (0.13, 0.01)}, {}, {"lever_arm_z_m"}),
+    ("I", "two heights", True, ("range_scale",), {"range_scale": (5e-6, 1e-6)},
+     {("range_offset_m", "range_scale"): -0.29}, set()),
+    ("J", "two heights", True, ("scan_angle_offset_rad",), {}, {}, {"scan_angle_offset_rad"}),
+    ("K", "one height", True, ("time_offset_s",), {}, {("phi_rad", "time_offset_s"): -0.999}, {"time_offset_s"}),
+    ("L", "two heights", True, ("time_offset_s",), {"time_offset_s": (2e-4, 1e-4)},
+     {("phi_rad", "time_offset_s"): -0.954}, set()),
+    ("M", "two heights", True, ("pitch_slope",), {}, {("kappa_rad", "pitch_slope"): 1.000}, {"pitch_slope"}),
+    ("N", "two heights", True, ("lever_arm_x_m", "time_offset_s"), {},
+     {("lever_arm_x_m", "time_offset_s"): -0.989}, {"lever_arm_x_m"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("lines", "roofs", "added", "sigmas", "correlations", "held"),
+    [row[1:] for row in TABLE],
+    ids=[row[0] for row in TABLE],
+)
+def test_the_table_of_designs(
+    lines: str,
+    roofs: bool,
+    added: tuple[str, ...],
+    sigmas: dict[str, tuple[float, float]],
+    correlations: dict[tuple[str, str], float],
+    held: set[str],
+) -> None:
+    """Printed sigmas and correlations to their last digit, from georef's Jacobian; and which parameters are held."""
+    names = (*BASIC, *added)
+    normal = reduced(lines, roofs, names)
+    told = decide(normal, [f"left.{name}" for name in names])
+    assert {one.name for one in told} == held
+    if "scan_angle_offset_rad" in added:
+        assert spectrum(normal)[0] < 1e-12
+        return
+    covariance = np.linalg.inv(normal)
+    found = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    for name, (printed, digit) in sigmas.items():
+        assert found[name] / ANGLES.get(name, 1.0) == pytest.approx(printed, abs=0.51 * digit), name
+    for (one, other), printed in correlations.items():
+        rho = covariance[names.index(one), names.index(other)] / (found[one] * found[other])
+        digits = 3 if abs(printed) > 0.94 else 2
+        assert abs(rho - printed) <= 0.51 * 10.0**-digits, (one, other, rho)
+
+
+def held_of(lines: str, roofs: bool, *added: str) -> dict[str, Held]:
+    names = [f"left.{name}" for name in (*BASIC, *added)]
+    return {held.name: held for held in decide(reduced(lines, roofs, (*BASIC, *added)), names)}
+
+
+def test_opposite_lines_over_flat_ground_say_nothing_of_pitch_heading_and_range() -> None:
+    """Each in plain words, with the lines that would."""
+    held = held_of("opposite", False)
+    assert set(held) == {"phi_rad", "kappa_rad", "range_offset_m"}
+    assert "which flat ground does not show" in held["phi_rad"].why
+    assert held["phi_rad"].remedy == "fly opposite lines over roofs or slopes that face along the track"
+    assert "parallel lines" in held["kappa_rad"].remedy
+    assert "at least 8 points at 1 cm" in held["range_offset_m"].remedy
+    assert held["phi_rad"].sigma == pytest.approx(35 * ARC, rel=0.03)
+    assert np.isinf(held["range_offset_m"].sigma) or held["range_offset_m"].sigma > 10.0
+
+
+def test_what_cannot_be_told_apart_is_said_with_its_remedy() -> None:
+    one = held_of("one height", True, "lever_arm_x_m")["lever_arm_x_m"]
+    assert one.scanner == "left"
+    assert one.with_others[0][0] == "left.phi_rad"
+    assert one.with_others[0][1] == pytest.approx(-1.0, abs=1e-3)
+    assert one.why.startswith("this flight cannot tell it apart from left.phi_rad (correlation -1.000)")
+    assert "second height, at least 1.7 times" in one.remedy
+    assert "second height" in held_of("one height", True, "time_offset_s")["time_offset_s"].remedy
+    assert "another speed" in held_of("two heights", True, "lever_arm_x_m", "time_offset_s")["lever_arm_x_m"].remedy
+    assert "bench" in held_of("two heights", True, "pitch_slope")["pitch_slope"].remedy
+    angle = held_of("two heights", True, "scan_angle_offset_rad")["scan_angle_offset_rad"]
+    assert "one and the same" in angle.remedy
+    assert angle.with_others[0][0] == "left.omega_rad"
+    assert angle.with_others[0][1] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_the_whole_model_keeps_the_boresight() -> None:
+    """All sixteen at once, of two heights: rank defects and all; ω, φ, κ and the range offset stay."""
+    names = tuple(parameter.name for parameter in PARAMETERS)
+    held = {one.name for one in decide(reduced("two heights", True, names), [f"a.{name}" for name in names])}
+    assert not held & set(BASIC)
+    assert {"scan_angle_offset_rad", "pitch_slope", "scan_plane_tilt_rad", "lever_arm_z_m", "lever_arm_x_m"} <= held
+    assert {"imu_latency_s", "encoder_latency_s", "torsion_s2"} <= held  # nothing turned, no encoder's motion
+    free = [name for name in names if name not in held]
+    sigma = np.sqrt(np.diag(np.linalg.inv(reduced("two heights", True, tuple(free)))))
+    assert (sigma <= [RULES[name].wanted for name in free]).all()
+
+
+# ---------------------------------------------------------------------- by hand
+
+
+def information(covariance: FloatArray, names: list[str]) -> FloatArray:
+    """Normal matrix of a covariance given in wanted sigmas."""
+    wanted = np.array([RULES[kind_of(name)].wanted for name in names])
+    return np.asarray(np.linalg.inv(covariance * np.outer(wanted, wanted)), dtype=np.float64)
+
+
+def test_what_a_prior_holds_is_never_held() -> None:
+    """Pitch and lever arm that are one: with a prior on the arm both stay, without the arm goes."""
+    names = ["left.phi_rad", "left.lever_arm_x_m"]
+    normal = information(np.array([[1e4, 0.99999e4], [0.99999e4, 1e4]]), names)
+    assert [held.name for held in decide(normal, names)] == ["lever_arm_x_m"]
+    assert decide(normal, names, np.array([np.inf, 0.001])) == ()
+    assert decide(np.zeros((1, 1)), names[1:], np.array([1.0])) == ()
+
+
+def test_one_that_was_given_up_comes_back_when_it_is_determined_after_all() -> None:
+    """A slope that looked like heading; heading is then held itself, and the slope must not take its place."""
+    names = ["left.kappa_rad", "left.pitch_slope"]
+    both = information(np.array([[40.0, 39.9], [39.9, 40.0]]), names)
+    assert {held.name for held in decide(both, names)} == {"pitch_slope"}
+    poor = information(np.array([[40.0**2, 0.9 * 80.0], [0.9 * 80.0, 2.0**2]]), names)
+    assert decide(poor[1:, 1:], names[1:]) == ()  # alone it would be determined
+    assert {held.name for held in decide(poor, names)} == {"kappa_rad", "pitch_slope"}
+    three = ["left.phi_rad", "left.time_offset_s", "left.lever_arm_x_m"]
+    # arm and pitch are one; the time offset is like both until the arm is gone
+    design_ = np.array([[1.0, 0.9, 1.0], [0.0, 0.8, 0.0], [0.0, 0.0, 1e-4]]) * 4.0
+    wanted = np.array([RULES[kind_of(name)].wanted for name in three])
+    normal = design_.T @ design_ / np.outer(wanted, wanted)
+    assert {held.name for held in decide(normal, three)} == {"lever_arm_x_m"}
+
+
+def test_rounding_that_makes_an_eigenvalue_negative_is_no_knowledge() -> None:
+    names = ["left.omega_rad", "left.scan_angle_offset_rad"]
+    wanted = np.array([RULES[kind_of(name)].wanted for name in names])
+    normal = 1e6 * np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]]) / np.outer(wanted, wanted)
+    held = decide(normal, names)
+    assert [one.name for one in held] == ["scan_angle_offset_rad"]
+    assert np.isinf(held[0].sigma) or held[0].sigma > 30 * RULES["scan_angle_offset_rad"].plausible
+
+
+def test_what_nothing_shows_is_said() -> None:
+    names = ["left.omega_rad", "left.torsion_s2", "left.beam.12.azimuth_rad"]
+    normal = np.diag([1e14, 0.0, 0.0])
+    held = decide(normal, names)
+    assert [(one.scanner, one.name) for one in held] == [("left", "torsion_s2"), ("left", "beam.12.azimuth_rad")]
+    assert all(one.why.startswith("nothing in this flight shows it") for one in held)
+    assert all(np.isinf(one.sigma) for one in held)
+    assert decide(np.zeros((0, 0)), []) == ()
+
+
+def test_limits_are_the_callers() -> None:
+    """A limit half as large, a correlation allowed: the same matrix is decided otherwise."""
+    names = ["left.omega_rad", "left.phi_rad"]
+    normal = information(np.array([[0.5, 0.0], [0.0, 0.1]]), names)
+    assert decide(normal, names) == ()
+    table = {**RULES, "omega_rad": type(RULES["omega_rad"])(RULES["omega_rad"].plausible, 0.1, "", "")}
+    assert [held.name for held in decide(normal, names, None, Rules(table))] == ["omega_rad"]
+    alike = information(0.1 * np.array([[1.0, 0.99], [0.99, 1.0]]), names)
+    assert [held.name for held in decide(alike, names)] == ["phi_rad"]
+    assert decide(alike, names, None, Rules(correlation=0.995)) == ()
+
+
+def test_heads_that_share_their_trajectorys_errors_keep_their_own_parameters() -> None:
+    """Known to 1 mm relative to each other and to 1 cm both: told apart, though they go together by 0.995."""
+    names = ("left.range_offset_m", "right.range_offset_m")
+    normal: FloatArray = np.linalg.inv(1e-4 * np.array([[1.0, 0.995], [0.995, 1.0]])).astype(np.float64)
+    assert decide(normal, names) == ()
+    of_one = decide(normal, ("left.range_offset_m", "left.lever_arm_z_m"))
+    assert [held.name for held in of_one] == ["lever_arm_z_m"]

@@ -1,0 +1,153 @@
+"""Which parameters are estimated, and how they go back into calibrations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.flight import Flight, Head
+from calib.parameters import MODELS, ParameterError, Unknowns, Wish, unknowns
+from georef.beams import LineGeometry, SpinningGeometry
+from georef.calibration import INDEX, BeamCorrection, RangeOffset, nominal
+from tests.calib.roofs import LINES, frame, trajectory
+
+
+def spinning() -> SpinningGeometry:
+    """Three beams."""
+    nothing = np.zeros(3)
+    return SpinningGeometry(np.array([-10.0, 0.0, 10.0]), nothing, nothing, nothing, nothing, nothing)
+
+
+def flight() -> Flight:
+    """A line scanner and a spinning head."""
+    left, top = nominal("left", (0.1, 0.2, 0.3), np.eye(3)), nominal("top", (0.5, 0.0, -0.2), np.eye(3))
+    heads = (Head("left", left, LineGeometry()), Head("top", top, spinning()))
+    return Flight(frame(), heads, (trajectory(LINES[:1]),), ())
+
+
+def test_models_are_those_of_the_program() -> None:
+    assert MODELS["basic"] == ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
+    assert set(MODELS["scanner"]) - set(MODELS["basic"]) == {
+        "scan_angle_scale",
+        "range_scale",
+        "scan_plane_tilt_rad",
+        "time_offset_s",
+    }
+    assert set(MODELS["full"]) == set(INDEX)
+
+
+def test_several_heads_stand_in_one_vector() -> None:
+    asked = unknowns(flight(), Wish("scanner", fix=frozenset(["left.kappa_rad"]), priors={"lever_arm_z_m": 0.02}))
+    left, top = ([name.split(".", 1)[1] for name in asked.names if name.startswith(head)] for head in ("left", "top"))
+    assert left == [name for name in INDEX if name in {*MODELS["scanner"], "lever_arm_z_m"} - {"kappa_rad"}]
+    assert "scan_plane_tilt_rad" not in top  # a spinning head has none
+    assert "kappa_rad" in top
+    held = {(one.scanner, one.name): one for one in asked.held}
+    assert held["left", "kappa_rad"].why == "held at your word"
+    assert held["left", "kappa_rad"].remedy == ""
+    assert ("top", "scan_angle_scale") in held
+    assert asked.start[asked.names.index("top.lever_arm_z_m")] == -0.2
+    assert asked.prior_sigmas[asked.names.index("top.lever_arm_z_m")] == 0.02
+    assert np.isinf(asked.prior_sigmas[asked.names.index("top.omega_rad")])
+
+
+def test_the_scan_angle_s_offset_is_held_unless_it_is_freed() -> None:
+    held = unknowns(flight(), Wish("full"))
+    assert "left.scan_angle_offset_rad" not in held.names
+    assert any(one.name == "scan_angle_offset_rad" and "boresight" in one.why for one in held.held)
+    freed = unknowns(flight(), Wish("full", free=frozenset(["left.scan_angle_offset_rad"])))
+    assert "left.scan_angle_offset_rad" in freed.names
+
+
+def extras() -> Unknowns:
+    """All that is beyond the model."""
+    made = flight()
+    old = replace(
+        made.heads[1].start,
+        ibrc=(np.array([0.0, 100.0]), np.array([0.0, 0.1])),
+        range_offsets=(RangeOffset(0.5, 2), RangeOffset(0.7, 2, 1)),
+        beams={2: BeamCorrection(0.01, 0.02, 0.03)},
+    )
+    made = replace(made, heads=(made.heads[0], replace(made.heads[1], start=old)))
+    wish = Wish(
+        ibrc_knots=(0.0, 50.0, 75.0, 100.0),
+        ibrc_reference=50.0,
+        beams=frozenset(["azimuth_rad", "range_m"]),
+        range_offset_slots=(2,),
+        range_offset_zones=(3,),
+    )
+    return unknowns(made, wish)
+
+
+def test_tables_start_from_those_there_are_and_come_back() -> None:
+    asked = extras()
+    start = asked.calibrations(asked.start)["top"]
+    assert start.ibrc is not None
+    np.testing.assert_allclose(start.ibrc[1], [-0.05, 0.0, 0.025, 0.05])
+    assert start.value("range_offset_m") == pytest.approx(-0.05)  # the range is the same
+    values = asked.start + np.arange(1, len(asked) + 1) * 1e-3
+    done = asked.calibrations(values)["top"]
+    by_name = dict(zip(asked.names, values.tolist(), strict=True))
+    assert done.ibrc is not None
+    assert done.ibrc[1].tolist() == [by_name["top.ibrc.0"], 0.0, by_name["top.ibrc.2"], by_name["top.ibrc.3"]]
+    assert RangeOffset(by_name["top.range_offset_slot.2"], 2) in done.range_offsets
+    assert RangeOffset(0.7, 2, 1) in done.range_offsets
+    assert RangeOffset(by_name["top.range_offset_zone.3"], None, 3) in done.range_offsets
+    assert len(done.range_offsets) == 3
+    assert done.beams[2] == BeamCorrection(by_name["top.beam.2.azimuth_rad"], 0.02, by_name["top.beam.2.range_m"])
+    assert "top.beam.0.range_m" not in asked.names  # the first beam is what others are told from
+    assert done.value("phi_rad") == by_name["top.phi_rad"]
+
+
+def test_pseudo_observations_are_priors_and_bends() -> None:
+    asked = extras()
+    values = asked.start + np.random.default_rng(1).normal(size=len(asked)) * 0.01
+    design, misclosure = asked.pseudo(values)
+    assert len(design) == 4  # two inner knots of each head
+    step = np.random.default_rng(2).normal(size=len(asked)) * 0.01
+    np.testing.assert_allclose(asked.pseudo(values + step)[1] - misclosure, design @ step, atol=1e-12)
+    table = asked.calibrations(values)["top"].ibrc
+    assert table is not None
+    bend = table[1][2] - (table[1][1] + table[1][3]) / 2.0
+    assert misclosure[3] == pytest.approx(bend / 0.02)
+    prior = unknowns(flight(), Wish(priors={"left.phi_rad": 0.01}))
+    design, misclosure = prior.pseudo(prior.start + 0.005)
+    assert design.shape == (1, 8)
+    assert design[0, 1] == pytest.approx(100.0)
+    assert misclosure[0] == pytest.approx(0.5)
+
+
+def test_sigmas_and_correlations_go_to_their_head() -> None:
+    asked = unknowns(flight(), Wish())
+    root = np.random.default_rng(5).normal(size=(8, 8))
+    covariance = root @ root.T
+    done = asked.finished(asked.start, covariance)
+    at = [INDEX[name] for name in MODELS["basic"]]
+    np.testing.assert_allclose(done["top"].covariance()[np.ix_(at, at)], covariance[4:, 4:])
+    assert done["top"].sigmas[INDEX["lever_arm_x_m"]] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wish", "text"),
+    [
+        (Wish("everything"), "want one of basic, scanner, full"),
+        (Wish(fix=frozenset(["omega"])), "omega: is no parameter"),
+        (Wish(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
+        (Wish(priors={"phi_rad": 0.0}), "want a sigma above 0"),
+        (Wish(priors={"fie_rad": 0.1}), "prior fie_rad"),
+        (Wish(ibrc_knots=(5.0, 5.0)), "rising intensities"),
+        (Wish(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
+    ],
+)
+def test_wishes_that_cannot_be_met_are_refused(wish: Wish, text: str) -> None:
+    with pytest.raises(ParameterError, match=text.replace(".", r"\.")) as refused:
+        unknowns(flight(), wish)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_beam_s_correction_needs_a_spinning_head() -> None:
+    only = replace(flight(), heads=flight().heads[:1])
+    with pytest.raises(ParameterError, match="no scanner of this flight is a spinning head"):
+        unknowns(only, Wish(beams=frozenset(["range_m"])))

@@ -1,0 +1,149 @@
+"""A planned flight: its returns lie where georef puts them, and its predicted sigmas are those of adjusted noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calib.features import ControlPoint
+from calib.flight import FlightError
+from calib.normals import TrajectoryWeight, normals
+from calib.parameters import Wish, unknowns
+from calib.plan import MOST_POINTS, Scan, planned, predict
+from calib.rows import Rows
+from calib.tie_rows import Ties
+from calib.trajectory_errors import apply, draw, gauss_markov
+from tests.calib.planned_flight import (
+    FRAME,
+    NOISE,
+    ONE_HEIGHT,
+    OPPOSITE,
+    TWO_HEIGHTS,
+    flown,
+    noised,
+    path,
+    scanner,
+    surfaces,
+)
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+DEG = float(np.radians(1.0))
+
+
+def test_returns_lie_on_the_planes() -> None:
+    """With a boresight, an offset and scales: within a micrometre of where they were aimed, within the scan."""
+    values = {
+        "omega_rad": 0.3 * DEG, "phi_rad": -0.5 * DEG, "kappa_rad": 0.8 * DEG, "range_offset_m": 0.4,
+        "range_scale": 3e-5, "scan_angle_scale": 2e-4, "scan_angle_offset_rad": 0.1 * DEG, "time_offset_s": 2e-3,
+    }  # fmt: skip
+    head, (trajectory, lines) = scanner("left", **values), path(ONE_HEIGHT)
+    pieces = surfaces()
+    flight, features = planned(FRAME, [head], [Scan(20.0 * DEG, 1e5)], [trajectory], lines, pieces)
+    normals_t = {piece.name: piece.normal_t for piece in pieces}
+    seen = 0
+    for swath in flight.swaths:
+        assert (np.diff(swath.time_ns) >= 0).all()
+        np.testing.assert_allclose(flight.place(swath, head.start), swath.points_t, atol=1e-6)
+        angle = flight.rays(swath, head.start).angle_rad
+        assert np.abs(angle).max() < 20.001 * DEG
+    for plane in features.planes:
+        assert len(plane.patches) > 1
+        for patch in plane.patches:
+            assert 4 <= len(patch.at) <= MOST_POINTS
+            away = flight.swaths[patch.swath].points_t[patch.at] - plane.centre_t
+            assert np.abs(away @ normals_t[plane.name]).max() < 1e-9
+            seen += len(patch.at)
+    assert seen == sum(len(swath) for swath in flight.swaths)
+
+
+def test_sigmas_are_those_of_flights_with_such_errors() -> None:
+    """60 flights: new trajectory errors, noise on range and angle, one step of the adjustment: χ² of four parameters.
+
+    A trajectory taken as white would make these four sigmas several times too small.
+    """
+    flight, features = flown(ONE_HEIGHT)
+    prior, wanted = gauss_markov(flight), unknowns(flight, Wish())
+    predicted = predict(flight, features, Wish(), prior)
+    assert predicted.held == ()
+    assert predicted.returns == sum(len(swath) for swath in flight.swaths)
+    covariance = predicted.correlation * np.outer(predicted.sigmas, predicted.sigmas)
+    rng, found, white = np.random.default_rng(11), [], []
+    careless = predict(flight, features, Wish(), None)
+    for seed in range(60):
+        errors = draw(prior, rng)
+        spoilt = replace(flight, trajectories=(apply(flight.trajectories[0], 0, prior, -errors),))
+        rows = Rows(noised(spoilt, seed), features.planes, wanted, prior)
+        ones, ties = np.ones(rows.count, np.float32), Ties(rows, (), None)
+        system = normals(rows, ties, TrajectoryWeight(rows), rows.start(), ones, np.zeros(0, np.float32), 0.0)
+        step = system.step()[0][: len(wanted)]
+        found.append(float(step @ np.linalg.solve(covariance, step)))
+        white.append((step / careless.sigmas) ** 2)
+    low, high = chi2.ppf([0.001, 0.999], 4 * len(found)) / len(found)
+    assert low < np.mean(found) < high
+    assert np.mean(white) > 4.0
+
+
+def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
+    """What each design adds."""
+    one, two = flown(ONE_HEIGHT), flown(TWO_HEIGHTS)
+    model = Wish("scanner")
+    low = predict(one[0], one[1], model, gauss_markov(one[0]))
+    high = predict(two[0], two[1], model, gauss_markov(two[0]))
+    assert "left.range_scale" in high.names
+    assert "range_scale" in {held.name for held in low.held}
+    flight, features = flown(OPPOSITE, roofs=False)
+    told = {held.name for held in predict(flight, features, Wish(), gauss_markov(flight)).held}
+    assert told == {"phi_rad", "kappa_rad", "range_offset_m"}
+    planes = tuple(
+        replace(plane, control=(ControlPoint(f"{index}", plane.centre_t, 0.01),)) if index % 4 == 0 else plane
+        for index, plane in enumerate(features.planes)
+    )
+    controlled = replace(features, planes=planes)
+    told = {held.name for held in predict(flight, controlled, Wish(), gauss_markov(flight)).held}
+    assert told == {"phi_rad", "kappa_rad"}
+
+
+def test_a_lone_line_has_no_planes_but_with_control() -> None:
+    trajectory, lines = path(ONE_HEIGHT[:1])
+    scan = Scan(30.0 * DEG, 1e5)
+    with pytest.raises(FlightError, match="no roof and no ground is seen from two lines; want lines that overlap"):
+        planned(FRAME, [scanner()], [scan], [trajectory], lines, surfaces())
+    piece = surfaces()[24]
+    controlled = replace(piece, control=(ControlPoint("1", piece.points_t[24], 0.01),))
+    _, features = planned(FRAME, [scanner()], [scan], [trajectory], lines, [controlled])
+    assert [len(plane.patches) for plane in features.planes] == [1]
+    assert len(planned(FRAME, [scanner()], [scan], [trajectory], lines * 2, surfaces())[1].planes) > 9
+    with pytest.raises(FlightError, match="no roof"):  # too few pulses for a patch to be found
+        planned(FRAME, [scanner()], [Scan(30.0 * DEG, 2000.0)], [trajectory], lines * 2, surfaces())
+    near = replace(scanner(), range_gate=(20.0, 300.0))
+    with pytest.raises(FlightError, match="no roof"):  # out of range
+        planned(FRAME, [near], [scan], [trajectory], lines * 2, surfaces())
+
+
+def test_the_encoder_moves_as_the_scan_does() -> None:
+    """Rates and accelerations against differences of the motion itself."""
+    t, h = np.linspace(0.001, 0.011, 7), 1e-6
+
+    def sine(at: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * np.sin(2 * np.pi * 20.0 * at))
+
+    def triangle(at: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * 4 * 20.0 * at)
+
+    for angle_of in (sine, triangle):
+        scan = Scan(0.5, 1e5, 20.0, angle_of.__name__)
+        rate, acceleration = scan.encoder_motion(angle_of(t))
+        np.testing.assert_allclose(np.abs(rate), (angle_of(t + h) - angle_of(t - h)) / (2 * h), rtol=1e-6)
+        second = (angle_of(t + 1e-4) - 2 * angle_of(t) + angle_of(t - 1e-4)) / 1e-8
+        np.testing.assert_allclose(acceleration, second, rtol=1e-3, atol=1e-3)
+        assert rate[0] > 0.0 > rate[1]
+    rate, acceleration = Scan(0.5, 1e5, 20.0).encoder_motion(t)
+    assert (rate == 2 * np.pi * 20.0).all()
+    assert not acceleration.any()
+    assert NOISE.range_m == 0.02

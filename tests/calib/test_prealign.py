@@ -1,0 +1,162 @@
+"""Coarse alignment, against the truth of virtual flights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.flight import Flight
+from calib.height_grids import Lattice, surface
+from calib.plane_search import find_planes
+from calib.prealign import NAMES, PrealignError, PrealignSettings, prealign
+from georef.calibration import Calibration
+from tests.calib.cast_flight import Cast, Line, cast_flight
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+LINES: tuple[Line, ...] = (
+    (-200, 0, 200, 0, 850),
+    (200, 60, -200, 60, 850),
+    (0, 200, 0, -200, 850),
+)
+TERRAIN = """
+height_m = 450.0
+relief_m = {relief}
+wavelength_m = 500.0
+[[terrain.village]]
+center_m = [0.0, 0.0]
+size_m = [260.0, 240.0]
+heading_deg = 25.0
+houses = 40
+[[terrain.forest]]
+center_m = [130.0, 90.0]
+size_m = [80.0, 60.0]
+trees_per_ha = 200.0
+"""
+FAST = PrealignSettings(returns=40_000)
+COARSE, FINE = replace(FAST, smooth_m=(48.0,)), replace(FAST, smooth_m=(24.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def cast() -> Cast:
+    return cast_flight(TERRAIN.format(relief=8.0), LINES, prf_hz=9_000.0)
+
+
+def off(cast: Cast, degrees: tuple[float, float, float], range_m: float = 0.0) -> dict[str, Calibration]:
+    """A start that is so far from the truth."""
+    values = [*np.radians(degrees).tolist(), range_m]
+    changed = {name: cast.truth.value(name) + value for name, value in zip(NAMES, values, strict=True)}
+    return {"left": cast.truth.changed(**changed)}
+
+
+def errors_deg(cast: Cast, found: dict[str, Calibration]) -> list[float]:
+    return [float(np.degrees(found["left"].value(name) - cast.truth.value(name))) for name in NAMES[:3]]
+
+
+@pytest.mark.parametrize(
+    ("degrees", "range_m"),
+    [((-3.0, 3.0, -3.0), 5.0), ((3.0, -3.0, -3.0), -5.0)],
+)
+def test_three_degrees_and_five_metres_become_small(
+    cast: Cast, degrees: tuple[float, float, float], range_m: float
+) -> None:
+    found = prealign(cast.flight, FAST, off(cast, degrees, range_m))
+    assert np.abs(errors_deg(cast, found)).max() < 0.05
+    assert abs(found["left"].value("range_offset_m") - cast.truth.value("range_offset_m")) < 0.3
+
+
+@pytest.mark.parametrize("seed", [2])
+def test_so_also_over_flat_ground_where_houses_are_all_there_is(seed: int) -> None:
+    flat = cast_flight(TERRAIN.format(relief=0.0), LINES, prf_hz=9_000.0, seed=seed)
+    signs = np.random.default_rng(seed).choice([-3.0, 3.0], 3).tolist()
+    found = prealign(flat.flight, FAST, off(flat, (signs[0], signs[1], signs[2])))
+    assert np.abs(errors_deg(flat, found)).max() < 0.05
+
+
+def test_afterwards_planes_are_found() -> None:
+    """From 1° off there are none that all see; aligned, the roofs of the scene."""
+    dense = cast_flight(TERRAIN.format(relief=8.0), LINES, prf_hz=16_000.0)
+    start = off(dense, (1.0, -1.0, -1.0), 2.0)
+    before = find_planes(dense.flight.placed(start))
+    found = prealign(dense.flight, FINE, start)
+    after = find_planes(dense.flight.placed(found))
+    roofs = [plane for plane in after.planes if plane.kind == "roof" and len(plane.patches) == 3]
+    assert len(roofs) > 30
+    assert sum(plane.kind == "roof" and len(plane.patches) == 3 for plane in before.planes) < 3
+
+
+def test_two_heads_are_aligned_together(cast: Cast) -> None:
+    """The second one flew the third line, with another mounting."""
+    flight = cast.flight
+    right = replace(flight.heads[0], name="right")
+    swaths = (*flight.swaths[:2], replace(flight.swaths[2], head=1))
+    two = Flight(flight.frame, (*flight.heads, right), flight.trajectories, swaths)
+    start = {"left": off(cast, (1.0, -1.0, 1.0))["left"], "right": off(cast, (-1.0, 0.5, 1.0))["left"]}
+    found = prealign(two, FINE, start)
+    assert np.abs(errors_deg(cast, {"left": found["left"]})).max() < 0.1
+    assert np.abs(errors_deg(cast, {"left": found["right"]})).max() < 0.1
+
+
+def test_control_says_how_high(cast: Cast) -> None:
+    """The true ground, 5 m of range off; one line flown twice shows no height, control does."""
+    flight = replace(cast.flight, swaths=cast.flight.swaths[:2])
+    bare = np.isin(cast.surface[0], (1, 4)) & (np.abs(cast.true_t[0][:, 1]) < 40.0)
+    control = cast.true_t[0][np.flatnonzero(bare)[:: int(bare.sum()) // 12]]
+    start = off(cast, (0.0, 0.0, 0.0), 5.0)
+    found = prealign(flight, FINE, start, control)
+    assert abs(found["left"].value("range_offset_m") - cast.truth.value("range_offset_m")) < 0.1
+
+
+def test_what_the_flight_does_not_show_stays_near_the_start() -> None:
+    """Over bare level ground, one line both ways: heading is not to be had, and is not invented."""
+    bare = cast_flight("height_m = 450.0", LINES[:2], prf_hz=5_000.0)
+    found = prealign(bare.flight, COARSE, off(bare, (2.0, 0.5, 0.5)))
+    roll, pitch, heading = errors_deg(bare, found)
+    assert abs(roll) < 0.02
+    assert abs(pitch) < 1.0
+    assert abs(heading) < 1.0
+
+
+def test_one_strip_only_is_told(cast: Cast) -> None:
+    with pytest.raises(PrealignError, match="got 1 swath, want at least two that overlap"):
+        prealign(replace(cast.flight, swaths=cast.flight.swaths[:1]), FAST)
+
+
+def test_no_overlap_is_told() -> None:
+    apart = cast_flight("height_m = 450.0", ((-1200, 0, -1000, 0, 850), (1000, 0, 1200, 0, 850)), prf_hz=3_000.0)
+    with pytest.raises(PrealignError, match="do not overlap"):
+        prealign(apart.flight, FAST)
+
+
+def test_no_points_are_told(cast: Cast) -> None:
+    late = tuple(replace(swath, time_ns=swath.time_ns + 10**15) for swath in cast.flight.swaths)
+    with pytest.raises(PrealignError, match="no points; want a trajectory"):
+        prealign(replace(cast.flight, swaths=late), FAST)
+
+
+def test_a_wrong_installation_is_told(cast: Cast) -> None:
+    """Ten degrees are no error of a mounting."""
+    with pytest.raises(PrealignError, match=r"left: \w+ came to .*° from the start; want the installation matrix"):
+        prealign(cast.flight, COARSE, off(cast, (0.0, 9.0, 0.0)))
+
+
+def test_a_surface_changes_as_moved_points_make_it() -> None:
+    """Against the same surface made of points that were moved: up, aside and tilted."""
+    draws = np.random.default_rng(1)
+    place = draws.uniform(0.0, 200.0, (60_000, 2))
+
+    def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 3.0 * np.sin(x / 25.0) + 2.0 * np.cos(y / 30.0)
+
+    points = np.column_stack([place, height(*place.T)])
+    motion = np.stack([np.tile([0.0, 0.0, 1.0], (60_000, 1)), np.tile([1.0, 0.5, 0.0], (60_000, 1))])
+    lattice = Lattice(0.0, 0.0, 4.0, 50, 50)
+    one = surface(lattice, points, motion, 8.0)
+    for index, by in ((0, 0.5), (1, 0.5)):
+        other = surface(lattice, points + by * motion[index], motion, 8.0)
+        _, a, b = np.intersect1d(one.cells, other.cells, return_indices=True)
+        change = other.height_m[b] - one.height_m[a]
+        assert len(a) > 1000
+        assert np.std(change - by * one.change[a, index]) < 0.12 * np.sqrt(np.mean(change**2))

@@ -1,0 +1,126 @@
+"""Redundancy, tests and groups: against a dense solution and printed values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.adjust import adjust
+from calib.features import Features
+from calib.normals import extras
+from calib.parameters import Wish, unknowns
+from calib.robust import huber_weight, least_detectable, least_shift, tau_critical, w_critical
+from calib.solve import Block, Settings, solved
+from calib.trajectory_errors import Taus, gauss_markov
+from tests.calib.printed import printed
+from tests.calib.roofs import LINES, made
+from tests.calib.test_adjust import controlled, in_planes
+from tests.calib.test_rows import design
+
+pytestmark = pytest.mark.xdist_group("kernels")
+PLAIN = Settings(huber=0.0, family=0.0)
+
+
+def test_printed_limits() -> None:
+    assert least_shift() == pytest.approx(4.13215, abs=1e-5)
+    for redundancy, printed_tau in ((10, 2.6786), (100, 3.22634), (1000, 3.28409)):
+        assert tau_critical(0.001, redundancy) == pytest.approx(printed_tau, abs=1e-5)
+    assert w_critical(10) == pytest.approx(3.2905, abs=1e-4)
+    assert w_critical(10_000_000) == pytest.approx(stats.norm.isf(0.05 / 2e7))
+    np.testing.assert_allclose(huber_weight(np.array([-3.0, 0.0, 1.4, 6.0])), [0.5, 1.0, 1.0, 0.25])
+    np.testing.assert_allclose(least_detectable(np.array([4.0]), np.array([0.25])), 4.13215 * 4.0, rtol=1e-5)
+
+
+def test_the_printed_huber_weight() -> None:
+    """Four times six steps with weights of the last solution; a blunder of 0.6 m gets 0.185."""
+    flight, features = printed().with_blunder().flight()
+    found = adjust(flight, features, Wish(), None, Settings(huber=1.5, family=0.0, rounds=0, tolerance=1e-3))
+    (residuals,) = found.residuals
+    worst = int(np.abs(residuals.normalised).argmax())
+    size = abs(float(residuals.misclosure_m[worst])) / float(residuals.sigma_m[worst])
+    assert huber_weight(np.array([size]))[0] == pytest.approx(0.18467852582257605, abs=2e-3)
+
+
+def test_redundancy_is_that_of_the_dense_solution() -> None:
+    built = made(lines=LINES[:4], points=5)
+    prior = gauss_markov(built.flight, Taus(), 5.0)
+    features = controlled(built)
+    block = Block.of(built.flight, features, unknowns(built.flight, Wish()), prior, None)
+    done = solved(block, replace(PLAIN, tolerance=1e-5), block.start())
+    rows, state = done.solution.rows, done.solution.state
+    columns, misclosure, variance, _ = design(rows, state)
+    u, q = rows.size, len(rows.planes)
+    whole = np.zeros((rows.count, u + 3 * q))
+    whole[:, :u] = columns
+    for row, (place, which) in enumerate(zip(*in_planes(rows, state), strict=True)):
+        whole[row, u + 3 * which : u + 3 * which + 3] = *place, 1.0
+    whole /= np.sqrt(variance)[:, np.newaxis]
+    more = np.zeros((10, u + 3 * q))
+    for row, extra in enumerate(extras(rows, state)):
+        more[row, u + 3 * extra.plane : u + 3 * extra.plane + 3] = extra.design
+    every = np.vstack([whole, more])
+    normal = every.T @ every
+    normal[4:u, 4:u] += done.solution.trajectory.normal
+    scale = 1 / np.sqrt(np.diag(normal))
+    cofactor = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    expected = 1.0 - np.einsum("ij,jk,ik->i", every, cofactor, every)
+    on_planes, on_control = done.quality.residuals
+    np.testing.assert_allclose(on_planes.redundancy, expected[:-10], atol=2e-6)
+    np.testing.assert_allclose(on_control.redundancy, expected[-10:], atol=1e-6)
+    w = -misclosure / np.sqrt(variance * expected[:-10])
+    np.testing.assert_allclose(on_planes.normalised, w, atol=1e-4)
+    assert done.quality.redundancy == pytest.approx(rows.count + 10 - 4 - 3 * q, abs=1e-3)
+    groups = {fit.group: fit for fit in done.quality.groups}
+    assert groups["trajectory"].redundancy == pytest.approx(6 * len(prior.time_ns) - np.trace(
+        done.solution.trajectory.normal @ cofactor[4:u, 4:u]
+    ), abs=1e-6)  # fmt: skip
+    assert groups["planes"].variance_factor * groups["planes"].redundancy == pytest.approx(
+        float((misclosure**2 / variance).sum()), rel=1e-5
+    )
+
+
+def test_variance_components_tell_which_group_is_worse() -> None:
+    """Points at 5 cm that say 1 cm."""
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    features, g = controlled(built), np.random.default_rng(3)
+    planes = list(features.planes)
+    for index in range(0, 25, 5):
+        points = tuple(
+            replace(point, position_t=point.position_t + np.array([0.0, 0.0, 0.05 * g.normal()]))
+            for point in planes[index].control
+        )
+        planes[index] = replace(planes[index], control=points)
+    found = adjust(built.flight, Features(tuple(planes)), Wish(), prior, PLAIN)
+    groups = {fit.group: fit for fit in found.groups}
+    assert groups["control"].variance_factor > 5.0
+    assert 0.9 < groups["planes"].variance_factor < 1.1
+
+
+def test_returns_that_are_no_points_count_for_nothing() -> None:
+    built = made(lines=LINES[:4])
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    head = replace(built.flight.heads[0], range_gate=(0.0, 850.0))
+    lost = sum(int((swath.rows["range_m"] + 0.18 > 850.0).sum()) for swath in built.flight.swaths)
+    found = adjust(replace(built.flight, heads=(head,)), built.features, Wish(), prior)
+    (residuals,) = found.residuals
+    assert lost > 10
+    assert abs(int((residuals.weight == 0.0).sum()) - lost) <= 1
+    assert np.isfinite(found.values).all()
+    assert 0.85 < found.variance_factor < 1.15
+
+
+def test_least_detectable_range_error_is_found_as_often_as_it_says() -> None:
+    """With 0.8 probability at |w| > 3.29: errors of that size in one range each."""
+    built = made(lines=LINES[:4])
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior, PLAIN)
+    (residuals,) = found.residuals
+    shift = least_detectable(residuals.sigma_m.astype(float) ** 2, residuals.redundancy.astype(float))
+    w = residuals.normalised + shift * np.sqrt(residuals.redundancy) / residuals.sigma_m
+    share = float((np.abs(w) > 3.2905).mean())
+    assert share == pytest.approx(0.8, abs=0.04)
+    assert 0.05 < found.least_detectable["range_m"] < 0.2

@@ -1,0 +1,248 @@
+"""The record holds what the dictionary asks for, or says that it is missing; and says the same twice."""
+
+from __future__ import annotations
+
+import io
+import json
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.record import NAMESPACE, RecordError, RecordInput, record_json, record_of, record_xml
+from calib.record_tables import CLASSES, ROWS
+from calib.record_values import utc_text
+from georef.beams import LineGeometry
+from georef.calibration import INDEX
+from georef.sensor_model import SensorModel
+from tests.calib.made_outcome import Outcome, made_outcome
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+# As the dictionary has them: class, then attributes that are mandatory.
+MANDATORY = {
+    "CA_CalibrationValidation": "calibrationType",
+    "CA_LidarCalibrationTestfield": "lidarNObjectPoints lidarObjectPoint lidarJPlane lidarPlaneParameters",
+    "CA_LidarCalComputation": "designMatrix1 designMatrix2 corrections1 corrections2 designMatrixObservations "
+    "residuals misclosure designMatrixUnitLength",
+    "CA_Frames": "timeRecording",
+    "CA_SFrame": "thetaTarget rhoTarget",
+    "CA_GeometryValidation": "validationMethod validationTime",
+    "CA_PhotoFlight": "numberOfPhotoFlights flyingHeight flyingAltitudeAboveGround terrainHeight alongStripOverlap "
+    "acrossStripOverlap numberOfStrips",
+    "CA_InteriorOrientation": "synchronization synchronizationError referenceTemperature versionFirmware "
+    "versionHardware",
+    "CA_SensorSystem": "relativePosition relativeAttitude operationalTemperature",
+    "CA_AuxiliaryDevice": "timeLeverarm leverarm errorLeverarm",
+    "CA_GNSS": "numberSatellites registrationCycle",
+    "CA_IMU": "boresightAngle dataRate attitudeAccuracy",
+    "CA_TestRange": "numberControlPoints numberCheckPoints",
+    "CA_PositionalError": "errorX errorY errorZ errorXY errorXYZ",
+    "CA_Documentation": "certificateIdentification dataProductLevel geometricQuality stabilizedPlatform",
+    "SD_Calibration": "calibrationAgency calibrationDate",
+}
+KEYS = {f"{owner}.{name}" for owner, names in MANDATORY.items() for name in names.split()}
+
+
+@pytest.fixture(scope="module")
+def outcome() -> Outcome:
+    """Small."""
+    return made_outcome(40_000)
+
+
+def given(outcome: Outcome, **more: Any) -> RecordInput:
+    """Of the one scanner."""
+    return RecordInput(outcome.flight, outcome.features, outcome.adjusted, "left", outcome.header, **more)
+
+
+def test_what_is_mandatory_is_there_or_said_to_be_missing(outcome: Outcome) -> None:
+    record = record_of(given(outcome))
+    assert KEYS == {row.key for row in ROWS if row.obligation == "M"}
+    assert KEYS <= record.values.keys() | set(record.missing)
+    assert not record.values.keys() & set(record.missing)
+    # What no flight can tell is not made up.
+    assert {
+        "CA_GNSS.numberSatellites",
+        "SD_Calibration.calibrationAgency",
+        "CA_GeometryValidation.validationMethod",
+        "CA_LidarCalComputation.corrections2",
+        "CA_PositionalError.errorX",
+        "CA_TestRange.numberCheckPoints",
+    } <= set(record.missing)
+    assert {"CA_SFrame.rhoTarget", "CA_LidarCalComputation.designMatrix1"} <= record.values.keys()
+    assert {row.owner for row in ROWS} == {owner.name for owner in CLASSES}
+
+
+def test_uncertain_names_are_flagged(outcome: Outcome) -> None:
+    """Rows 1 to 24 of the dictionary were at hand, and nothing after them."""
+    doubtful = {row.owner for row in ROWS if not row.confirmed}
+    assert doubtful == {"CA_BFrame", "CA_LFrame", "CA_Intensity", "CA_ErrorModel"}
+    assert not any(row.obligation for row in ROWS if not row.confirmed)
+    root = ET.fromstring(record_xml(record_of(given(outcome))))
+    flags = {
+        (one.get("name"), attribute.get("name")): attribute.get("confirmed")
+        for one in root.iter(f"{{{NAMESPACE}}}class")
+        for attribute in one
+    }
+    assert flags["CA_BFrame", "leverArm"] == "false"
+    assert flags["CA_SFrame", "thetaTarget"] == "true"
+
+
+def from_json(text: str) -> dict[str, Any]:
+    """Flat: path → word."""
+    document = json.loads(text)
+    found: dict[str, Any] = {"id": document["id"], "version": str(document["version"])}
+    found["missing"] = [f"{one['class']}.{one['name']}" for one in document["missing"]]
+    for owner in document["classes"]:
+        for attribute in owner["attributes"]:
+            key = f"{owner['name']}.{attribute['name']}"
+            for name, word in attribute.items():
+                if name == "value":
+                    found[key] = [str(one) for one in (word if isinstance(word, list) else [word])]
+                elif name == "values":
+                    found[f"{key}.rows"] = word
+                elif name == "matrix":
+                    found |= {f"{key}.matrix.{k}": str(v) for k, v in word.items()}
+                else:
+                    found[f"{key}@{name}"] = str(word).lower() if isinstance(word, bool) else word
+    return found
+
+
+def from_xml(text: str) -> dict[str, Any]:
+    """Likewise."""
+    root = ET.fromstring(text)
+    space = {"cr": NAMESPACE}
+    found: dict[str, Any] = {"id": root.get("id"), "version": root.get("version")}
+    missing = root.findall("cr:missing/cr:attribute", space)
+    found["missing"] = [f"{one.get('class')}.{one.get('name')}" for one in missing]
+    for owner in root.findall("cr:class", space):
+        for attribute in owner:
+            key = f"{owner.get('name')}.{attribute.get('name')}"
+            found |= {f"{key}@{name}": word for name, word in attribute.attrib.items()}
+            values = [one.text or "" for one in attribute.findall("cr:value", space)]
+            rows = [[float(x) for x in (one.text or "").split()] for one in attribute.findall("cr:row", space)]
+            found |= {key: values} if values else {}
+            found |= {f"{key}.rows": rows} if rows else {}
+            for matrix in attribute.findall("cr:matrix", space):
+                found |= {f"{key}.matrix.{k}": v for k, v in matrix.attrib.items()}
+    return found
+
+
+def test_json_and_xml_say_the_same(outcome: Outcome) -> None:
+    told = {
+        "CA_GNSS.numberSatellites": 14,
+        "SD_Calibration.calibrationAgency": "Geo & <Sons> «Zürich»",
+        "CA_AuxiliaryDevice.leverarm": (0.12, -0.4, 1.0 / 3.0),
+        "CA_AuxiliaryDevice.errorLeverarm": 0.004,
+    }
+    record = record_of(given(outcome, told=told, settings={"Swath": "0.1.0"}, attachment="left.npz"))
+    assert from_xml(record_xml(record)) == from_json(record_json(record))
+    flat = from_json(record_json(record))
+    assert flat["CA_GNSS.numberSatellites"] == ["14"]
+    assert flat["SD_Calibration.calibrationAgency"] == ["Geo & <Sons> «Zürich»"]
+    assert float(flat["CA_AuxiliaryDevice.leverarm"][2]) == 1.0 / 3.0
+    assert record_xml(record) == record_xml(record)
+    assert "CA_GNSS.numberSatellites" not in flat["missing"]
+
+
+def test_large_matrices_are_told_and_attached(outcome: Outcome) -> None:
+    record = record_of(given(outcome, attachment="left.npz"))
+    held = io.BytesIO()
+    attached: dict[str, Any] = record.arrays()
+    np.savez_compressed(held, **attached)
+    held.seek(0)
+    arrays = np.load(held)
+    flat = from_json(record_json(record))
+    key = "CA_LidarCalComputation.designMatrix1"
+    assert flat[f"{key}.matrix.attachment"] == "left.npz"
+    assert f"{key}.rows" not in flat
+    table = arrays[flat[f"{key}.matrix.array"]]
+    assert table.shape == (int(flat[f"{key}.matrix.rows"]), 16)
+    assert float(flat[f"{key}.matrix.rms"]) == pytest.approx(float(np.sqrt(np.mean(table**2))), rel=1e-12)
+    assert flat["CA_LidarCalibrationTestfield.lidarNObjectPoints"] == [str(len(table))]
+    # Small ones stand in the record whole.
+    assert len(flat["CA_LidarCalComputation.corrections1.rows"][0]) == len(outcome.adjusted.names)
+
+
+def test_matrices_are_the_derivatives_they_claim(outcome: Outcome) -> None:
+    """A1 and B against differences of the sensor model itself, on the first plane's returns."""
+    arrays = record_of(given(outcome)).arrays()
+    group = outcome.adjusted.residuals[0]
+    row = int(np.flatnonzero(group.weight > 0.0)[0])
+    plane, swath = outcome.features.planes[group.feature[row]], outcome.flight.swaths[group.swath[row]]
+    at = group.at[row : row + 1]
+    calibration = outcome.adjusted.calibrations["left"]
+    normal_e = plane.normal_t @ outcome.flight.frame.rot_t_from_e
+
+    def off(changed: Any, rows: Any) -> float:
+        model = SensorModel(changed, LineGeometry())
+        rays = model.rays(rows, swath.time_ns[at], outcome.flight.trajectories[0], encoder_rate=np.zeros(1),
+                          encoder_acceleration=np.zeros(1))  # fmt: skip
+        return float(rays.points_e[0] @ normal_e)
+
+    rows = swath.rows[at]
+    for name, step in {"omega_rad": 1e-5, "phi_rad": 1e-5, "range_offset_m": 1e-2, "lever_arm_y_m": 1e-2}.items():
+        value = calibration.value(name)
+        slope = (
+            off(calibration.changed(**{name: value + step}), rows)
+            - off(calibration.changed(**{name: value - step}), rows)
+        ) / (2 * step)
+        assert arrays["designMatrix1"][0, INDEX[name]] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+    longer = rows.copy()
+    longer["range_m"] += 0.01
+    assert arrays["designMatrixObservations"][0, 6] == pytest.approx(
+        (off(calibration, longer) - off(calibration, rows)) / 0.01, abs=1e-5
+    )
+    # v of range and angle together close the misclosure: B v = e.
+    share = float(np.sum(arrays["designMatrixObservations"][0, 6:] ** 2 * [0.02**2, 2e-5**2])) / group.sigma_m[row] ** 2
+    closed = float(arrays["designMatrixObservations"][0] @ arrays["residuals"][0])
+    assert closed == pytest.approx(group.misclosure_m[row] * share, rel=1e-9)
+    np.testing.assert_allclose(arrays["misclosure"][0], -group.misclosure_m[row])
+    place_t = outcome.flight.frame.t_from_e(arrays["lidarObjectPoint"][:1])
+    np.testing.assert_allclose(place_t, outcome.flight.place(swath, calibration, at), atol=1e-8)
+    plane_e = arrays["lidarPlaneParameters"][group.feature[row]]
+    assert abs(plane_e[:3] @ arrays["lidarObjectPoint"][0] + plane_e[3]) < 0.15
+
+
+def test_figures_of_the_flight(outcome: Outcome) -> None:
+    """Flown at 750 m over ground at 450 m and roofs; level, at the turn of the wave at most 0.6°."""
+    record = record_of(given(outcome))
+    number = {key: value.content for key, value in record.values.items()}
+    assert number["CA_PhotoFlight.terrainHeight"] == pytest.approx(450.0, abs=2.0)
+    assert number["CA_PhotoFlight.flyingAltitudeAboveGround"] == pytest.approx(300.0, abs=2.0)
+    assert number["CA_PhotoFlight.numberOfStrips"] == 5
+    arrays = record.arrays()
+    assert np.nanmax(np.abs(arrays["attitudeBodyLocal"][:, 0])) < np.radians(0.61)
+    np.testing.assert_allclose(arrays["ellipsoidalHeight"], 750.0, atol=0.2)
+    np.testing.assert_allclose(np.degrees(arrays["phiLocal"]), 47.18, atol=0.01)
+    assert number["CA_Frames.timeRecording"] == utc_text(1_447_000_000 * 10**9)
+
+
+def test_gps_time_as_utc() -> None:
+    """GPS week 2000 began on 2018-05-06, 18 leap seconds ahead of UTC."""
+    assert utc_text(2000 * 604_800 * 10**9) == "2018-05-05T23:59:42Z"
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"CA_GNSS.satellites": 9}, "CA_GNSS.numberSatellites"),
+        ({"CA_GNSS.numberSatellites": "nine"}, "whole number"),
+        ({"CA_GeometryValidation.validationMethod": "crossstrip"}, "crossStripFlight"),
+        ({"CA_AuxiliaryDevice.errorLeverarm": "4 mm"}, "metres"),
+    ],
+)
+def test_what_is_told_wrongly(outcome: Outcome, told: dict[str, Any], message: str) -> None:
+    with pytest.raises(RecordError, match=message) as caught:
+        record_of(given(outcome, told=told))
+    assert "\n" not in str(caught.value)
+
+
+def test_validation_methods_may_be_several(outcome: Outcome) -> None:
+    told = {
+        "CA_GeometryValidation.validationMethod": "testfield, secondFlight",
+        "CA_GeometryValidation.validationTime": "2026-11-21T12:00:00Z",
+    }
+    record = record_of(given(outcome, told=told))
+    assert "CA_GeometryValidation.validationMethod" not in record.missing

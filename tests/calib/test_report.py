@@ -1,0 +1,365 @@
+"""The report says what was found, in figures that are those of the input, and holds together without a network."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from calib.features import Features
+from calib.outcome import Adjusted, ControlFit, GroupFit, Held
+from calib.report import PairDifference, Profile, ReportInput, html, judge, pdf
+from calib.report_canvas import NARROW, PAPER
+from calib.report_cut_plots import cuts_of
+from calib.report_map_plots import plane_rms_cm
+from calib.report_pdf import width_in, wrapped
+from calib.report_residual_plots import residual_picture, seen_of
+from calib.report_tables import entries_table, held_table, parameter_tables
+from calib.report_verdict import Level
+from calib.report_words import decimals_of, degrees, length, number, plain, share, unknown
+from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+
+@pytest.fixture(scope="module")
+def outcome() -> Outcome:
+    """Of 40 000 returns a strip."""
+    return made_outcome(40_000)
+
+
+@pytest.fixture(scope="module")
+def report(outcome: Outcome) -> ReportInput:
+    """With everything."""
+    return made_report(outcome)
+
+
+@pytest.fixture(scope="module")
+def page(report: ReportInput) -> str:
+    """The page."""
+    return html(report)
+
+
+def sound(report: ReportInput, **changes: Any) -> ReportInput:
+    """Without the bad control point, the correlated pair and what is not determined; then changed."""
+    adjusted = report.adjusted
+    correlation = np.eye(len(adjusted.names))
+    plain = replace(adjusted, control=adjusted.control[:4], correlation=correlation, held=())
+    return replace(report, adjusted=replace(plain, **changes))
+
+
+def test_verdict_of_a_good_calibration(report: ReportInput) -> None:
+    verdict = judge(sound(report))
+    assert verdict.level is Level.GOOD
+    assert not verdict.reasons
+    # κ is the least certain: 2.4e-5 rad; 4.1 mm; ten pairs of 1.4 to 2.6 cm
+    assert re.fullmatch(
+        r"Good: boresight to 0\.0014°, range offset to 4\u00a0mm; strips agree to (\d\.\d)\u00a0cm \(RMS of height "
+        r"differences\)\.",
+        verdict.sentence,
+    )
+
+
+def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
+    held = (Held("left", "lever_arm_z_m", "why", "control"), Held("left", "lever_arm_x_m", "at the user's word"))
+    verdict = judge(sound(report, held=held))
+    assert verdict.level is Level.GOOD
+    assert verdict.sentence.endswith("Not determined by this flight: lever arm z.")
+    # A boresight angle that is not determined is a reason, and all three are the end of it.
+    pitch = Held("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
+    verdict = judge(sound(report, held=(pitch,)))
+    assert verdict.level is Level.CARE
+    assert "does not determine boresight φ (pitch)" in verdict.sentence
+    every = tuple(replace(pitch, name=name) for name in ("omega_rad", "phi_rad", "kappa_rad"))
+    assert judge(sound(report, held=every)).level is Level.UNUSABLE
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "words"),
+    [
+        ({"converged": False}, Level.UNUSABLE, "did not converge"),
+        ({"redundancy": 4.0}, Level.UNUSABLE, "only 4 observations beyond"),
+        ({"variance_factor": 3.0}, Level.CARE, "variance factor 3"),
+        ({"variance_factor": 0.1}, Level.CARE, "far smaller"),
+        ({"variance_factor": math.nan}, Level.UNUSABLE, "variance factor –"),
+        (
+            {"sigmas": np.array([2e-4, 1e-5, 1e-5, 0.004, 1e-5, 1e-6, 1e-4])},
+            Level.CARE,
+            "boresight ω (roll) is known to",
+        ),
+        ({"sigmas": np.array([1e-5, 1e-5, 1e-5, 0.9, 1e-5, 1e-6, 1e-4])}, Level.UNUSABLE, "range offset is known to"),
+        ({"groups": (GroupFit("planes", 100, 90.0, 1.0, 0.02, 8),)}, Level.CARE, "8.00 % of the observations"),
+        ({"prior_sigmas": np.array([1e-4] + [np.inf] * 6)}, Level.UNUSABLE, "has moved 43.9 times"),
+        ({"control": (ControlFit("K9", 0.05, 0.01, -5.0, {}),)}, Level.CARE, "K9 (5.0\u00a0cm) is 5.0 sigmas off"),
+        ({"control": (ControlFit("K9", 0.0, 0.01, 0.1, {"left.phi_rad": -2.0}),)}, Level.CARE, "moves boresight φ"),
+    ],
+)
+def test_what_is_wrong_is_a_reason(report: ReportInput, changes: dict[str, Any], level: Level, words: str) -> None:
+    verdict = judge(sound(report, **changes))
+    assert verdict.level is level
+    assert words in verdict.sentence
+    assert all(reason.change for reason in verdict.reasons)
+
+
+def test_strips_that_became_worse(report: ReportInput) -> None:
+    pair = ("01", "02")
+    before, after = {pair: PairDifference(0.0, 0.02, 0.02, 0.1, 10)}, {pair: PairDifference(0.0, 0.09, 0.09, 0.3, 10)}
+    words = [reason.what for reason in judge(replace(sound(report), before=before, after=after)).reasons]
+    assert words[0].startswith("strips agree worse than before (2.0\u00a0cm before, 9.0\u00a0cm after)")
+    assert words[1].startswith("strips differ by 9.0\u00a0cm")
+
+
+def test_the_worst_comes_first(report: ReportInput) -> None:
+    """Of equal levels, by how far beyond the limit."""
+    points = tuple(ControlFit(f"K{w}", 0.01 * w, 0.01, float(w)) for w in (4, 9, 6))
+    verdict = judge(sound(report, control=points, variance_factor=2.1))
+    assert [reason.what.split()[2] for reason in verdict.reasons[:3]] == ["K9", "K6", "K4"]
+    assert "3 more reasons below" in verdict.sentence
+
+
+def test_trajectory_corrections_beyond_their_sigmas(report: ReportInput) -> None:
+    fit = report.adjusted.trajectory
+    assert fit is not None
+    large = replace(fit, position_l=np.full_like(fit.position_l, 0.02) * 2.0)
+    reasons = judge(sound(report, trajectory=large)).reasons
+    assert [reason.what for reason in reasons] == [
+        "corrections of the trajectory's positions are 1.8 times what its sigmas let expect"
+    ]
+
+
+class Seen(HTMLParser):
+    """What a page refers to, and the words it shows."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.words: list[str] = []
+        self._in_style = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self._in_style = tag == "style"
+        self.addresses += [value or "" for key, value in attrs if key in ("src", "href", "srcset", "data")]
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in_style = False
+
+    def handle_data(self, data: str) -> None:
+        if not self._in_style:
+            self.words.append(data)
+
+
+def test_the_page_needs_no_network(page: str) -> None:
+    seen = Seen(page)
+    assert seen.addresses
+    assert all(address.startswith("data:image/svg+xml;base64,") for address in seen.addresses)
+    assert not seen.tags["script"] + seen.tags["link"] + seen.tags["iframe"]
+    assert "@import" not in page
+    assert "url(" not in page
+    for address in seen.addresses:
+        svg = base64.b64decode(address.partition(",")[2]).decode()
+        assert ET.fromstring(svg).tag == "{http://www.w3.org/2000/svg}svg"
+        assert not re.search(r"href=[\"']https?:", svg)
+    assert len(page) < 5_000_000
+
+
+def test_the_page_has_all_its_parts(page: str) -> None:
+    titles = re.findall(r"<h2>(.*?)</h2>", page)
+    assert titles == [
+        "Reasons",
+        "Parameters",
+        "Correlations",
+        "Not determined by this flight",
+        "Strips and planes",
+        "Strips against each other",
+        "Difference maps",
+        "Profiles",
+        "Roll from strips 01 and 02",
+        "Residuals",
+        "Normalised residuals",
+        "Outliers",
+        "Control",
+        "Corrections of the trajectory",
+        "How it was computed",
+        "Fit by group of observations",
+        "Smallest errors that would be found",
+        "Software and settings",
+        "Inputs",
+    ]
+    words = " ".join(Seen(page).words)
+    for told in ("9f" * 32, "VQ-780 S2221234", "not post-processed", "curved or rough", "Gauss–Helmert", "converged"):
+        assert told in words
+
+
+def test_the_same_input_gives_the_same_picture(report: ReportInput) -> None:
+    """Shaded columns are an image within the picture: they too."""
+    first, second = residual_picture(report), residual_picture(report)
+    assert first is not None
+    assert second is not None
+    assert first.svg(NARROW) == second.svg(NARROW)
+
+
+def test_parameters_stand_as_the_file_has_them(report: ReportInput) -> None:
+    (table,) = parameter_tables(report)
+    rows = {row[0]: dict(zip(table.heads, row, strict=True)) for row in table.rows}
+    kappa = rows["boresight κ (heading)"]
+    # 0.611° and 0.4 of 2.4e-5 rad
+    assert (kappa["unit"], kappa["estimate"], kappa["sigma"], kappa["start"]) == ("°", "0.6116", "0.0014", "0.0000")
+    assert kappa["change / sigma"] == f"{(math.radians(0.611) + 0.4 * 2.4e-5) / 2.4e-5:.0f}"
+    assert rows["time offset"]["estimate"] == "76"  # 0.4 · 190 µs
+    assert rows["time offset"]["change / sigma"] == "0.4 ·"
+    held = [table.rows[i][0] for i in sorted(table.pale)]
+    assert held == ["scan plane tilt Δη", "lever arm x", "lever arm y", "lever arm z"]
+    assert rows["lever arm x"]["change"] == "held"
+    assert rows["lever arm z"]["change"] == "not determined"
+
+
+def test_what_is_not_determined_comes_with_its_remedy(report: ReportInput) -> None:
+    table = held_table(report)
+    assert table is not None
+    assert [row[0] for row in table.rows] == ["lever arm z", "scan plane tilt Δη"]
+    assert table.rows[0][1:3] == ["0.13 m", "range offset (−0.97)"]
+    assert table.rows[1][1] == "none"
+    late = Held("left", "time_offset_s", "why", "a second speed", 9.757e-4)
+    again = held_table(replace(report, adjusted=replace(report.adjusted, held=(late,))))
+    assert again is not None
+    assert again.rows[0][1] == "976 µs"
+
+
+def test_residuals_by_what_they_may_depend_on(report: ReportInput) -> None:
+    """Outliers are left out; strip 04 stands 6 mm higher, as it was made."""
+    seen = seen_of(report)
+    kept = sum(int((one.weight > 0).sum()) for one in report.adjusted.residuals if one.group != "control")
+    assert len(seen.misclosure_m) == kept
+    means = [seen.misclosure_m[seen.swath == index].mean() for index in range(5)]
+    assert means[3] - np.mean(means[:3]) == pytest.approx(0.006, abs=0.0015)
+    assert np.abs(seen.angle_deg).max() <= 30.0
+    row = int(np.flatnonzero(report.adjusted.residuals[0].weight > 0)[0])
+    group = report.adjusted.residuals[0]
+    first = report.flight.swaths[group.swath[row]].rows[group.at[row]]
+    assert (first["range_m"], first["intensity"]) == (seen.range_m[0], seen.intensity[0])
+
+
+def test_planes_are_coloured_by_their_own_residuals(report: ReportInput) -> None:
+    rms_cm = plane_rms_cm(report)
+    group = report.adjusted.residuals[0]
+    mine = group.misclosure_m[(group.feature == 7) & (group.weight > 0)]
+    assert rms_cm[7] == pytest.approx(100 * math.sqrt(float(np.mean(mine**2))))
+    assert rms_cm[7] < 4.0  # its outliers of 12 cm and more are out
+
+
+def test_cuts_show_the_roof_once_calibrated(report: ReportInput) -> None:
+    """Before, strips stand metres apart; after, all lie on the roof's slope."""
+    cuts = cuts_of(report)
+    assert len(cuts) == 3
+
+    def off_m(points: Any) -> float:
+        on = np.concatenate([place[np.abs(place[:, 0]) < 3.0] for place in points.values()])
+        return float(np.sqrt(np.mean((on[:, 1] + RISE * on[:, 0]) ** 2)))
+
+    for cut in cuts:
+        assert off_m(cut.after) < 0.05
+        assert off_m(cut.before) > 0.3
+
+
+def bare_of(report: ReportInput, **more: Any) -> ReportInput:
+    """No planes, ties, control, corrections of the trajectory or strips."""
+    adjusted = replace(
+        report.adjusted, residuals=(), groups=(), control=(), trajectory=None, least_detectable={}, spectrum=np.zeros(0)
+    )
+    return ReportInput(report.flight, Features(), adjusted, {}, **more)
+
+
+def test_a_report_of_little(report: ReportInput) -> None:
+    """What is there is shown, the words of others as words; and the same each time."""
+    bare = bare_of(report, title="<b>A & B</b>", notes=["<script>x</script>"])
+    text = html(bare)
+    assert text == html(bare)
+    assert "<h2>Parameters</h2>" in text
+    assert "the sigmas here are too small" in text
+    assert "errors of the trajectory included" not in text
+    assert "<h2>Control</h2>" not in text
+    assert "<script>" not in text
+    assert "<h1>&lt;b&gt;A &amp; B&lt;/b&gt;</h1>" in text
+
+
+def test_two_scanners(report: ReportInput) -> None:
+    """Each has a table, and words say whose a parameter is."""
+    adjusted = report.adjusted
+    right = replace(adjusted.calibrations["left"], scanner="right")
+    both: Adjusted = replace(
+        adjusted,
+        calibrations={"left": adjusted.calibrations["left"], "right": right},
+        names=(
+            *adjusted.names[:3],
+            "right.omega_rad",
+            "right.ibrc.3",
+            "right.beam.12.azimuth_rad",
+            "right.range_offset_m",
+        ),
+        held=(Held("right", "phi_rad", "why", "slopes", math.inf, (("left.phi_rad", 0.97),)),),
+    )
+    two = replace(report, adjusted=both, headers={"left": report.headers["left"], "right": report.headers["left"]})
+    assert [table.title for table in parameter_tables(two)] == ["Parameters of left", "Parameters of right"]
+    assert "boresight φ (pitch) of right" in judge(two).sentence
+    entries = entries_table(two)
+    assert entries is not None
+    assert [row[0] for row in entries.rows] == ["right: IBRC 3", "right: beam 12 azimuth"]
+    assert "<title>Calibration of left and right, HB-ABC/left/2026-03</title>" in html(bare_of(two, title=two.heading))
+
+
+def test_pdf(report: ReportInput) -> None:
+    """Pages of A4, with the profile's figure when there is one; the same bytes each time."""
+    bare = bare_of(report, notes=["$100 & <b>"])
+    assert pdf(bare) == pdf(bare)
+    drawn = Profile("Roll", "words", "<svg xmlns='http://www.w3.org/2000/svg'/>", lambda: Figure(figsize=(8.0, 3.0)))
+    file = pdf(replace(report, profiles=[drawn]))
+    assert file.startswith(b"%PDF-")
+    assert 6 <= len(re.findall(rb"/Type /Page\b", file)) <= 16
+    boxes = re.findall(rb"/MediaBox \[ ([\d. ]+)\]", file)
+    assert {tuple(round(float(x)) for x in box.split()) for box in boxes} == {(0, 0, 595, 842)}
+    assert b"CreationDate" not in file
+    # 8 × 3 inches at 220 points an inch
+    assert re.search(rb"/Width 1760\b", file)
+
+
+def test_lines_of_the_pdf_fit() -> None:
+    words = "Points of one plane in several strips fulfil n · x = d, " * 5 + "ab12" * 60
+    for line in wrapped(words, 3.0):
+        assert 0.0 < width_in(line) <= 3.0
+    assert "".join(wrapped(words, 3.0)).replace(" ", "") == words.replace(" ", "")
+    assert width_in("mm") == pytest.approx(2 * width_in("m"))
+    assert PAPER.width_in < 8.27
+
+
+def test_numbers_as_people_read_them() -> None:
+    assert [length(x) for x in (1.764, 0.0181, 0.0041, 0.0004, math.nan)] == [
+        "1.76\u00a0m",
+        "1.8\u00a0cm",
+        "4\u00a0mm",
+        "0.4\u00a0mm",
+        "–",
+    ]
+    assert degrees(0.00091) == "0.0009°"
+    assert degrees(0.0137) == "0.0137°"
+    assert number(-0.0001, ".2f") == "0.00"
+    assert number(-1.5, "+.1f") == "−1.5"
+    assert [decimals_of(x) for x in (0.0041, 18.0, 0.96)] == [4, 0, 2]
+    assert [share(x) for x in (0.0, 1e-6, 0.0036)] == ["0 %", "< 0.01 %", "0.36 %"]
+    assert unknown("left.ibrc.3").words == "IBRC 3"
+    told = "cannot tell it from left.range_offset_m (correlation -0.9), nor left.omega_rad."
+    assert plain(told, several=False) == "cannot tell it from range offset (correlation -0.9), nor boresight ω (roll)."
+    assert plain("left.phi_rad", several=True) == "boresight φ (pitch) of left"
+    assert unknown("right.beam.12.elevation_rad").unit == "°"
+    assert unknown("left.torsion_s2").factor == pytest.approx(1e12)

@@ -1,0 +1,161 @@
+"""Signatures: the effects of FORMULAS 5.3 against printed numbers and central differences; what a wrong calibration
+leaves in the strips is found with its size, and what is not there is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.effects import NAMES, SeenFrom, effect_columns
+from calib.flight import Flight
+from calib.signatures import Signature, record_of, signatures
+from calib.strip_cells import StripRules
+from calib.strips import differences
+from georef.jacobian import parameter_columns_e
+from tests.calib.cast_flight import Cast, cast_flight
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+RULES = StripRules(most_cells=3000)
+
+
+@pytest.fixture(scope="module")
+def made() -> Cast:
+    """Four lines over a village at 400 m, no error at all but the noise of single returns."""
+    return cast_flight(prf_hz=20_000.0, true={})
+
+
+def found_in(flight: Flight) -> dict[str, Signature]:
+    """By name."""
+    found = signatures(differences(flight, RULES).checks, SeenFrom.of(flight)).found
+    assert tuple(one.effect.name for one in found) == NAMES
+    return {one.effect.name: one for one in found}
+
+
+def wrong(made: Cast, **values: float) -> Flight:
+    """Placed with a calibration that is wrong by so much."""
+    return made.flight.placed({"left": made.truth.changed(**values)})
+
+
+def test_columns_are_those_of_the_sensor_model(made: Cast) -> None:
+    flight = made.flight
+    swath, head = flight.swaths[2], flight.heads[0]
+    at = np.arange(100, len(swath), 5000)
+    rays = flight.rays(swath, head.start, at)
+    model, trajectory = head.model(head.start), flight.trajectories[0]
+    from_model = parameter_columns_e(rays, model, trajectory) @ flight.frame.rot_t_from_e.T
+    strip, direction = np.full(len(at), 2), np.ones(len(at))
+    seen = replace(SeenFrom.of(flight), scan_rate=[7.0] * 4)
+    columns, errors = effect_columns(swath.points_t[at], strip, swath.time_ns[at], direction, seen)
+    by_model = {"roll": 0, "pitch": 1, "heading": 2, "torsion": 6, "time": 11, "range": 3}
+    for name, column in by_model.items():
+        assert columns[:, NAMES.index(name)] == pytest.approx(from_model[:, column], rel=2e-3, abs=0.2)
+    latency = 7.0 * columns[:, NAMES.index("roll")]  # θ̇ τ moves a beam as a roll of −θ̇ τ does
+    assert columns[:, NAMES.index("scan direction")] == pytest.approx(-latency, rel=1e-2, abs=30.0)
+    assert errors[:, 3:] == pytest.approx(columns[:, :3])
+    assert errors[:, :3] == pytest.approx(np.broadcast_to(np.eye(3), errors[:, :3].shape))
+
+
+def test_a_true_calibration_shows_nothing(made: Cast) -> None:
+    whole = signatures(differences(made.flight, RULES).checks, SeenFrom.of(made.flight))
+    for one in whole.found:
+        assert one.level in ("none", "not told")
+    levels = {one.effect.name: one.level for one in whole.found}
+    assert [levels[name] for name in ("roll", "pitch", "heading", "torsion")] == ["none"] * 4
+    assert levels["scan direction"] == "not told"
+    assert whole.variance_factor == pytest.approx(0.93, abs=0.1)  # Huber's weights take from the tails
+    assert whole.left_rms_m == pytest.approx(whole.rms_m, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "error"),
+    [
+        ("roll", "omega_rad", 2.5e-4),
+        ("pitch", "phi_rad", -4.0e-4),
+        ("heading", "kappa_rad", 9.0e-4),
+        ("torsion", "scan_angle_scale", 1.5e-3),
+        ("time", "time_offset_s", 2.0e-3),
+    ],
+)
+def test_a_wrong_parameter_is_found_with_the_size_that_mends_it(
+    made: Cast, name: str, parameter: str, error: float
+) -> None:
+    found = found_in(wrong(made, **{parameter: error}))
+    one = found[name]
+    assert one.level == "significant"
+    assert one.value == pytest.approx(-error, abs=3.5 * one.sigma)
+    assert abs(one.value) > 5.0 * one.sigma
+    assert f"to {parameter}" in one.words
+    for other in found.values():
+        assert other is one or other.level in ("none", "not told", "small"), other.words
+
+
+def test_several_at_once_are_told_apart(made: Cast) -> None:
+    errors = {"omega_rad": -2e-4, "phi_rad": 3e-4, "kappa_rad": 8e-4}
+    flight = wrong(made, **errors)
+    whole = signatures(differences(flight, RULES).checks, SeenFrom.of(flight))
+    for one, error in zip(whole.found[:3], errors.values(), strict=True):
+        assert one.value == pytest.approx(-error, abs=3.5 * one.sigma)
+        assert one.level == "significant"
+    assert whole.left_rms_m < 0.5 * whole.rms_m
+
+
+def test_the_scan_direction_is_found_where_the_encoder_tells_it(made: Cast) -> None:
+    """A mirror to and fro: every other sweep backwards, points of a latency of 8 µs at ±3 rad/s."""
+    rate = 3.0
+    swaths = []
+    for number, swath in enumerate(made.flight.swaths):
+        back = np.where((swath.time_ns // 20_000_000) % 2, 1.0, -1.0)
+        with_rate = replace(swath, encoder_rate=rate * back)
+        seen = replace(SeenFrom.of(made.flight), scan_rate=[rate] * 4)
+        columns, _ = effect_columns(swath.points_t, np.full(len(swath), number), swath.time_ns, back, seen)
+        moved = swath.points_t + 8e-6 * columns[:, NAMES.index("scan direction")]
+        swaths.append(replace(with_rate, points_t=moved))
+    one = found_in(replace(made.flight, swaths=tuple(swaths)))["scan direction"]
+    assert one.value == pytest.approx(-8e-6, abs=3.5 * one.sigma)
+    assert abs(one.value) > 5.0 * one.sigma
+
+
+def test_errors_of_strips_alone_are_not_taken_for_a_calibration(made: Cast) -> None:
+    """Strips shifted as their trajectory's 2 cm allow: within three sigmas of nothing."""
+    shifts = np.random.default_rng(1).normal(0.0, 0.02, (4, 3))
+    swaths = [
+        replace(swath, points_t=swath.points_t + shift) for swath, shift in zip(made.flight.swaths, shifts, strict=True)
+    ]
+    found = found_in(replace(made.flight, swaths=tuple(swaths)))
+    assert [one.words for one in found.values() if one.level == "significant"] == []
+    assert found["pitch"].sigma > math.radians(0.001)
+
+
+def test_parallel_lines_over_flat_ground_do_not_tell_pitch_and_heading() -> None:
+    flat = "height_m = 450.0\nrelief_m = 0.0"
+    lines = ((-200, 0, 200, 0, 850), (200, 40, -200, 40, 850))
+    made = cast_flight(flat, lines, prf_hz=15_000.0, true={})
+    found = found_in(made.flight)
+    assert found["roll"].level == "none"
+    assert found["pitch"].level == "not told"
+    assert "opposite lines over slopes or roofs" in found["pitch"].words
+    assert found["heading"].level == "not told"
+    assert math.isnan(found["heading"].value)
+
+
+def test_too_few_differences_tell_nothing_and_the_record_has_no_number(made: Cast) -> None:
+    checks = differences(made.flight, RULES).checks.take(slice(0, 5))
+    whole = signatures(checks, SeenFrom.of(made.flight))
+    assert {one.level for one in whole.found} == {"not told"}
+    effects = record_of(whole)["effects"]
+    assert isinstance(effects, list)
+    assert all(effect["value"] is None for effect in effects)
+
+
+def test_checks_in_a_gap_of_the_trajectory_are_left_out(made: Cast) -> None:
+    checks = differences(made.flight, RULES).checks
+    late = checks.point_ns.copy()
+    late[::2] += 50_000_000_000
+    whole = signatures(replace(checks, point_ns=late), SeenFrom.of(made.flight))
+    assert whole.rows == len(checks) - len(late[::2])

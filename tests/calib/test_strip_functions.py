@@ -1,0 +1,158 @@
+"""Strip adjustment: errors put into single strips are found in these, with the model that they have, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import strip_functions
+from calib.features import ControlPoint, Features
+from calib.flight import Flight
+from calib.strip_functions import Settings, StripAdjusted, StripError, adjust_strips
+from calib.trajectory_errors import TrajectoryPrior, apply, knots_of
+from tests.calib.planned_flight import ONE_HEIGHT, flown, noised
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+TURN = float(np.radians(0.02))
+
+
+@pytest.fixture(scope="module")
+def clean() -> tuple[Flight, Features]:
+    flight, features = flown(ONE_HEIGHT)
+    return noised(flight, 3), features
+
+
+def spoilt(flight: Flight, strip: int, along: FloatArray, knot_s: float = 1.0) -> Flight:
+    """A strip whose trajectory lacks errors (k, 6) that lie evenly along it."""
+    knots = knots_of(flight, knot_s)
+    at = np.flatnonzero(knots.strip == strip)
+    errors = np.zeros((len(knots), 6))
+    places = np.linspace(0.0, 1.0, len(along))
+    errors[at] = np.stack([np.interp(np.linspace(0, 1, len(at)), places, column) for column in along.T], axis=1)
+    prior = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(6 * len(knots)))
+    return replace(flight, trajectories=(apply(flight.trajectories[0], 0, prior, -errors),))
+
+
+def adjusted(flight: Flight, features: Features, **settings: Any) -> StripAdjusted:
+    return adjust_strips(flight, features, flight.starts(), replace(Settings(), **settings))
+
+
+def off_planes(flight: Flight, features: Features, strip: int) -> float:
+    """Rms distance of a strip's returns from where the planes truly are."""
+    found = []
+    for plane in features.planes:
+        for patch in plane.patches:
+            swath = flight.swaths[patch.swath]
+            if swath.strip == strip:
+                points = flight.place(swath, flight.heads[0].start, patch.at)
+                found.append((points - swath.points_t[patch.at]) @ plane.normal_t)
+    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+
+def test_a_sound_flight_gets_no_corrections(clean: tuple[Flight, Features]) -> None:
+    """And its misclosures are as large as its noise."""
+    flight, features = clean
+    result = adjusted(flight, features)
+    assert [choice.model for choice in result.choices] == ["none"] * 6
+    assert [choice.strip for choice in result.choices] == [1, 2, 3, 4, 5, 6]
+    assert not result.fit.position_l.any()
+    assert result.parameters == 0.0
+    freedom = result.observations - 3 * len(features.planes)
+    factor = result.variance_after * result.observations / freedom
+    assert abs(factor - 1.0) < 4.0 * np.sqrt(2.0 / freedom)
+    np.testing.assert_array_equal(result.trajectories[0].position_e, flight.trajectories[0].position_e)
+
+
+def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Features]) -> None:
+    """A strip 15 cm too high and 10 cm beside, another whose roll drifts: both corrected, no other moved."""
+    flight, features = clean
+    shifted = np.tile([0.05, -0.1, 0.15, 0.0, 0.0, 0.0], (2, 1))
+    drifting = np.array([[0.0, 0.0, 0.0, -TURN, 0.0, 0.0], [0.0, 0.0, 0.0, TURN, 0.0, 0.0]])
+    bad = spoilt(spoilt(flight, 3, shifted), 5, drifting)
+    assert off_planes(bad, features, 3) > 0.1
+    result = adjusted(bad, features)
+    assert [choice.model for choice in result.choices] == ["none", "none", "constant", "none", "linear", "none"]
+    corrected = replace(bad, trajectories=result.trajectories)
+    for strip in (3, 5):
+        assert off_planes(corrected, features, strip) < 1.03 * off_planes(flight, features, strip)
+        mine = result.fit.strip == strip
+        truth = shifted[:1] if strip == 3 else np.interp(np.linspace(-1, 1, mine.sum()), [-1, 1], [-TURN, TURN])
+        found = np.concatenate([result.fit.position_l, result.fit.attitude_rad], axis=1)[mine]
+        sigma = np.concatenate([result.fit.position_sigma_l, result.fit.attitude_sigma_rad], axis=1)[mine]
+        wanted = np.tile(truth, (len(found), 1)) if strip == 3 else truth[:, np.newaxis] * [0, 0, 0, 1, 0, 0]
+        assert (np.abs(found - wanted) < 3.5 * sigma).all()
+        assert (sigma[:, 2] < 0.02).all()
+    others = ~np.isin(result.fit.strip, [3, 5])
+    assert not result.fit.position_l[others].any()
+    assert result.variance_after < 1.1 < 3.0 < result.variance_before
+    gains = result.choices[2].gains
+    assert gains["constant"] == 0.0
+    assert gains["none"] > 1000.0
+    assert 0.0 < gains["linear"] < gains["spline"]
+
+
+def test_a_bend_is_a_spline_and_only_with_knots_to_bend_at(clean: tuple[Flight, Features]) -> None:
+    """A height that swells by 12 cm in the middle of a strip."""
+    flight, features = clean
+    swell = np.zeros((9, 6))
+    swell[:, 2] = 0.12 * np.sin(np.linspace(0.0, np.pi, 9)) ** 2
+    bad = spoilt(flight, 2, swell)
+    result = adjusted(bad, features, knot_s=3.0)
+    assert [choice.model for choice in result.choices] == ["none", "spline", "none", "none", "none", "none"]
+    middle = result.fit.position_l[result.fit.strip == 2, 2]
+    assert middle.max() == pytest.approx(0.12, abs=0.02)
+    corrected = replace(bad, trajectories=result.trajectories)
+    assert off_planes(corrected, features, 2) < 1.1 * off_planes(flight, features, 2)
+    stiff = adjusted(bad, features, knot_s=3.0, models=("none", "constant", "linear"))
+    assert "spline" not in [choice.model for choice in stiff.choices]
+    assert stiff.variance_after > 1.3 * result.variance_after
+    assert adjusted(bad, features, knot_s=3.0, criterion="aicc").choices[1].model == "spline"
+
+
+def test_a_common_shift_is_seen_by_control_alone(clean: tuple[Flight, Features]) -> None:
+    """All strips 12 cm too high: nothing without control; with it, within a centimetre."""
+    flight, features = clean
+    low = flight
+    for strip in range(1, 7):
+        low = spoilt(low, strip, np.tile([0.0, 0.0, 0.12, 0.0, 0.0, 0.0], (2, 1)))
+    assert [choice.model for choice in adjusted(low, features).choices] == ["none"] * 6
+    planes = tuple(
+        replace(plane, control=(ControlPoint(f"c{index}", plane.centre_t, 0.005),))
+        if plane.normal_t[2] > 0.99
+        else plane
+        for index, plane in enumerate(features.planes)
+    )
+    result = adjusted(low, replace(features, planes=planes), models=("none", "constant"))
+    assert [choice.model for choice in result.choices] == ["constant"] * 6
+    down = [off_planes(replace(low, trajectories=result.trajectories), features, strip) for strip in range(1, 7)]
+    assert max(down) < 0.03 < off_planes(low, features, 1)
+
+
+def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strip_functions, "MOST_CHOSEN_SINGLY", 3)
+    flight, features = clean
+    bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], (2, 1)))
+    result = adjusted(bad, features)
+    assert {choice.model for choice in result.choices} == {"constant"}
+    assert "6 strips, more than 3: all got the same model" in result.notes
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"models": ("none", "cubic")}, "strip model: got 'cubic', want some of none, constant, linear, spline"),
+        ({"criterion": "cp"}, "criterion: got 'cp', want bic or aicc"),
+        ({"models": ()}, "strip model: got none at all"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(
+    clean: tuple[Flight, Features], settings: dict[str, object], words: str
+) -> None:
+    with pytest.raises(StripError, match=words):
+        adjusted(clean[0], clean[1], **settings)

@@ -1,0 +1,149 @@
+"""A small calibration flight over houses: flown by the virtual aircraft, and read as a calibration reads a log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.flight import Flight
+from daemon.processing.calibration_flight import read_flight
+from daemon.processing.flights import Wish
+from daemon.processing.flown import TrajectoryWish
+from daemon.processing.setup import Options
+from georef.calibration import Calibration, read_calibration
+from georef.formats.trajectory_csv import csv_text
+from georef.trajectory import Trajectory
+from tests.daemon.short_flight import Flown, fly_short
+
+HEADER = """
+[flight]
+name = "village"
+seed = {seed}
+origin_deg = [47.182, 9.005]
+crs = "EPSG:25832"
+speed_mps = 50.0
+bank_max_deg = 38.0
+climb_max_mps = 12.0
+lead_s = 3.0
+
+[terrain]
+height_m = 450.0
+relief_m = 0.0
+
+[[terrain.village]]
+center_m = [0.0, 0.0]
+size_m = [260.0, 240.0]
+heading_deg = 25.0
+houses = 40
+
+[[terrain.road]]
+points_m = [[-320.0, -150.0], [30.0, -130.0], [60.0, 300.0]]
+width_m = 7.0
+
+[control]
+points = 12
+
+[gnss.rover]
+rate_hz = 5
+ins = true
+
+[imu.main]
+grade = "tactical"
+rate_hz = 200
+
+[scanner.left]
+prf_hz = {prf_hz}
+scan_hz = 50.0
+half_angle_deg = 30.0
+range_max_m = 1500.0
+reference_range_m = 500.0
+
+[scanner.left.true]
+{true}
+"""
+LINE = """
+[[line]]
+name = "{name}"
+from_m = [{x0}, {y0}]
+to_m = [{x1}, {y1}]
+height_m = {height}
+"""
+# name, from, to, height: opposite, crossing and parallel ones, the last two higher
+LINES = (
+    ("east", (-300, 0), (300, 0), 850),
+    ("west", (300, 60), (-300, 60), 850),
+    ("south", (0, 300), (0, -300), 850),
+    ("north", (120, -300), (120, 300), 850),
+    ("high_west", (320, -60), (-320, -60), 1150),
+    ("high_south", (-80, 320), (-80, -320), 1150),
+)
+TRUE = {"omega_deg": 0.25, "phi_deg": -0.4, "kappa_deg": 0.6, "range_offset_m": 0.12}
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What was flown.
+
+    Attributes:
+        flight: as read, with nominal calibration, on the true trajectory (its sigmas say what the INS's do).
+        truth: the true calibration.
+        trajectory: the true one.
+        flown: the log and the files beside it: ``flown.folder / "truth.npz"``, ``control.csv``.
+    """
+
+    flight: Flight
+    truth: Calibration
+    trajectory: Trajectory
+    flown: Flown
+
+    def at_truth(self) -> Flight:
+        """With the points where the true calibration puts them."""
+        return self.flight.placed({"left": self.truth})
+
+
+def village(
+    folder: Path,
+    *,
+    seed: int = 4,
+    prf_hz: float = 10_000.0,
+    lines: tuple[int, ...] = (0, 1, 2, 3),
+    true: dict[str, float] | None = None,
+    plan_more: str = "",
+    sigma_m: float = 0.02,
+    sigma_deg: float = 0.003,
+) -> Made:
+    """Fly some of `LINES` and read the log on the true trajectory.
+
+    Args:
+        folder: for the log and what is kept of it.
+        seed, prf_hz: of the flight.
+        lines: indexes of `LINES`.
+        true: what the scanner really is, keys of a calibration file; None: `TRUE`.
+        plan_more: tables added to the plan.
+        sigma_m, sigma_deg: that the true trajectory says of itself, each coordinate, each angle (heading twice).
+    """
+    tables = "\n".join(f"{key} = {value}" for key, value in (TRUE if true is None else true).items())
+    text = HEADER.format(seed=seed, prf_hz=prf_hz, true=tables)
+    for index in lines:
+        name, (x0, y0), (x1, y1), height = LINES[index]
+        text += LINE.format(name=name, x0=x0, y0=y0, x1=x1, y1=y1, height=height)
+    flown = fly_short(folder, text + plan_more)
+    trajectory = told(flown.truth(), sigma_m, sigma_deg)
+    file = folder / "true_trajectory.csv"
+    file.write_text(csv_text(trajectory))
+    kept = folder / "kept"
+    kept.mkdir()
+    wish = Wish([flown.log], kept, TrajectoryWish(file), Options(datum="same", uncertainty=False))
+    read = read_flight(wish, kept, lambda what, done, total: None)
+    truth = read_calibration((folder / "left.true.toml").read_text(), "left.true.toml")
+    flight = replace(read.flight, trajectories=(trajectory,))
+    return Made(flight, truth, trajectory, flown)
+
+
+def told(trajectory: Trajectory, sigma_m: float, sigma_deg: float) -> Trajectory:
+    """With sigmas."""
+    position = np.full((len(trajectory), 3), sigma_m)
+    attitude = np.radians(np.tile([sigma_deg, sigma_deg, 2.0 * sigma_deg], (len(trajectory), 1)))
+    return replace(trajectory, position_sigma_l=position, attitude_sigma_rad=attitude)
