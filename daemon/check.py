@@ -137,7 +137,7 @@ class Wire:
 
     def listen(self, span: Span) -> None:
         """Feed the readings until the time is up; then say what is wrong with the wire."""
-        session = Session(lambda: open_transport(self._spec))
+        session = Session(lambda: open_transport(self._spec, span.stop.is_set))
         for blocks in span.listen(session):
             for block in blocks:
                 batch = _batch(self.report.source, block)
@@ -290,7 +290,7 @@ def _answer_problems(reading: Reading) -> list[str]:
     if other is not None:
         return [other]
     found: list[str] = []
-    if not heard.counts:
+    if not heard.counts and entry.kind != "corrections":  # those are not decoded, but for a station now and then
         names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
         found.append(f"speaks {entry.protocol}, but sends nothing that is decoded ({names})")
     bad = counters.bad_checksums + counters.bad_messages

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from daemon.config import DeviceEntry, GnssConfig, ImuConfig, ScannerConfig
+from daemon.config import CorrectionsConfig, DeviceEntry, DeviceTable, GnssConfig, ImuConfig, ScannerConfig
 from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import all_drivers, find_driver
 from georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
@@ -154,11 +154,13 @@ def not_understood(
 def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
     """Settings of a device of which only the protocol is known; what frames need no value of ours is stood in for."""
     transport = entry.transport.text
-    table: GnssConfig | ImuConfig | ScannerConfig
+    table: DeviceTable
     if entry.kind == "gnss":
         table = GnssConfig(transport=transport, protocol=protocol)
     elif entry.kind == "imu":
         table = ImuConfig(transport=transport, protocol=protocol, tick_hz=1_000_000.0)
+    elif entry.kind == "corrections":
+        table = CorrectionsConfig(transport=transport, protocol=protocol)
     else:
         table = ScannerConfig(transport=transport, protocol=protocol, mirror_factor=1.0, installation=IDENTITY)
     return DeviceSettings(entry.source, table.model_dump())

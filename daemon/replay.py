@@ -46,7 +46,7 @@ def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], O
     makers: dict[str, Callable[[], Output]] = {}
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
-            if spec is not None and spec.kind != "gnss":
+            if spec is not None and spec.kind not in ("gnss", "ntrip"):  # a caster is nobody to play to
                 makers[device.source + suffix] = partial(open_output, spec)
     for name, pps in config.pps.items():
         if with_pps and pps.source.startswith(_FIXED):

@@ -17,6 +17,7 @@ from daemon.answers import FirstUnits
 from daemon.block_queue import BlockQueue
 from daemon.channels import ChannelTable, JsonChannel
 from daemon.config import Config, DeviceEntry, GnssConfig
+from daemon.corrections import CorrectionsWatch, Relay
 from daemon.errors import ExitCode
 from daemon.events import Events
 from daemon.host_clock import HostClock
@@ -30,12 +31,13 @@ from daemon.sd_notify import ServiceManager
 from daemon.timekeeper import TimeKeeper
 from drivers.core.registry import find_driver
 from drivers.session import Session
+from drivers.transports.base import UnitBlock
 from drivers.transports.uri import TransportSpec, open_transport, parse_pps
 from georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
 
-_ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp"}
+_ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp", "ntrip": "x-swath-serial"}
 
 
 def read_boot_id() -> str:
@@ -72,6 +74,8 @@ class Assembly:
     clock_channel: JsonChannel
     receivers: list[Receiver] = field(default_factory=list)
     first_units: list[FirstUnits] = field(default_factory=list)
+    sessions: dict[str, Session[UnitBlock]] = field(default_factory=dict)
+    corrections: dict[str, CorrectionsWatch] = field(default_factory=dict)
 
 
 def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
@@ -91,9 +95,12 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
         reserve_bytes=int(config.session.reserve_mb * 1e6),
     )
     timekeeper = make_timekeeper(config, events, clock.offset_ns)
-    recorder = Recorder(
-        parts, settings, queue, channels, events, clock, lambda source: timekeeper.status(source, clock.now_ns())
-    )
+    watches: dict[str, CorrectionsWatch] = {}
+
+    def added_status(source: str) -> dict[str, object]:
+        return watches[source].status() if source in watches else timekeeper.status(source, clock.now_ns())
+
+    recorder = Recorder(parts, settings, queue, channels, events, clock, added_status)
     assembly = Assembly(
         config,
         clock,
@@ -103,6 +110,7 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
         recorder,
         timekeeper,
         JsonChannel(channels, "clock", "/clock", "swath.Clock"),
+        corrections=watches,
     )
     _add_pps(assembly)
     for device in config.devices():
@@ -150,14 +158,29 @@ def _add_device(assembly: Assembly, device: DeviceEntry) -> None:
     units_seen: list[UnitsSeen] = [first_units.add]
     if device.kind == "gnss":
         units_seen.append(assembly.timekeeper.units_seen(device.source))
+    if device.kind == "corrections":
+        units_seen.append(_watch_corrections(assembly, device).units_seen)
     main = make_wire(device, device.transport, "")
-    session = Session(lambda: open_transport(device.transport))
+    stopped = assembly.shared.stop.is_set
+    session = assembly.sessions[device.source] = Session(lambda: open_transport(device.transport, stopped))
     assembly.receivers.append(UnitReceiver(main, session, assembly.shared, units_seen))
     if device.auxiliary is not None:
         auxiliary = device.auxiliary
         aux_session = Session(lambda: open_transport(auxiliary))
         aux = make_wire(device, auxiliary, "/aux")
         assembly.receivers.append(UnitReceiver(aux, aux_session, assembly.shared))
+
+
+def _watch_corrections(assembly: Assembly, device: DeviceEntry) -> CorrectionsWatch:
+    """Receivers come before corrections, so that the one to hand on to has its session already."""
+    target = assembly.config.corrections[device.name].forward_to
+    relay = None
+    if target is not None:
+        send = assembly.sessions[target.replace(".", "/", 1)].send
+        relay = Relay(device.source, target, send, assembly.shared.events, assembly.shared.stop)
+    parser = find_driver(device.kind, device.protocol).make_parser(device.settings)
+    watch = assembly.corrections[device.source] = CorrectionsWatch(device.source, parser, relay)
+    return watch
 
 
 def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:

@@ -71,7 +71,11 @@ def command(
         output=output,
         trajectory=TrajectoryWish(trajectory, week, at),
         options=Options(
-            crs=crs, datum=datum, epoch=epoch, calibrations=_calibrations(calibration or []), uncertainty=not no_sigma
+            crs=crs,
+            datum=datum,
+            epoch=epoch,
+            calibrations=calibrations_given(calibration or []),
+            uncertainty=not no_sigma,
         ),
         config=None if config is None else load_config(config),
         strips=strips,
@@ -89,7 +93,7 @@ def command(
     _tell(report.record, report.sidecar, as_json=as_json)
 
 
-def _calibrations(given: list[str]) -> dict[str, tuple[str, str]]:
+def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
     """Text and name of each file, by the scanner that is named, or else the one that the file names."""
     found: dict[str, tuple[str, str]] = {}
     for entry in given:

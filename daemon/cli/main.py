@@ -29,11 +29,11 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 
 HELP = """Airborne laser scanning: from the sensors' wires into a log that survives.
 
-`swath run CONFIG` records; `swath check CONFIG` says before the flight what every device answers.
+`swath run CONFIG` records; `swath check CONFIG` asks every device before.
 """
 EPILOG = (
-    "Exit codes: 0 ok, 1 the job found a problem, 2 wrong configuration or usage, 3 cannot read or write, "
-    "4 data is damaged, 130 interrupted. `swath COMMAND --help` says more of a command."
+    "Exit codes: 0 ok, 1 a problem found, 2 wrong configuration or usage, 3 cannot read or write, 4 damaged data, "
+    "130 interrupted. `swath COMMAND --help` says more."
 )
 
 
@@ -54,24 +54,29 @@ class Listed:
 
 COMMANDS = (
     Listed("run", "Record every byte of the configured sensors.", "Record"),
-    Listed("check", "Validate a configuration; open every device, say what it answers.", "Record"),
+    Listed("check", "Validate a configuration; say what every device answers.", "Record"),
     Listed("mark", "Note something in the log being recorded.", "Record"),
     Listed("split", "Begin a new part of the log being recorded.", "Record"),
-    Listed("monitor", "Show a running recorder live: sources, rates, losses, time, disk.", "Record"),
+    Listed("monitor", "Show a running recorder live: rates, losses, time, disk.", "Record"),
     Listed("live", "Georeference what is being recorded, and show it.", "Record"),
-    Listed("info", "Say what logs hold: duration, counts, gaps, losses, time status.", "Logs"),
+    Listed("info", "Say what logs hold: counts, gaps, losses, time status.", "Logs"),
     Listed("replay", "Put the bytes of a log back on wires.", "Logs"),
     Listed("import", "Make a log of captures: pcap, candump, serial bytes.", "Logs"),
     Listed("export", "Write a log as the files that the devices' own tools read.", "Logs"),
-    Listed("recover", "Repair a log left open by a crash; say exactly what was lost.", "Logs"),
+    Listed("recover", "Repair a log left open by a crash; say what was lost.", "Logs"),
     Listed("offload", "Copy finished logs to another disk and prove each copy.", "Logs"),
-    Listed("georef", "Georeference logs: LAZ a strip, the trajectory used, a sidecar.", "Products"),
-    Listed("view", "Show products: maps, strip differences and a profile on one page.", "Products"),
-    Listed("sim", "Fly a virtual aircraft into a log or on wires; draw its plan.", "Simulation"),
+    Listed("trajectory", "Navigate logs: trajectory, accuracies, event marks.", "Products"),
+    Listed("georef", "Georeference logs: LAZ a strip, trajectory, sidecar.", "Products"),
+    Listed("view", "Show products on one page: maps, differences, a profile.", "Products"),
+    Listed("calibrate", "Find boresight, range offset and more, with sigmas.", "Calibration"),
+    Listed("plan-calibration", "Say what a planned calibration flight will tell.", "Calibration"),
+    Listed("strips", "Say how well strips agree; judge them by specifications.", "Calibration"),
+    Listed("validate", "Prove a calibration with other planes, flights, heights.", "Calibration"),
+    Listed("sim", "Fly a virtual aircraft into a log or on wires.", "Simulation"),
     Listed("warm-up", "Compile what live and georef run, before the flight.", "Setup"),
-    Listed("doctor", "Say what on this computer would cost data, and what mends it.", "Setup"),
-    Listed("setup", "Show, or send, the messages the devices need before a survey.", "Setup"),
-    Listed("devices", "List the protocols there are, how they come and what they yield.", "Setup"),
+    Listed("doctor", "Say what on this computer would cost data.", "Setup"),
+    Listed("setup", "Show, or send, what devices need before a survey.", "Setup"),
+    Listed("devices", "List the protocols there are and what they yield.", "Setup"),
 )
 
 

@@ -15,7 +15,7 @@ def command(
         Path | None, typer.Argument(metavar="[CONFIG]", help="Also what this configuration needs.", readable=False)
     ] = None,
 ) -> None:
-    """Compile what swath live and swath georef run, and keep it for later processes; says where.
+    """Compile what swath live, georef and calibrate run, and keep it for later processes; says where.
 
     It is kept in NUMBA_CACHE_DIR, else beside the program or in the user's cache. Once is enough, for as long as the
     program and the computer stay the same.
@@ -26,4 +26,4 @@ def command(
     from daemon.processing.warm_up import warm_up
 
     setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
-    print(warm_up(setups).text(), flush=True)
+    print(warm_up(setups, calibration=True).text(), flush=True)

@@ -1,10 +1,11 @@
 """The configuration: one TOML file, validated whole before anything starts."""
 
-from daemon.config.config import Config, DeviceEntry
+from daemon.config.config import Config, DeviceEntry, DeviceTable
 from daemon.config.loading import load_config, parse_config
 from daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,
+    CorrectionsConfig,
     GeometryConfig,
     GimbalConfig,
     GimbalStage,
@@ -26,7 +27,9 @@ __all__ = [
     "AtmosphereConfig",
     "AttitudeConfig",
     "Config",
+    "CorrectionsConfig",
     "DeviceEntry",
+    "DeviceTable",
     "GeometryConfig",
     "GimbalConfig",
     "GimbalStage",

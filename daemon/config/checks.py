@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from daemon.config.calibration_file import check_calibration
-from daemon.config.config import Config
-from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
+from daemon.config.config import Config, DeviceTable
+from daemon.config.tables import CorrectionsConfig, ScannerConfig
 from drivers.core.parser import DeviceKind, Driver, DriverSettingsError
 from drivers.core.registry import UnknownProtocolError, find_driver
 from drivers.core.startup import StartupWish
@@ -23,7 +23,6 @@ from drivers.core.startup import StartupWish
 if TYPE_CHECKING:
     from drivers.transports.uri import TransportSpec
 
-DeviceTable = GnssConfig | ImuConfig | ScannerConfig
 WILDCARD = "0.0.0.0"
 ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
 
@@ -88,7 +87,9 @@ def _unreadable(path: Path) -> str | None:
 
 def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTable) -> Iterator[str]:
     section = f"{kind}.{name}"
-    if table.pps is not None and table.pps not in config.pps:
+    if isinstance(table, CorrectionsConfig):
+        yield from _check_forwarding(config, section, table)
+    elif table.pps is not None and table.pps not in config.pps:
         known = ", ".join(config.pps) or "none; add [pps.main]"
         yield f'{section}.pps: got "{table.pps}", want the name of a [pps.<name>]; there are: {known}'
     yield from _check_rotations(section, table)
@@ -110,6 +111,17 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
                 driver.startup(settings, StartupWish())
         except DriverSettingsError as error:
             yield f"{section}: {error}"
+
+
+def _check_forwarding(config: Config, section: str, table: CorrectionsConfig) -> Iterator[str]:
+    if table.forward_to is None:
+        return
+    kind, _, name = table.forward_to.partition(".")
+    if kind != "gnss" or name not in config.gnss:
+        known = ", ".join(f"gnss.{one}" for one in config.gnss) or "none"
+        yield f'{section}.forward_to: got "{table.forward_to}", want a receiver as gnss.<name>; there are: {known}'
+    elif not config.gnss[name].transport.startswith("serial:"):
+        yield f"{section}.forward_to: {table.forward_to} has no serial port that could take corrections"
 
 
 def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
@@ -244,5 +256,7 @@ def _device_path(spec: TransportSpec) -> str | None:
 def _wire_name(spec: TransportSpec) -> str:
     if spec.kind == "udp":
         return f"UDP port {spec.port}"
+    if spec.kind == "ntrip":
+        return f"the mountpoint {spec.address}"
     path = _device_path(spec)
     return f"the device {path}" if path else f"the CAN bus {spec.address}"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,
+    CorrectionsConfig,
     GnssConfig,
     ImuConfig,
     MtaConfig,
@@ -25,6 +26,7 @@ from drivers.core.parser import DeviceKind, DeviceSettings
 if TYPE_CHECKING:
     from drivers.transports.uri import TransportSpec
 
+DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
 PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # what a parser is given; a calibration is not its business
 
@@ -93,6 +95,11 @@ class Config:
         return self.tables.scanner
 
     @property
+    def corrections(self) -> dict[str, CorrectionsConfig]:
+        """``[corrections.<name>]``."""
+        return self.tables.corrections
+
+    @property
     def attitude(self) -> AttitudeConfig:
         """``[attitude]``."""
         return self.tables.attitude
@@ -121,7 +128,7 @@ class Config:
         """A path of the file: relative ones are relative to the file."""
         return (self.path.parent / name).absolute()
 
-    def device_tables(self) -> Iterator[tuple[DeviceKind, str, GnssConfig | ImuConfig | ScannerConfig]]:
+    def device_tables(self) -> Iterator[tuple[DeviceKind, str, DeviceTable]]:
         """(kind, name, table) of every device, in the order of the kinds and of the file."""
         for name, gnss in self.gnss.items():
             yield "gnss", name, gnss
@@ -129,12 +136,14 @@ class Config:
             yield "imu", name, imu
         for name, scanner in self.scanner.items():
             yield "scanner", name, scanner
+        for name, corrections in self.corrections.items():
+            yield "corrections", name, corrections
 
-    def files_of(self, table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, Path]:
+    def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
         """The files a device's table names, by key."""
         return {key: self.resolve(name) for key, name in _names_of(table).items()}
 
-    def settings_of(self, kind: DeviceKind, name: str, table: GnssConfig | ImuConfig | ScannerConfig) -> DeviceSettings:
+    def settings_of(self, kind: DeviceKind, name: str, table: DeviceTable) -> DeviceSettings:
         """What the parser of a device is made with; reads its files.
 
         Raises:
@@ -145,7 +154,7 @@ class Config:
         return DeviceSettings(f"{kind}/{name}", plain_table(table), contents)
 
     def devices(self) -> Iterator[DeviceEntry]:
-        """Every device: GNSS, IMU, scanners, in the order of the file."""
+        """Every device: GNSS, IMU, scanners, corrections, in the order of the file."""
         from drivers.transports.uri import parse_transport
 
         for kind, name, table in self.device_tables():
@@ -156,7 +165,7 @@ class Config:
                 transport=parse_transport(table.transport),
                 auxiliary=parse_transport(auxiliary) if auxiliary else None,
                 protocol=table.protocol,
-                pps=table.pps,
+                pps=None if isinstance(table, CorrectionsConfig) else table.pps,
                 settings=self.settings_of(kind, name, table),
                 files=self.files_of(table),
             )
@@ -180,7 +189,7 @@ class Config:
         ]
 
 
-def _names_of(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, str]:
+def _names_of(table: DeviceTable) -> dict[FileKey, str]:
     named: dict[FileKey, str | None] = {}
     if isinstance(table, ImuConfig):
         named["dbc"] = table.dbc
@@ -190,7 +199,7 @@ def _names_of(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[FileKey, st
     return {key: name for key, name in named.items() if name is not None}
 
 
-def plain_table(table: GnssConfig | ImuConfig | ScannerConfig) -> dict[str, Any]:
+def plain_table(table: DeviceTable) -> dict[str, Any]:
     """A device's table as plain values, defaults filled in."""
     return table.model_dump()
 

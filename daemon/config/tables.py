@@ -125,6 +125,9 @@ class NoiseConfig(Section):
     bias_correlation_h: float | None = Field(None, gt=0.0, le=10_000.0, description="default: the grade's")
     gyro_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
     accel_scale_ppm: float | None = Field(None, ge=0.0, le=100_000.0, description="default: the grade's")
+    misalignment_mrad: float | None = Field(
+        None, ge=0.0, le=100.0, description="of axes towards each other; default: the grade's; 0: not estimated"
+    )
 
 
 class ImuConfig(Section):
@@ -264,6 +267,14 @@ class ScannerConfig(Section):
         return self
 
 
+class CorrectionsConfig(Section):
+    """``[corrections.<name>]``: corrections of a base station, logged, and handed on to a receiver."""
+
+    transport: Text = Field(description="serial:… or ntrip:<host>:<port>/<mountpoint>?…")
+    protocol: Text = Field("rtcm3", description="rtcm3")
+    forward_to: Text | None = Field(None, description="the receiver whose serial port gets the bytes, as gnss.rover")
+
+
 class AttitudeConfig(Section):
     """``[attitude]``: what vertical the attitude refers to."""
 
@@ -339,6 +350,7 @@ class Tables(Section):
     gnss: dict[Name, GnssConfig] = Field(default_factory=dict)
     imu: dict[Name, ImuConfig] = Field(default_factory=dict)
     scanner: dict[Name, ScannerConfig] = Field(default_factory=dict)
+    corrections: dict[Name, CorrectionsConfig] = Field(default_factory=dict)
     attitude: AttitudeConfig = Field(default_factory=AttitudeConfig)
     atmosphere: AtmosphereConfig = Field(default_factory=AtmosphereConfig)
     mta: MtaConfig = Field(default_factory=MtaConfig)

@@ -18,6 +18,7 @@ from georef.records import ByteRows, Int64Array
 
 TopicFilter = Callable[[str], bool]
 _MESSAGE_HEAD = 31
+ONE_BY_ONE = 32  # messages at the head of a run
 _HEAD = struct.Struct("<BQ")
 
 # What a stranger's log may take of the memory; ours stay far below.
@@ -82,7 +83,7 @@ def chunk_batches(
             raise LogError("chunk with a record of no kind")
         if opcode == OP_MESSAGE and length >= _MESSAGE_HEAD - _HEAD.size:
             stride = end - at
-            count = _run_length(array, at, stride)
+            count = _run_length(data, at, stride)
             channel_id = int.from_bytes(data[at + 9 : at + 11], "little")
             spec = channels.get(channel_id)
             if spec is None:
@@ -125,15 +126,14 @@ def _lose(lost: Counter[str] | None, why: str, count: int) -> None:
     lost[why] += count
 
 
-def _run_length(array: ByteRows, at: int, stride: int) -> int:
+def _run_length(data: bytes, at: int, stride: int) -> int:
     """Messages from here on with the same opcode, length and channel as the first: their eleven first bytes."""
-    possible = (len(array) - at) // stride
-    if possible <= 1:
-        return possible
-    # most runs in a chunk of several channels are short: look one ahead before looking at all
-    if not np.array_equal(array[at : at + 11], array[at + stride : at + stride + 11]):
-        return 1
-    heads = array[at : at + possible * stride].reshape(possible, stride)[:, :11]
+    possible, head = (len(data) - at) // stride, data[at : at + 11]
+    # most runs in a chunk of several channels or lengths are short: one by one before all at once
+    for count in range(1, min(possible, ONE_BY_ONE)):
+        if not data.startswith(head, at + count * stride):
+            return count
+    heads = np.frombuffer(data, np.uint8, possible * stride, at).reshape(possible, stride)[:, :11]
     differs = np.flatnonzero((heads != heads[0]).any(axis=1))
     return int(differs[0]) if len(differs) else possible
 

@@ -1,6 +1,6 @@
 """From a log's messages to a stream of points: parsers are fed in the order of the file, the stream decides at ticks.
 
-A tick is where the newest log time so far passes a multiple of 100 ms, or where 32 MiB have come since the last one.
+A tick is where the newest log time so far passes a multiple of 200 ms, or where 32 MiB have come since the last one.
 Both depend on the order of the messages alone, so it is the same for a log that is read whole, one that is followed
 while it is written, and one that comes message by message.
 """
@@ -8,12 +8,14 @@ while it is written, and one that comes message by message.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.log.chunks import LogBatch, json_objects
 from daemon.log.reader import Session
@@ -40,27 +42,28 @@ from georef.stream import CONTEXT_FLAG, Stream, StreamSettings
 from georef.stream_clocks import FrozenClocks, HostClocks
 from georef.trajectory_buffer import SOLUTION_STATUS
 
-TICK_NS = 100_000_000
+if TYPE_CHECKING:
+    from daemon.processing.navigator import Navigator
+
+TICK_NS = 200_000_000
 TICK_BYTES = 32 << 20
-JOINED_BYTES = 256 << 10  # of a scanner's units, that are decoded at once where others' stand between them
+JOINED_BYTES = 256 << 10  # of a source's units, that are decoded at once where others' stand between them
 MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
 Placed = list[tuple[str, Points]]
 Tick = tuple[int, int, int | None]  # messages from one to before another, and the tick that comes after them
 
 
 class _Run:
-    """Consecutive units of a scanner that wait to be decoded together, for a call of a parser costs as much as many."""
+    """Consecutive units of a source that wait to be decoded together, for a call of a parser costs as much as many."""
 
-    def __init__(self, parse: Callable[[ChunkBatch], None]) -> None:
+    def __init__(self, parse: Callable[[list[ChunkBatch]], None]) -> None:
         self._parse = parse
         self._held: list[ChunkBatch] = []
         self._bytes = 0
 
     def add(self, units: ChunkBatch) -> None:
-        """The next ones; those of another wire or length are decoded before them."""
-        if self._held and (
-            self._held[0].source != units.source or self._held[0].units.shape[1] != units.units.shape[1]
-        ):
+        """The next ones, of any length; those of another wire are decoded before them."""
+        if self._held and self._held[0].source != units.source:
             self.flush()
         self._held.append(units)
         self._bytes += units.units.size
@@ -70,11 +73,12 @@ class _Run:
     def flush(self) -> None:
         """Decode them now."""
         held, self._held, self._bytes = self._held, [], 0
-        if len(held) == 1:
-            self._parse(held[0])
-        elif held:
-            times = np.concatenate([one.host_time_ns for one in held])
-            self._parse(ChunkBatch(held[0].source, times, np.concatenate([one.units for one in held])))
+        if held:
+            self._parse(held)
+
+
+def _any_status(status: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    return np.ones(len(status), np.bool_)
 
 
 class LogFeed:
@@ -93,6 +97,11 @@ class LogFeed:
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
         self._parsers = setup.parsers(("gnss", "scanner")) | setup.ins_parser()
+        # of a growing log; until the device's own INS has a solution
+        self.navigator: Navigator | None = None if stream.clocks.frozen else setup.navigator(stream.clocks)
+        self._is_solution = SOLUTION_STATUS.get(setup.ins_protocol, _any_status)
+        if self.navigator is not None:
+            self._parsers |= self.navigator.parsers
         for name in stream.scanners:
             connect(stream.chain(name), self._parsers[f"scanner/{name}"])
         self._newest_ns: int | None = None
@@ -118,8 +127,15 @@ class LogFeed:
                 self._feed(batch.between(first, last))
             if tick_ns is not None:
                 self.flush()
+                self._navigate(tick_ns)
                 placed += self.stream.advance(tick_ns)
         return placed
+
+    def _navigate(self, tick_ns: int | None) -> None:
+        if self.navigator is not None:
+            poses = self.navigator.close() if tick_ns is None else self.navigator.advance(tick_ns)
+            if len(poses):
+                self.stream.path.add(poses)
 
     def flush(self) -> None:
         """Decode what is held to be decoded together."""
@@ -131,6 +147,7 @@ class LogFeed:
         self.flush()
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
+        self._navigate(None)
         return self.stream.close()
 
     def parser(self, source: str) -> Parser:
@@ -187,14 +204,14 @@ class LogFeed:
         if not inside:
             return None
 
-        def parse(units: ChunkBatch) -> None:
+        def parse(batches: list[ChunkBatch]) -> None:
             for name in inside:
-                self._take_records(name, self._parsers[name].feed_batch(units))
+                self._take_records(name, self._parsers[name].feed_batches(batches))
 
-        take = parse
         if source.startswith("scanner/"):  # whose records wait for the tick, each scanner's for themselves
-            take = self._runs.setdefault(inside[0], _Run(parse)).add
-        return lambda batch: take(ChunkBatch(source, batch.log_time_ns, batch.units))
+            run = self._runs.setdefault(inside[0], _Run(parse))
+            return lambda batch: run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
+        return lambda batch: parse([ChunkBatch(source, batch.log_time_ns, batch.units)])
 
     def _take_readings(self, batch: LogBatch) -> None:
         for reading in readings_of(batch):
@@ -223,10 +240,15 @@ class LogFeed:
                 self._take_returns(source, record.rows)
             elif isinstance(record, TimeMessage) and source in clocks.host.plan.gnss:
                 clocks.add_message(source, record)
-            elif isinstance(record, DeviceClockSamples) and source in clocks.host.plan.devices:
-                clocks.add_samples(source, record.rows)
+            elif isinstance(record, DeviceClockSamples) and source.removeprefix("scanner/") in self.stream.scanners:
+                if source in clocks.host.plan.devices:
+                    clocks.add_samples(source, record.rows)
             elif isinstance(record, InsSolution) and source == self._setup.ins_source:
                 self.stream.path.add(self._setup.ins_rows(record.rows))
+                if self.navigator is not None and self._is_solution(record.rows["status"]).any():
+                    self.navigator = None
+            elif self.navigator is not None:
+                self.navigator.take(source, record)
 
     def _take_returns(self, source: str, rows: StructArray) -> None:
         name = source.removeprefix("scanner/")
@@ -293,6 +315,7 @@ class _ClockReader:
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
         self._parsers = setup.parsers(("gnss", "imu"))
+        self._runs: dict[str, _Run] = {}
 
     def take(self, batch: LogBatch) -> None:
         """The next messages."""
@@ -306,14 +329,19 @@ class _ClockReader:
             for found in edges_of(batch, edge) if edge is not None else ():
                 if found is not None:
                     self.host.add_edge(source, found)
-        elif source is not None:
-            units = ChunkBatch(source, batch.log_time_ns, batch.units)
-            for name in self._setup.inside(source):
-                if name in self._parsers:
-                    self.take_records(name, self._parsers[name].feed_batch(units))
+        elif source is not None:  # its own order is enough: times are taken all at once
+            run = self._runs.setdefault(source, _Run(partial(self._parse, self._setup.inside(source))))
+            run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
+
+    def _parse(self, names: Iterable[str], batches: list[ChunkBatch]) -> None:
+        for name in names:
+            if name in self._parsers:
+                self.take_records(name, self._parsers[name].feed_batches(batches))
 
     def close(self) -> None:
         """Tails of the streams, and all times at once."""
+        for run in self._runs.values():
+            run.flush()
         for name, parser in self._parsers.items():
             self.take_records(name, parser.close())
         self.host.update()
@@ -339,7 +367,7 @@ class _ClockReader:
             if isinstance(record, TimeMessage) and source in self.host.plan.gnss:
                 self.host.add_message(source, record)
             elif isinstance(record, InsSolution) and source == self._setup.ins_source:
-                self.ins.append(self._setup.ins_rows(record.rows))
+                self.ins.append(record.rows)
             elif isinstance(record, InsSolution) and source in self.gimbals:
                 self.gimbals[source].append(record.rows)
             elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
@@ -355,7 +383,7 @@ def read_clocks(session: Session, setup: Setup) -> LogClocks:
     for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
         reader.take(batch)
     reader.close()
-    ins = np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE)
+    ins = setup.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
     imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
     gps_ns, rate_b = np.empty(0, np.int64), np.empty((0, 3))
     clock = setup.clock_of_imu

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from daemon.config.config import Config
+    from daemon.processing.navigate import Navigated
     from georef.timescales import ClockStatus
 
     Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -92,6 +93,7 @@ class Flight:
         span: GPS time of its first and last return; host_span likewise in log time.
         trajectory: the body's.
         solutions: of the device's INS that it is made of, by what became of them.
+        navigated: what the trajectory was smoothed from; None: it comes from elsewhere.
         strips: spans of log time, and the number of the first.
         lost: units that the recorder lost, by source.
         troubles: with time or trajectory, a line each.
@@ -106,6 +108,7 @@ class Flight:
     host_span: tuple[int, int]
     trajectory: Trajectory | None = None
     solutions: dict[str, int] = field(default_factory=dict)
+    navigated: Navigated | None = None
     strips: list[Span] = field(default_factory=list)
     first_number: int = 1
     lost: dict[str, int] = field(default_factory=dict)
@@ -208,8 +211,8 @@ def _choose(wish: Wish, flight: Flight) -> None:
     """The flight's trajectory; the mapping's operation for where it was."""
     status = flight.status(flight.host_span[1])
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
-    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.clocks, flight.span, leap_seconds, flight.log)
-    flight.trajectory, flight.solutions = chosen.trajectory, chosen.solutions
+    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
+    flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
     flight.troubles += chosen.doubts
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)

@@ -1,4 +1,4 @@
-"""Which trajectory a session is georeferenced with: a file's, or the device's own INS solution in the log."""
+"""Which trajectory a session is georeferenced with: of a file, of the device's own INS, or of IMU and GNSS."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING
 from daemon.errors import ExitCode, UserError
 from daemon.processing.refusals import refuse_no_overlap, refuse_other_motion
 from georef.formats.trajectory_file import read_trajectory
+from georef.stream_path import SHORTEST_TRAJECTORY
 from georef.trajectory import Trajectory, TrajectoryError
 from georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
     from daemon.config.config import Config
+    from daemon.log.reader import Session
     from daemon.processing.feed import LogClocks
+    from daemon.processing.navigate import Navigated
     from daemon.processing.setup import Setup
 
 Vector = tuple[float, float, float]
@@ -30,11 +33,14 @@ class TrajectoryWish:
         file: None: the device's own.
         week: GPS week of a file that says none; None: the one that fits the log.
         at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
+        navigate: without a file IMU and GNSS are navigated and smoothed where the log has both, whatever the device's
+            own INS said.
     """
 
     file: Path | None = None
     week: int | None = None
     at: str = "body"
+    navigate: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,30 +51,45 @@ class Chosen:
         trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
         doubts: about it, a line each.
         solutions: of the device's INS, by what became of them (`georef.trajectory_buffer`); none of a file.
+        navigated: what it was smoothed from; None: it comes from elsewhere.
     """
 
     trajectory: Trajectory
     doubts: list[str]
     solutions: dict[str, int]
+    navigated: Navigated | None = None
 
 
 def choose_trajectory(
-    wish: TrajectoryWish, setup: Setup, clocks: LogClocks, span: tuple[int, int], leap_seconds: int | None, log: Path
+    wish: TrajectoryWish,
+    setup: Setup,
+    session: Session,
+    clocks: LogClocks,
+    span: tuple[int, int],
+    leap_seconds: int | None,
 ) -> Chosen:
     """For a session whose returns lie in a span of GPS time; ``leap_seconds``, as the log knows them, for files in UTC.
 
     Raises:
         UserError: there is none, it cannot be read, or it is of another time.
     """
+    log = session.parts[0].path
     doubts: list[str] = []
     solutions: dict[str, int] = {}
+    navigated: Navigated | None = None
+    both = setup.imu_source is not None and bool(setup.config.gnss)
     try:
         if wish.file is None:
-            trajectory, solutions = _from_log(setup, clocks, log)
+            trajectory, solutions = _from_device(setup, clocks)
+            if (wish.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
+                navigated = _navigated(setup, session, solutions)
+                trajectory = navigated.trajectory()
+                findings = [finding.text for leg in navigated.legs for finding in leg.findings]
+                doubts = [*navigated.doubts, *navigated.holes, *findings]
         else:
             trajectory = _from_file(wish, wish.file, span, leap_seconds)
             doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
-        refuse_no_overlap(trajectory, str(wish.file or FROM_LOG), span, log)
+        refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
         trajectory.require_attitude()
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
@@ -78,7 +99,7 @@ def choose_trajectory(
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
-    return Chosen(trajectory, doubts, solutions)
+    return Chosen(trajectory, doubts, solutions, navigated)
 
 
 def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
@@ -101,16 +122,28 @@ def _smrmsg_beside(file: Path) -> Path | None:
     return next((name for name in names if name.exists()), None)
 
 
-def _from_log(setup: Setup, clocks: LogClocks, log: Path) -> tuple[Trajectory, dict[str, int]]:
-    source = setup.ins_source
-    if source is None or not len(clocks.ins_rows):
-        raise UserError(f"{log}: no INS solution in the log; want --trajectory FILE", ExitCode.USAGE)
-    buffer = TrajectoryBuffer(setup.protocol(source), name=FROM_LOG)
+def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:
+    """What the device's own INS said, and what became of its solutions."""
+    buffer = TrajectoryBuffer(setup.protocol(setup.ins_source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
-    trajectory = buffer.snapshot()
-    if len(trajectory) < 2:
-        raise UserError(f"{log}: {source}: its INS had no solution; want --trajectory FILE")
-    return trajectory, {what: count for what, count in sorted(buffer.counts.items()) if count}
+    return buffer.snapshot(), {what: count for what, count in sorted(buffer.counts.items()) if count}
+
+
+def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
+    """Smoothed from IMU and GNSS."""
+    from daemon.processing.navigate import NavigateWish, navigate_session
+    from daemon.processing.navigation_inputs import InputWish
+
+    log = session.parts[0].path
+    if setup.imu_source is None or not setup.config.gnss:
+        told = f"{setup.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"
+        missing = "no receiver" if setup.imu_source is not None else "no IMU"
+        raise UserError(f"{log}: {told}, and {missing} to make one; want --trajectory FILE", ExitCode.USAGE)
+    try:
+        return navigate_session(session, NavigateWish(InputWish(config=setup.config)))
+    except UserError as error:
+        hint = "; or give --trajectory FILE"
+        raise UserError("\n".join(f"{line}{hint}" for line in error.message.splitlines()), error.exit_code) from error
 
 
 def offset_of(at: str, config: Config) -> Vector | None:

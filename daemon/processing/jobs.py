@@ -50,21 +50,30 @@ class JobError(Exception):
 
 
 @dataclass(frozen=True)
-class SessionPlan:
-    """What all jobs of a session share; pickles.
+class JobPlan:
+    """What all jobs of a session share, whatever they do; pickles.
 
     Attributes:
         index: where the chunks stand.
         setup: what makes points.
         clocks: the host's, complete.
-        las: of the files.
-        intensity_factors: by scanner.
-        copc: the files are cloud optimised.
     """
 
     index: LogIndex
     setup: Setup
     clocks: FrozenClocks
+
+
+@dataclass(frozen=True)
+class SessionPlan(JobPlan):
+    """Of jobs that write files of points.
+
+    Attributes:
+        las: of the files.
+        intensity_factors: by scanner.
+        copc: the files are cloud optimised.
+    """
+
     las: LasSettings
     intensity_factors: dict[str, float]
     copc: bool = False
@@ -206,7 +215,24 @@ def _write(
     if job.dropped is not None:
         dropped = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
         opened.callback(dropped.close)
-    unread = Unread({name: feed.parser(f"scanner/{name}") for name in names})
+    feed_job(plan, job, result, feed, write, tell)
+    sink.close()
+    result.clipped = sink.clipped
+    if dropped is not None:
+        result.withheld, result.listed = dropped.withheld, dropped.rows
+
+
+def feed_job(
+    plan: JobPlan,
+    job: Job,
+    result: JobResult,
+    feed: LogFeed,
+    write: Callable[[list[tuple[str, Points]]], None],
+    tell: Tell,
+) -> None:
+    """A job's messages through a feed of its own, which is closed; counts what became of them."""
+    stream = feed.stream
+    unread = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
     was_own = False
     for batch, own in _messages(plan, job, result, tell):
         if own is not was_own:
@@ -216,15 +242,12 @@ def _write(
         write(feed.take(batch, context=not own))
     write(feed.close())
     unread.note(own=was_own)
-    sink.close()
-    result.clipped, result.unread = sink.clipped, unread.counts
-    if dropped is not None:
-        result.withheld, result.listed = dropped.withheld, dropped.rows
-    for name in names:
-        fates = georeferenced.fates(name)
+    result.unread = unread.counts
+    for name in stream.scanners:
+        fates = stream.fates(name)
         result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})
         result.points += fates.get(Fate.GEOREFERENCED, 0)
-        result.time_refused[name] = georeferenced.clocks.refused(f"scanner/{name}")
+        result.time_refused[name] = stream.clocks.refused(f"scanner/{name}")
 
 
 def _sink(plan: SessionPlan, job: Job, stream: BinaryIO, opened: ExitStack) -> PointSink:
@@ -294,7 +317,7 @@ def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
         result.fates[source.removeprefix("scanner/")] = Counter({BETWEEN_STRIPS: counts[source]})
 
 
-def _messages(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> Iterator[tuple[LogBatch, bool]]:
+def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterator[tuple[LogBatch, bool]]:
     """Messages of the job's chunks, in the order of the file, and whether they are its own or of the margin."""
     start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
     own_damage: list[PartDamage] = []

@@ -77,18 +77,19 @@ class LiveSession:
         beside_recorder: bool = False,
     ) -> None:
         """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
-        if setup.ins_source is None:
-            raise UserError(
-                f"{info.session_id}: no configured device tells its own INS solution, which points are made with while "
-                "it is recorded; record one, or georeference afterwards with a trajectory",
-                ExitCode.USAGE,
-            )
         self.info = info
         self.now_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
         self._feed = LogFeed(setup, self._stream)
+        if setup.ins_source is None and self._feed.navigator is None:
+            raise UserError(
+                f"{info.session_id}: no configured device tells its own INS solution, nor are there both an IMU and a "
+                "receiver to navigate by, and without a trajectory nothing is made while it is recorded; add them, or "
+                "georeference afterwards",
+                ExitCode.USAGE,
+            )
         reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
         self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about)
@@ -104,6 +105,7 @@ class LiveSession:
         self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
         self.status.note_batch(batch, self.host_now_ns(live=live))
         placed = self._feed.take(batch)
+        self.status.navigation = None if self._feed.navigator is None else self._feed.navigator.state
         if placed:
             self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)

@@ -51,9 +51,14 @@ class Latencies:
 
 
 class LiveStatus:
-    """Collects over one recording; `plain` says how things are."""
+    """Collects over one recording; `plain` says how things are.
+
+    Attributes:
+        navigation: what the navigator waits for, or how it began, in words; None: the device's own INS is used.
+    """
 
     def __init__(self, setup: Setup, stream: Stream, products: LiveProducts) -> None:
+        self.navigation: str | None = None
         self._setup, self._stream, self._products = setup, stream, products
         self._pulse: dict[str, Latencies] = {}
         self._log: dict[str, Latencies] = {}
@@ -111,6 +116,7 @@ class LiveStatus:
             "points": {name: products.points[name] for name in stream.scanners},
             "points_per_s": rates,
             "waiting": {name: stream.waiting(name) for name in stream.scanners},
+            "navigation": self.navigation,
             "fates": {
                 name: {FATE_NAMES[fate]: count for fate, count in stream.fates(name).items()}
                 for name in stream.scanners

@@ -191,8 +191,11 @@ def connect(chain: ScannerChain, parser: Parser) -> None:
 
 def make_motion(table: ScannerConfig, model: SensorModel) -> EncoderMotion | None:
     """What tells how the encoder moves; None where the calibration does not ask."""
-    if not model.needs_encoder_motion:
-        return None
+    return motion_of(table) if model.needs_encoder_motion else None
+
+
+def motion_of(table: ScannerConfig) -> EncoderMotion:
+    """What tells how a scanner's encoder moves."""
     kind = table.geometry.type if table.geometry is not None else None
     swings = table.protocol == "srep" and kind in (None, "oscillating")
     return EncoderMotion(steady=not swings, facets=kind == "polygon")

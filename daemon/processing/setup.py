@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
+from daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
 from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from daemon.errors import ConfigError, UserError
 from daemon.log.format import LogError, SessionInfo
@@ -28,7 +28,7 @@ from daemon.processing.models import (
     make_resolver,
     refuse_logged_gimbals,
 )
-from daemon.processing.terrain import read_terrain
+from daemon.processing.terrain import terrain_of
 from drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
 from drivers.core.registry import UnknownProtocolError, find_driver
 from georef.calibration import Calibration, CalibrationError, nominal, read_calibration
@@ -47,7 +47,6 @@ SECOND_NS = 1_000_000_000
 ARCSEC = math.pi / 648_000
 REACH_NS = 1_000_000  # beyond its own stamp, of a return whose calibration shifts no times
 OFFICE = StreamSettings(settle_s=2.0)  # so that a latched edge on either side of a return is known
-DeviceTable = GnssConfig | ImuConfig | ScannerConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +98,7 @@ class Setup:
         self.ins_source = self._ins_source()
         self.calibrations = {name: self._calibration(name) for name in self.scanners}
         self.mapping = self._mapping()
-        self.terrain = self.options.terrain or self._terrain()
+        self.terrain = self.options.terrain or terrain_of(config)
         self._georeferencers = self._made(None)
 
     @classmethod
@@ -267,7 +266,16 @@ class Setup:
         path = GrowingPath(
             TrajectoryBuffer(self.protocol(self.ins_source), name=self.ins_source or ""), self.deflection_rad
         )
-        return Stream(self._chains(), StreamClocks.growing(self.clock_plan(info)), path, settings)
+        plan = self.clock_plan(info)
+        if self.imu_source is not None and self.clock_of_imu is not None:  # by whose clock a navigator places samples
+            plan = replace(plan, devices={**plan.devices, self.imu_source: DevicePlan(self.clock_of_imu)})
+        return Stream(self._chains(), StreamClocks.growing(plan), path, settings)
+
+    def navigator(self, clocks: StreamClocks) -> Any:
+        """What finds the way of a growing log, a `Navigator`; None: there are not both an IMU and a receiver."""
+        from daemon.processing.navigator import navigator_of
+
+        return navigator_of(self.config, self._attachments, clocks)
 
     def office_stream(self, clocks: FrozenClocks, trajectory: Trajectory, settings: StreamSettings = OFFICE) -> Stream:
         """A stream with all of a log's clock and a complete trajectory, which is taken as it is."""
@@ -350,14 +358,6 @@ class Setup:
             )
         except ValueError as error:
             raise ConfigError(f"scanner.{name}: {error}") from error
-
-    def _terrain(self) -> CoarseTerrain | None:
-        if not self.config.mta.terrain:
-            return None
-        path = self.config.resolve(self.config.mta.terrain)
-        if not path.exists():
-            raise ConfigError(f"mta.terrain: {path} is not there, and no log holds it; put it there, or take it out")
-        return read_terrain(path)
 
     def _mapping(self) -> MappingFrame | None:
         output = self.config.output

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
+from daemon.config.config import Config
 from daemon.errors import ConfigError
 from georef.coarse_terrain import CoarseTerrain
 
@@ -27,6 +28,20 @@ class ToGrid:
         """(n,) x and y in the raster's CRS."""
         x, y = self._transformer.transform(np.degrees(lon_rad), np.degrees(lat_rad))
         return np.asarray(x), np.asarray(y)
+
+
+def terrain_of(config: Config) -> CoarseTerrain | None:
+    """Of a configuration; None: it names none.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    if not config.mta.terrain:
+        return None
+    path = config.resolve(config.mta.terrain)
+    if not path.exists():
+        raise ConfigError(f"mta.terrain: {path} is not there, and no log holds it; put it there, or take it out")
+    return read_terrain(path)
 
 
 def read_terrain(path: Path) -> CoarseTerrain:

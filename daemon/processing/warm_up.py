@@ -1,4 +1,4 @@
-"""Compiles what `swath live` and `swath georef` run, before there is anything to run it on, and keeps it on disk.
+"""Compiles what `swath live`, `georef` and `calibrate` run, before there is anything to run it on, and keeps it.
 
 A moment of made-up returns goes the whole way: parser, model, air, mapping frame, products. What has been kept from
 before is only read. Nothing here knows which loops there are; a loop is warm because it has run.
@@ -31,6 +31,7 @@ from daemon.processing.live_frame import LocalFrame, Maps
 from daemon.processing.live_grid import CountGrid, count_points
 from daemon.processing.live_products import Thinning
 from daemon.processing.setup import Options, Setup
+from daemon.processing.warm_navigation import warm_navigation
 from drivers.core.parser import DeviceSettings, Parser
 from drivers.core.registry import find_driver
 from drivers.scanner.hesai import MODE_LAST_STRONGEST, encode_point_packet
@@ -137,15 +138,20 @@ def cache_folder() -> Path | None:
     return None if path is None else Path(path)
 
 
-def warm_up(setups: Iterable[Setup] = ()) -> WarmUp:
-    """Run everything once: for what any configuration is made of, and for those that are given."""
+def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False) -> WarmUp:
+    """Run everything once: for what any configuration is made of, and for those that are given; calibration on wish."""
     began_s = time.monotonic()
     with compilations() as names:
         _warm_parsers()
+        warm_navigation()
         for plan, uncertainty in product(PLANS, (False, True)):
             warm_setup(_setup(plan, uncertainty))
         for setup in setups:
             warm_setup(setup)
+        if calibration:
+            from daemon.processing.warm_calibration import warm_calibration
+
+            warm_calibration()
     return WarmUp(len(names), time.monotonic() - began_s, cache_folder())
 
 
@@ -167,6 +173,8 @@ def get_ready(setup: Setup) -> None:
 
 def warm_setup(setup: Setup) -> None:
     """Run once what one configuration needs; the setup itself is left as it is."""
+    if setup.imu_source is not None and setup.config.gnss:
+        warm_navigation()
     copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
     parsers = copy.parsers(("scanner",))
     for name in copy.scanners:

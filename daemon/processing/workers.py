@@ -14,29 +14,37 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from daemon.errors import ExitCode, UserError
-from daemon.processing.jobs import Job, JobResult, SessionPlan, run_job
+from daemon.processing.jobs import Job, JobResult, run_job
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
 DIED = "the process died, as it does when memory is short"
 END_S = 5.0  # for a process to end when it was told to
 Progress = Callable[[int], None]  # bytes done so far
+Do = Callable[[Any, Job, Progress], JobResult]  # with the plan of its session; is told bytes
 
-_plans: list[SessionPlan] = []  # of a worker process
+_plans: list[Any] = []  # of a worker process
 _done: Any = None  # its share of the bytes done
 
 
 def run_jobs(
-    plans: Sequence[SessionPlan], jobs: Sequence[Job], *, workers: int, scheduler: str | None, progress: Progress
+    plans: Sequence[Any],
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    scheduler: str | None,
+    progress: Progress,
+    do: Do = run_job,
 ) -> list[JobResult]:
     """Do all jobs.
 
     Args:
-        plans: of the sessions.
+        plans: of the sessions, `daemon.processing.jobs.JobPlan`.
         jobs: in any order.
         workers: processes here; 1: in this one.
         scheduler: address of a Dask scheduler; None: none.
         progress: is told the bytes done.
+        do: what is done; a function of a module, for it is named to the processes.
 
     Returns:
         Results in the order of the jobs. A job whose process died is one that failed.
@@ -48,16 +56,16 @@ def run_jobs(
     """
     order = sorted(range(len(jobs)), key=lambda number: (-jobs[number].size, number))
     if scheduler is not None:
-        results = _on_cluster(plans, jobs, order, scheduler, progress)
+        results = _on_cluster(plans, jobs, order, scheduler, progress, do)
     elif workers <= 1:
-        results = _here(plans, jobs, order, progress)
+        results = _here(plans, jobs, order, progress, do)
     else:
-        results = _in_processes(plans, jobs, order, min(workers, len(jobs)), progress)
+        results = _in_processes(plans, jobs, order, min(workers, len(jobs)), progress, do)
     return [results[number] for number in range(len(jobs))]
 
 
 def _here(
-    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], progress: Progress
+    plans: Sequence[Any], jobs: Sequence[Job], order: list[int], progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     done = 0
 
@@ -66,7 +74,7 @@ def _here(
         done += size
         progress(done)
 
-    return {number: run_job(plans[jobs[number].session], jobs[number], tell) for number in order}
+    return {number: do(plans[jobs[number].session], jobs[number], tell) for number in order}
 
 
 def _failed(job: Job, why: str) -> JobResult:
@@ -106,16 +114,16 @@ def _held_interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _do(job: Job) -> JobResult:
+def _do(do: Do, job: Job) -> JobResult:
     def tell(size: int) -> None:
         with _done.get_lock():
             _done.value += size
 
-    return run_job(_plans[job.session], job, tell)
+    return do(_plans[job.session], job, tell)
 
 
 def _in_processes(
-    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress
+    plans: Sequence[Any], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     context = multiprocessing.get_context("spawn")
     done = context.Value("q", 0)
@@ -127,7 +135,7 @@ def _in_processes(
         with _held_interrupts():
             for number in order:
                 try:
-                    futures[pool.submit(_do, jobs[number])] = number
+                    futures[pool.submit(_do, do, jobs[number])] = number
                 except BrokenProcessPool:
                     results[number] = _failed(jobs[number], DIED)
         pending: set[Future[JobResult]] = set(futures)
@@ -156,7 +164,7 @@ def _in_processes(
 
 
 def _on_cluster(
-    plans: Sequence[SessionPlan], jobs: Sequence[Job], order: list[int], scheduler: str, progress: Progress
+    plans: Sequence[Any], jobs: Sequence[Job], order: list[int], scheduler: str, progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     try:
         distributed: Any = importlib.import_module("distributed")
@@ -171,7 +179,7 @@ def _on_cluster(
     with client:
         shared = client.scatter(list(plans), broadcast=True, hash=False)
         futures = {
-            client.submit(_do_with, shared, jobs[number], pure=False, priority=-rank): number
+            client.submit(_do_with, do, shared, jobs[number], pure=False, priority=-rank): number
             for rank, number in enumerate(order)
         }
         try:
@@ -187,8 +195,8 @@ def _on_cluster(
     return results
 
 
-def _do_with(plans: list[SessionPlan], job: Job) -> JobResult:
-    return run_job(plans[job.session], job)
+def _do_with(do: Do, plans: list[Any], job: Job) -> JobResult:
+    return do(plans[job.session], job, lambda size: None)
 
 
 def _result_of(future: Any, job: Job) -> JobResult:

@@ -56,7 +56,7 @@ class TestHelp:
         run = swath("--help", COLUMNS="80")
         assert run.returncode == 0
         lines = run.stdout.splitlines()
-        assert len([line for line in lines if line.strip()]) <= 40
+        assert len([line for line in lines if line.strip()]) <= 48
         for listed in COMMANDS:
             assert any(line.startswith(f"│ {listed.name} ") for line in lines), listed.name
             assert any(line.startswith(f"╭─ {listed.panel} ") for line in lines), listed.panel
@@ -223,12 +223,24 @@ class TestDevices:
                 assert all(record.__name__ in text for record in driver.yields)
 
 
+SOURCES = ["pps/main", "gnss/rover", "imu/main", "scanner/left", "corrections/base"]
+
+
 class TestCheckOffline:
     def test_a_valid_configuration_opens_nothing_and_lists_its_sources(self) -> None:
         run = swath("check", "--offline", str(AIRCRAFT))
         assert run.returncode == 0
-        assert run.stdout == f"{AIRCRAFT}: valid; 4 sources: pps/main, gnss/rover, imu/main, scanner/left\n"
+        assert (
+            run.stdout
+            == f"{AIRCRAFT}: valid; 5 sources: pps/main, gnss/rover, imu/main, scanner/left, corrections/base\n"
+        )
 
     def test_json(self) -> None:
         run = swath("check", "--offline", "--json", str(AIRCRAFT))
-        assert json.loads(run.stdout)["sources"] == ["pps/main", "gnss/rover", "imu/main", "scanner/left"]
+        assert json.loads(run.stdout)["sources"] == [
+            "pps/main",
+            "gnss/rover",
+            "imu/main",
+            "scanner/left",
+            "corrections/base",
+        ]

@@ -246,7 +246,7 @@ class TestDevices:
 
     def test_devices_carry_all_a_recorder_needs(self, config: Config) -> None:
         devices = {device.source: device for device in config.devices()}
-        assert list(devices) == ["gnss/rover", "imu/main", "scanner/left"]
+        assert list(devices) == ["gnss/rover", "imu/main", "scanner/left", "corrections/base"]
         imu, scanner = devices["imu/main"], devices["scanner/left"]
         assert (imu.transport.kind, imu.transport.address) == ("can", "socketcan:can0")
         assert imu.files == {"dbc": FIXTURES / "imu.dbc"}
@@ -330,7 +330,8 @@ def _findings(table: dict[str, Any]) -> list[str]:
         config = validate(table, AIRCRAFT, "")
     except ConfigError as error:
         return error.lines or ["an error without a line"]
-    assert len(list(config.devices())) == len(config.gnss) + len(config.imu) + len(config.scanner)
+    count = len(config.gnss) + len(config.imu) + len(config.scanner) + len(config.corrections)
+    assert len(list(config.devices())) == count
     return []
 
 

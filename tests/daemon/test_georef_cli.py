@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -144,12 +145,25 @@ class TestProducts:
         twice = laspy.read(next((tmp_path / "again").glob("*_strip01.laz")))
         assert np.abs(las.xyz - twice.xyz).max() <= 0.001 + 1e-9  # what is written refers to the plumb line again
 
-    def test_without_a_trajectory_the_log_says_what_is_wanted(
+    def test_without_a_trajectory_the_imu_and_the_receiver_make_one(self, flown: Flown, tmp_path: Path) -> None:
+        arguments = flown.arguments(tmp_path / "x", "--no-sigma")
+        del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
+        assert run_app(arguments) in (0, 1)  # so short a flight is not aligned at its very beginning: partial
+        (flight,) = record(tmp_path / "x")["flights"]
+        assert flight["trajectory"]["name"] == "navigation of the log's IMU and GNSS"
+        assert flight["trajectory"]["epochs"] > 1000
+
+    def test_without_one_of_them_the_log_says_what_is_wanted(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        arguments = flown.arguments(tmp_path / "x")
+        text = re.sub(r"(?ms)^\[imu\..*?(?=^\[(?!imu))", "", (flown.folder / "swath.toml").read_text())
+        config = flown.folder / "no_imu.toml"
+        config.write_text(text)
+        arguments = flown.arguments(tmp_path / "x", "--config", str(config))
         del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
-        assert "want --trajectory FILE" in refused(capsys, tmp_path / "x", arguments)
+        line = refused(capsys, tmp_path / "x", arguments)
+        assert "no IMU" in line
+        assert "want --trajectory FILE" in line
 
 
 class TestStrips:

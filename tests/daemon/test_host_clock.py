@@ -65,9 +65,17 @@ def test_batch_across_a_step_takes_old_and_new(converter: StampConverter, step_n
 
 def test_stamp_that_fits_neither_step_takes_the_read_time(converter: StampConverter) -> None:
     converter.convert_at(None, 1, pair(1.0))
-    stale = np.array([host(0.2)], dtype=np.int64)
+    stale = np.array([host(-600)], dtype=np.int64)
     assert converter.convert_at(stale, 1, pair(1.5, HOUR)).tolist() == [host(1.5)]
     assert converter.ambiguous == 1
+
+
+@pytest.mark.parametrize("step_ns", [HOUR, -HOUR, SECOND, -SECOND])
+def test_unit_that_came_before_the_reading_after_the_previous_batch(converter: StampConverter, step_ns: int) -> None:
+    converter.convert_at(None, 1, pair(1.0))
+    came = np.array([host(0.98)], dtype=np.int64)  # the thread was kept waiting between its read and the clocks'
+    assert converter.convert_at(came, 1, pair(1.5, step_ns)).tolist() == [host(0.98)]
+    assert converter.ambiguous == 0
 
 
 def test_a_wide_bracket_is_not_taken_for_a_step(converter: StampConverter) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -206,9 +207,12 @@ class TestPoints:
         np.testing.assert_allclose(late["time_ns"], theirs["time_ns"], rtol=0, atol=100)
         np.testing.assert_allclose(late["points_map"], theirs["points_map"], rtol=0, atol=1e-4)
 
-    def test_without_a_solution_of_the_device_nothing_can_be_made(self, flown: Flown, tmp_path: Path) -> None:
+    def test_without_a_solution_of_the_device_and_an_imu_nothing_can_be_made(
+        self, flown: Flown, tmp_path: Path
+    ) -> None:
         attachments = flown.session().attachments()
-        attachments["config.toml"] = attachments["config.toml"].replace(b'"novatel"', b'"nmea"')
+        text = attachments["config.toml"].replace(b'"novatel"', b'"nmea"')
+        attachments["config.toml"] = re.sub(rb"(?ms)^\[imu\..*?(?=^\[(?!imu))", b"", text)
         setup = Setup.of_log(attachments, Options(datum="same", uncertainty=False))
         with pytest.raises(UserError, match="no configured device tells its own INS solution"):
             replay(flown.session(), setup, tmp_path, LiveConfig(), None)

@@ -42,8 +42,8 @@ def running(*words: str | Path, output: IO[str] | int = subprocess.DEVNULL) -> I
 def config_of(wires: Path, folder: Path) -> str:
     """The configuration that reads a flight's wires, and its files beside it."""
     wait_until((wires / "pps-main").exists, "the last of the wires")
-    for name in ("left.nominal.toml", "right.nominal.toml", "main.dbc"):
-        (folder / name).write_bytes((wires / name).read_bytes())
+    for path in [*wires.glob("*.nominal.toml"), wires / "main.dbc"]:
+        (folder / path.name).write_bytes(path.read_bytes())
     text = (wires / "swath.toml").read_text().replace('"novatel"', '"novatel"\ndatum = "same"')
     head = session_table(folder / "logs", name='"growing"', split_minutes=PART_MINUTES)
     return text.replace(text[: text.index("[pps.main]")], head)

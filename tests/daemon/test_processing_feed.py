@@ -8,8 +8,8 @@ from __future__ import annotations
 import hashlib
 import pickle
 import random
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from daemon.config import Config, load_config
 from daemon.log import scan as scan_module
 from daemon.log.chunks import LogBatch
 from daemon.log.follow import PartFollower
-from daemon.log.format import LogError
+from daemon.log.format import ChannelSpec, LogError
 from daemon.log.reader import Session, open_logs
 from daemon.processing import feed as feed_module
 from daemon.processing.feed import LogClocks, LogFeed, Placed, read_clocks
@@ -29,7 +29,7 @@ from daemon.processing.setup import Options, Setup
 from daemon.sim_log import fly_into_log
 from georef.coarse_terrain import CoarseTerrain
 from georef.points import Fate
-from georef.records import Int64Array, StructArray
+from georef.records import ChunkBatch, Int64Array, Record, StructArray
 from georef.stream import Stream, StreamSettings
 from georef.trajectory import Trajectory
 from georef.trajectory_buffer import TrajectoryBuffer
@@ -299,6 +299,44 @@ def test_what_is_no_reading_and_no_edge_is_left_out(setup: Setup, flown: Flown) 
     assert feed.counts["pps/main"] == {"refused": 3}
 
 
+def test_a_scanners_units_of_any_lengths_are_decoded_together(
+    setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until they are enough, come by another wire, or a tick comes."""
+    session = flown.session()
+    feed = LogFeed(setup, setup.live_stream(session.info))
+    left = next(batch for batch in session.batches() if batch.channel.topic == "/scanner/left/raw")
+    aux = replace(left.channel, topic="/scanner/left/aux/raw")
+    seen: list[list[tuple[int, ...]]] = []
+
+    def noted(batches: Sequence[ChunkBatch]) -> list[Record]:
+        assert len({batch.source for batch in batches}) == 1
+        seen.append([batch.units.shape for batch in batches])
+        return []
+
+    monkeypatch.setattr(feed.parser("scanner/left"), "feed_batches", noted)
+
+    def take(channel: ChannelSpec, count: int, length: int, after_ns: int = 0) -> None:
+        rows = np.zeros((count, 31 + length), np.uint8)
+        feed.take(LogBatch(channel, left.channel_id, np.full(count, 10**18 + after_ns), rows))
+
+    for count, length in ((3, 1492), (1, 52), (2, 412)):
+        take(left.channel, count, length)
+    assert seen == []
+    take(aux, 1, 52)
+    assert seen == [[(3, 1492), (1, 52), (2, 412)]]
+    take(left.channel, 100, 1492)
+    take(left.channel, 1, 1000)
+    assert seen[1:] == [[(1, 52)]]
+    take(left.channel, 1, feed_module.JOINED_BYTES - 150_200)
+    assert seen[2:] == [[(100, 1492), (1, 1000), (1, feed_module.JOINED_BYTES - 150_200)]]
+    take(left.channel, 4, 52)
+    take(left.channel, 4, 60, after_ns=200_000_000)
+    assert seen[3:] == [[(4, 52)]]
+    feed.close()
+    assert seen[4:] == [[(4, 60)]]
+
+
 def test_a_log_whose_time_stands_still_is_decided_on_by_its_bytes(
     setup: Setup, flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -325,10 +363,10 @@ def test_a_batch_is_split_at_every_tick_that_it_passes(
     readings: list[int] = []
     monkeypatch.setattr(stream, "advance", lambda tick_ns: [seen.append((tick_ns, len(readings)))][:0])  # type: ignore[func-returns-value]
     monkeypatch.setattr(stream.clocks, "add_reading", lambda *reading: readings.append(0))
-    times = 10**18 + 10**6 * np.array([0, 30, 99, 100, 90, 130, 199, 450, 460, 440, 500])
+    times = 10**18 + 10**6 * np.array([0, 60, 199, 200, 180, 260, 399, 900, 920, 880, 1000])
     feed = LogFeed(setup, stream)
     feed.take(LogBatch(clock.channel, clock.channel_id, times, np.repeat(clock.rows[:1], len(times), axis=0)))
-    assert [(tick - 10**18) // 10**6 for tick, _ in seen] == [100, 400, 500]
+    assert [(tick - 10**18) // 10**6 for tick, _ in seen] == [200, 800, 1000]
     assert [before for _, before in seen] == [3, 7, 10]
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from daemon.cli.main import run_app
 from daemon.log.reader import open_logs
-from daemon.processing import workers
+from daemon.processing import products, workers
 from daemon.processing.jobs import Job, JobResult, SessionPlan, Tell, run_job
 from daemon.processing.log_index import index_log, read_chunks
 from georef.strips import Segment
@@ -115,22 +116,19 @@ class TestWorkers:
         """Of no size."""
         return [Job(0, Segment(number, 0, 1), []) for number in range(count)]
 
-    def test_results_come_in_the_order_of_the_jobs(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(workers, "run_job", counts)
+    def test_results_come_in_the_order_of_the_jobs(self) -> None:
         told: list[int] = []
-        plans: list[SessionPlan] = [None]  # type: ignore[list-item]
-        results = workers.run_jobs(plans, self.jobs(4), workers=1, scheduler=None, progress=told.append)
+        results = workers.run_jobs([None], self.jobs(4), workers=1, scheduler=None, progress=told.append, do=counts)
         assert [result.strip for result in results] == [0, 1, 2, 3]
         assert told == [5, 10, 15, 20]
 
-    def test_a_process_that_dies_is_a_strip_that_failed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(workers, "_do", _dying)
-        results = workers.run_jobs([], self.jobs(2), workers=2, scheduler=None, progress=lambda done: None)
+    def test_a_process_that_dies_is_a_strip_that_failed(self) -> None:
+        results = workers.run_jobs([None], self.jobs(2), workers=2, scheduler=None, progress=lambda done: None, do=dies)
         assert [bool(result.failed) for result in results] == [True, True]
         assert "memory" in results[0].failed
 
 
-def _dying(job: Job) -> JobResult:
+def dies(plan: SessionPlan, job: Job, tell: Tell) -> JobResult:
     os._exit(9)
 
 
@@ -145,7 +143,7 @@ def test_a_strip_that_failed_makes_the_products_partial(
             return workers._failed(job, "the process died")
         return run_job(plan, job, tell)
 
-    monkeypatch.setattr(workers, "run_job", second_fails)
+    monkeypatch.setattr(products, "run_jobs", partial(workers.run_jobs, do=second_fails))
     assert run_app(flown.arguments(tmp_path, "--strips", str(alone[0]))) == 1
     told = json.loads((tmp_path / f"{flown.name}.json").read_text())
     assert not told["complete"]

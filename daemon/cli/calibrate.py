@@ -1,0 +1,125 @@
+"""``swath calibrate``: from the logs of a calibration flight to the scanner's parameters."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
+
+OBSERVE = ("planes", "ties", "markings")
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="FILE.toml; of several scanners a folder.")
+    ],
+    scanner: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this one; may be repeated. Default: all.")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="SBET, Waypoint text, .pos or CSV; default: the log's own.")
+    ] = None,
+    control: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+    ] = None,
+    ties: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Picked points: name,strip,x,y,z,sigma_m in output.crs.")
+    ] = None,
+    polygons: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Planes to use: WKT,name; polygons in output.crs.")
+    ] = None,
+    model: Annotated[str, typer.Option(help="basic, scanner or full.")] = "scanner",
+    fix: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters that keep their value, as phi_deg.")] = "",
+    free: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters beyond the model.")] = "",
+    prior: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=SIGMA", help="Held to its start by one sigma; may be repeated.")
+    ] = None,
+    observe: Annotated[
+        str, typer.Option(metavar="WHAT,…", help="planes or ties (their intersections); markings.")
+    ] = "planes",
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Report as page and PDF, record by ISO 19159, pictures.")
+    ] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option("--calibration", metavar="[SCANNER=]FILE", help="To begin with, instead of the log's own."),
+    ] = None,
+    datum: Annotated[
+        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help="Coordinate system; over output.crs.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
+    strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
+    limit_deg: Annotated[float, typer.Option("--limit-deg", help="Boresight may change by so much.", min=0.0)] = 5.0,
+    limit_m: Annotated[float, typer.Option("--limit-m", help="The range offset likewise.", min=0.0)] = 10.0,
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The outcome to stdout, for scripts.")] = False,
+) -> None:
+    """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
+
+    What this flight cannot determine is held, and said. Exit code 1 where no calibration could be made that would
+    be worth its name; then no file is written.
+    """
+    require_installed("swath calibrate", *(["matplotlib"] if report else []))
+    from daemon.cli.georef import calibrations_given
+    from daemon.config import load_config
+    from daemon.processing.calibrate_model import model_of
+    from daemon.processing.calibrate_products import write_products
+    from daemon.processing.calibrate_run import CalibrateWish, calibrate
+    from daemon.processing.flights import Wish
+    from daemon.processing.flown import TrajectoryWish
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.setup import Options
+
+    _refuse(output, observe, overwrite=overwrite)
+    wish = CalibrateWish(
+        logs=Wish(
+            logs=logs,
+            output=output,
+            trajectory=TrajectoryWish(trajectory, navigate=True),
+            options=Options(
+                crs=crs,
+                datum=datum,
+                scanners=tuple(scanner or ()),
+                calibrations=calibrations_given(start or []),
+                uncertainty=False,
+            ),
+            config=None if config is None else load_config(config),
+            strips=strips,
+            workers=workers or os.cpu_count() or 1,
+        ),
+        output=output,
+        model=model_of(model, fix, free, prior or []),
+        control=control,
+        ties=ties,
+        polygons=polygons,
+        observe=tuple(observe.split(",")),
+        report=report,
+        limit_deg=limit_deg,
+        limit_m=limit_m,
+        overwrite=overwrite,
+    )
+    with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
+        told = write_products(wish, calibrate(wish, Path(folder), tell), tell)
+    print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
+
+
+def _refuse(output: Path, observe: str, *, overwrite: bool) -> None:
+    unknown = [word for word in observe.split(",") if word not in OBSERVE]
+    if unknown:
+        raise UserError(f'--observe: got "{unknown[0]}", want {", ".join(OBSERVE)}', ExitCode.USAGE)
+    if {"planes", "ties"} <= set(observe.split(",")):
+        raise UserError("--observe: planes and ties are of the same returns; want one of both", ExitCode.USAGE)
+    if output.is_file() and not overwrite:
+        raise UserError(f"{output}: is there already; want another name, or --overwrite", ExitCode.USAGE)
+    if not output.resolve().parent.is_dir():
+        raise UserError(f"{output}: no such folder: {output.parent}", ExitCode.USAGE)

@@ -1,0 +1,108 @@
+"""``swath plan-calibration``: before take-off, what a planned flight would determine of the calibration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daemon.cli.sim import PlanArgument
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from daemon.processing.calibration_plan import PlannedCalibration
+
+
+def command(
+    plan: PlanArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="PNG, PDF or SVG; else <plan>-calibration.png, here."),
+    ] = None,
+    model: Annotated[str, typer.Option(help="basic, scanner or full: which parameters.")] = "scanner",
+    sigmas: Annotated[
+        str | None,
+        typer.Option(
+            metavar="P,R,H",
+            help="Expected of the trajectory: position (m), roll and pitch, heading (degrees); else by the IMU.",
+        ),
+    ] = None,
+    no_control: Annotated[bool, typer.Option("--no-control", help="Without the plan's control points.")] = False,
+    control_sigma: Annotated[
+        float, typer.Option("--control-sigma", metavar="M", help="Of control points.", min=0.0005, max=1.0)
+    ] = 0.01,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Predict what a calibration of a planned flight would find: each parameter's sigma, or why it cannot be found.
+
+    The plan is flown over its terrain on paper: roofs, ground and control points that the lines see go through the
+    equations of `swath calibrate`. Exit code 1 where boresight or range offset would not be determined.
+    """
+    require_installed("swath plan-calibration", "matplotlib")
+    from rich.console import Console
+
+    from daemon.processing.calibration_plan import PlanWish, plan_calibration
+    from daemon.processing.calibration_plan_page import draw_planned, require_picture
+    from daemon.sim_plans import Wish
+
+    picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
+    require_picture(picture)
+    asked = PlanWish(model, None if sigmas is None else _three(sigmas), not no_control, control_sigma)
+    wish = Wish(plan)
+    with Console(stderr=True).status("flying on paper"), wish.told():
+        planned = plan_calibration(wish.load(), asked)
+        try:
+            draw_planned(planned, picture)
+        except OSError as error:
+            raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
+    if as_json:
+        print(json.dumps(_document(planned, picture), indent=2))
+    else:
+        _print(Console(), planned, picture)
+    if planned.lacking:
+        raise UserError(one_line(f"{plan}: {planned.sentence}"))
+
+
+def _three(text: str) -> tuple[float, float, float]:
+    try:
+        position_m, tilt_deg, heading_deg = (float(part) for part in text.split(","))
+    except ValueError as error:
+        wanted = "want three numbers: position (m), roll and pitch, heading (degrees), as 0.02,0.004,0.01"
+        raise UserError(f'--sigmas: got "{one_line(text)}", {wanted}', ExitCode.USAGE) from error
+    if not 0.0 < min(position_m, tilt_deg, heading_deg) <= max(position_m, tilt_deg, heading_deg) < 100.0:
+        raise UserError(f'--sigmas: got "{one_line(text)}", want numbers above 0 and below 100', ExitCode.USAGE)
+    return position_m, tilt_deg, heading_deg
+
+
+def _document(planned: PlannedCalibration, picture: Path) -> dict[str, Any]:
+    return {
+        "verdict": planned.sentence,
+        "parameters": [{key: value for key, value in row.items() if key != "basic"} for row in planned.rows],
+        "planes": planned.predicted.planes,
+        "control_points": planned.control,
+        "trajectory_sigmas": dict(zip(("position_m", "roll_pitch_deg", "heading_deg"), planned.sigmas, strict=True)),
+        "picture": str(picture),
+    }
+
+
+def _print(console: Console, planned: PlannedCalibration, picture: Path) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("scanner", "parameter", "sigma", "wanted", "determined"):
+        table.add_column(column, justify="right" if column in ("sigma", "wanted") else "left")
+    for row in planned.rows:
+        sigma = "–" if row["sigma"] is None else f"{row['sigma']:.3g}"
+        word = "yes" if row["determined"] else "no"
+        table.add_row(one_line(row["scanner"]), row["name"], sigma, f"{row['wanted']:.3g}", word)
+    console.print(table)
+    for row in planned.rows:
+        if row["why"]:
+            print(one_line(f"{row['scanner']} {row['name']}: {row['why']}; to determine it: {row['remedy']}"))
+    print(planned.sentence)
+    print(one_line(str(picture)))

@@ -1,0 +1,77 @@
+"""``swath strips``: how far strips are from each other."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
+
+LEVELS = ("QL0", "QL1", "QL2", "QL3")
+
+
+def command(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="A folder of swath georef, LAS or LAZ files, or logs.", metavar="DIR|LOG…", readable=False),
+    ],
+    before: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="DIR|LOG", help="The same strips before, to compare with; may be repeated."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Difference maps and strips.json.")
+    ] = None,
+    level: Annotated[str | None, typer.Option(help="QL0, QL1, QL2 or QL3, which the strips must keep.")] = None,
+    cells: Annotated[int, typer.Option(help="Of the overlap, that are looked into.", min=100)] = 20_000,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text, .pos or CSV.")
+    ] = None,
+    calibration: Annotated[
+        list[str] | None, typer.Option(metavar="[SCANNER=]FILE", help="Of logs: instead of their own.")
+    ] = None,
+    datum: Annotated[
+        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+    ] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Of logs: instead of their own.")] = None,
+    strips: Annotated[str, typer.Option(help="Of logs: auto, whole, or a CSV of times.")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Compare strips: point to plane and gridded, what the differences look like, and what specifications say.
+
+    Exit code 1 when the differences show an error of the calibration that matters, when the level asked for is not
+    kept, or when nothing could be compared; 2 and 3 as ever.
+    """
+    require_installed("swath strips", *(["matplotlib"] if output else []))
+    from daemon.cli.georef import calibrations_given
+    from daemon.config import load_config
+    from daemon.processing.flights import Wish
+    from daemon.processing.flown import TrajectoryWish
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.setup import Options
+    from daemon.processing.strips_run import StripsWish, compare_strips, most_cells
+
+    if level is not None and level not in LEVELS:
+        raise UserError(f'--level: got "{level}", want one of {", ".join(LEVELS)}', ExitCode.USAGE)
+    logs = Wish(
+        logs=paths,
+        output=output or Path(),
+        trajectory=TrajectoryWish(trajectory, navigate=True),
+        options=Options(datum=datum, calibrations=calibrations_given(calibration or []), uncertainty=False),
+        config=None if config is None else load_config(config),
+        strips=strips,
+        workers=workers or os.cpu_count() or 1,
+    )
+    wish = StripsWish(paths, logs, before or (), most_cells(cells), output, level)
+    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
+        done = compare_strips(wish, Path(folder), tell)
+    print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
+    if done.problem:
+        raise UserError(done.problem)

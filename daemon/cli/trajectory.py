@@ -1,0 +1,118 @@
+"""``swath trajectory``: from a log's IMU and GNSS to where the aircraft was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
+
+
+def command(
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or directories of them.", metavar="LOG…", readable=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="FILE.sbet, FILE.out or FILE.csv; or a folder.")
+    ],
+    smooth: Annotated[
+        bool, typer.Option("--smooth/--realtime", help="Forward and backward; or forward only, as in flight.")
+    ] = True,
+    gnss: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Post-processed positions of the antenna: RTKLIB .pos or Waypoint text."),
+    ] = None,
+    week: Annotated[int | None, typer.Option(help="GPS week of such a file that says none.", min=0)] = None,
+    csv: Annotated[bool, typer.Option("--csv", help="Also as CSV, with sigmas.")] = False,
+    events: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV of the event marks, each with its pose.")
+    ] = None,
+    imu: Annotated[str | None, typer.Option(metavar="NAME", help="Of [imu.NAME]; default: the first.")] = None,
+    gnss_name: Annotated[
+        str | None, typer.Option("--gnss-name", metavar="NAME", help="Of [gnss.NAME]; default: the first.")
+    ] = None,
+    ins: Annotated[
+        str, typer.Option(metavar="HOW", help="A device's own INS: ignore, observe its attitude, or take it as-is.")
+    ] = "ignore",
+    start: Annotated[
+        str | None, typer.Option(metavar="R,P,H", help="Roll, pitch, heading at the start, degrees; default: found.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
+    no_page: Annotated[bool, typer.Option("--no-page", help="Leave the page of plots out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="The summary to stdout, for scripts.")] = False,
+) -> None:
+    """Navigate a log: SBET (or CSV) of the body with its accuracies, a JSON summary and one page of plots.
+
+    Every fix that was read is used or counted with the reason why not. Exit code 1 when the trajectory is partial or
+    not to be used: data damaged, parts missing, inputs that do not go together; 2 and 3 when there is none.
+    """
+    require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
+    from daemon.config import load_config
+    from daemon.processing.navigate import NavigateWish, attitude_of_text
+    from daemon.processing.navigation_inputs import INS_USES, InputWish
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.trajectory_run import TrajectoryWish, make_trajectory
+
+    if ins not in INS_USES:
+        raise UserError(f'--ins: got "{ins}", want {", ".join(INS_USES)}', ExitCode.USAGE)
+    inputs = InputWish(imu, gnss_name, None if config is None else load_config(config), gnss, week, ins)
+    attitude = None if start is None else attitude_of_text(start)
+    wish = TrajectoryWish(
+        logs,
+        output,
+        NavigateWish(inputs, smooth=smooth, attitude_rad=attitude),
+        csv=csv,
+        events=events,
+        page=not no_page,
+        overwrite=overwrite,
+    )
+    with progress_bar() as tell:
+        report = make_trajectory(wish, tell)
+    if as_json:
+        print(json.dumps(report.record, indent=2))
+    else:
+        _print(report.record, report.files)
+    unusable = [line for session in report.record["sessions"] for line in _unusable(session)]
+    if unusable:
+        raise UserError("\n".join(f"{report.summary}: {line}" for line in unusable))
+    if not report.record["complete"]:
+        raise UserError(f"{report.summary}: partial: " + "; ".join(map(one_line, report.record["holes"][:5])))
+
+
+def _unusable(session: dict[str, Any]) -> list[str]:
+    """What is said of legs that are not to be used."""
+    return [
+        one_line(leg["verdict"]["sentence"]) for leg in session.get("legs", []) if leg["verdict"]["level"] == "unusable"
+    ]
+
+
+def _print(record: dict[str, Any], files: list[Path]) -> None:
+    for session in record["sessions"]:
+        if "ins" in session:
+            told = ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in session["solutions"].items())
+            print(f"{one_line(session['session'])}: {session['ins']}: {told}")
+            continue
+        seen = ", ".join(
+            f"{count:,} {kind.replace('_', ' ')}" for kind, count in session["gnss"]["observations"].items()
+        )
+        print(
+            f"{one_line(session['session'])}: {session['imu']['samples'].get('taken', 0):,} samples; observed: {seen}"
+        )
+        for what, counts in (("samples", session["imu"]["samples"]), ("GNSS", session["gnss"]["refused"])):
+            left = ", ".join(f"{count:,} {why.replace('_', ' ')}" for why, count in counts.items() if why != "taken")
+            if left:
+                print(f"not as they came, {what}: {left}")
+        for leg in session["legs"]:
+            print(f"start: {leg['start']['words']}")
+            for finding in leg["findings"]:
+                print(f"{finding['severity']}: {one_line(finding['text'])}")
+            print(one_line(leg["verdict"]["sentence"]))
+    for line in record["warnings"]:
+        print(f"warning: {one_line(line)}")
+    if record.get("events") is not None:
+        told = ", ".join(f"{count:,} {fate}" for fate, count in record["events"].items())
+        print(f"event marks: {told or 'none in the log'}")
+    print(f"{'complete' if record['complete'] else 'partial'}: {', '.join(one_line(str(path)) for path in files)}")

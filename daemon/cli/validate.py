@@ -1,0 +1,89 @@
+"""``swath validate``: is a calibration right, and does it still hold?"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.installed import require_installed
+
+
+def command(
+    calibration: Annotated[Path, typer.Argument(help="The calibration file.", metavar="CALIBRATION", readable=False)],
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Logs it was not made of, or directories of them.", metavar="LOG…", readable=False),
+    ] = None,
+    also: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="Calibration of another scanner of the same logs.")
+    ] = None,
+    control: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+    ] = None,
+    anew: Annotated[
+        bool, typer.Option("--anew", help="Estimate the parameters from these logs too, and compare.")
+    ] = False,
+    past: Annotated[
+        list[Path] | None,
+        typer.Option("--history", metavar="DIR|FILE", help="Calibrations of the same installation: has it moved?"),
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="SBET, Waypoint text, .pos or CSV; default: the log's own.")
+    ] = None,
+    datum: Annotated[
+        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+    ] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
+    strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="validation.json, history.png.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+) -> None:
+    """Validate a calibration by ISO/TS 19159-2, 6.8: six methods, each with numbers, a test and a sentence.
+
+    Exit code 1 when a test speaks against the calibration, when the boresight has moved, or when nothing could be
+    tested; 2 and 3 as ever.
+    """
+    require_installed("swath validate", *(["matplotlib"] if output else []))
+    from daemon.config import load_config
+    from daemon.processing.flights import Wish
+    from daemon.processing.flown import TrajectoryWish
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.setup import Options
+    from daemon.processing.validate_run import ValidateWish, read_file, run_validation
+
+    if not logs and not past:
+        raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)
+    files = [calibration, *(also or [])]
+    given = {read_file(path).scanner: (path.read_text(encoding="utf-8"), str(path)) for path in files}
+    if len(given) < len(files):
+        raise UserError(f"{files[-1]}: is the second calibration of one scanner; want one a scanner", ExitCode.USAGE)
+    wish = ValidateWish(
+        calibrations=files,
+        logs=Wish(
+            logs=logs or [],
+            output=output or Path(),
+            trajectory=TrajectoryWish(trajectory, navigate=True),
+            options=Options(datum=datum, calibrations=given, uncertainty=False),
+            config=None if config is None else load_config(config),
+            strips=strips,
+            workers=workers or os.cpu_count() or 1,
+        ),
+        control=control,
+        histories=past or (),
+        anew=anew,
+        output=output,
+    )
+    with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
+        done = run_validation(wish, Path(folder), tell)
+    print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
+    if done.problem:
+        raise UserError(done.problem)

@@ -1,0 +1,325 @@
+"""What `swath calibrate` writes: a calibration file a scanner; where wanted report, record and outcome."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.calibration_file import CalibrationFileError, Header, calibration_text
+from calib.outcome import Adjusted
+from calib.profile_check import Check
+from calib.report_input import DifferenceMap, ReportInput
+from calib.report_verdict import Verdict, judge
+from calib.strips import Numbers, StripReport, differences
+from daemon.errors import ExitCode, UserError
+from daemon.processing.calibrate_run import Calibrated, CalibrateWish
+from daemon.processing.sidecar import sha256_of
+from georef.calibration import PARAMETERS
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+OUTCOME = "calibration.json"
+MAP_CELLS = 400  # across a map of differences
+
+
+@dataclass(frozen=True)
+class Told:
+    """The outcome as values for scripts, and as lines for people."""
+
+    record: dict[str, Any]
+    lines: list[str]
+
+
+def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
+    """Write all of it; what was there before is replaced last.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    tell("strips before and after", 0, 1)
+    before, after = differences(done.kept.flight), differences(done.flight)
+    inputs = _inputs(wish, done)
+    headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
+    try:
+        texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
+    except CalibrationFileError as error:
+        raise UserError(str(error)) from error
+    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in _paths(wish, headers).items()}
+    report = _report(wish, done, headers, before, after, inputs)
+    verdict = judge(report)
+    record = _record(done, headers, before, after, inputs) | {"verdict": _verdict_entry(verdict)}
+    if wish.report is not None:
+        tell("report", 0, 1)
+        files |= _report_files(wish.report, done, report)
+        files[wish.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
+    _write(files)
+    written = [str(path) for path in files]
+    reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
+    return Told(record | {"files": written}, [*_lines(done, before, after), verdict.sentence, *reasons, *written])
+
+
+def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:
+    return replace(done.adjusted.calibrations[name], id=headers[name].id, method=headers[name].method)
+
+
+def _paths(wish: CalibrateWish, headers: Mapping[str, Header]) -> dict[str, Path]:
+    if len(headers) == 1 and not wish.output.is_dir():
+        return dict.fromkeys(headers, wish.output)
+    return {name: wish.output / f"{name}.toml" for name in headers}
+
+
+def _write(files: Mapping[Path, bytes]) -> None:
+    """Beside their places first, so that none is half there."""
+    partial = {path: path.with_name(path.name + ".partial") for path in files}
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial[path].write_bytes(data)
+        for path in files:
+            partial[path].replace(path)
+    except OSError as error:
+        for path in partial.values():
+            path.unlink(missing_ok=True)
+        raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
+    """Name and SHA-256 of every file that went in; logs first."""
+    paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
+    paths += [path for path in (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons) if path is not None]
+    return [(path.name, sha256_of(path)) for path in paths]
+
+
+def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
+    now = dt.datetime.now(dt.UTC).replace(microsecond=0)
+    found = done.adjusted.calibrations[name]
+    digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
+    config = done.kept.logged[0].setup.config
+    table = config.scanner[name]
+    logs = tuple(entry for entry in inputs if entry[0].endswith(".mcap"))
+    return Header(
+        id=f"{now:%Y-%m-%dT%H:%M:%SZ}-{digest[:4]}",
+        created=now,
+        method=method_of(done),
+        scanner_model=table.model,
+        scanner_serial=table.serial,
+        installation=config.profile.installation,
+        logs=logs,
+        variance_factor=done.adjusted.variance_factor,
+        redundancy=done.adjusted.redundancy,
+    )
+
+
+def method_of(done: Calibrated) -> str:
+    """The word of a calibration file for what it was made of."""
+    kinds = {"control" if plane.control else "planes" for plane in done.features.planes}
+    kinds |= {"tie_points" for _ in done.features.ties[:1]}
+    return kinds.pop() if len(kinds) == 1 else "combined"
+
+
+def _record(
+    done: Calibrated,
+    headers: Mapping[str, Header],
+    before: StripReport,
+    after: StripReport,
+    inputs: list[tuple[str, str]],
+) -> dict[str, Any]:
+    """For scripts."""
+    adjusted = done.adjusted
+    return {
+        "format": "swath.calibration",
+        "version": 1,
+        "software": f"swath {importlib.metadata.version('swath')}",
+        "calibrations": {name: header.id for name, header in headers.items()},
+        "unknowns": [
+            {"name": name, "start": start, "value": value, "sigma": sigma}
+            for name, start, value, sigma in zip(
+                adjusted.names,
+                adjusted.start.tolist(),
+                adjusted.values.tolist(),
+                adjusted.sigmas.tolist(),
+                strict=True,
+            )
+        ],
+        "correlation": adjusted.correlation.tolist(),
+        "held": [
+            {"scanner": one.scanner, "name": one.name, "why": one.why, "remedy": one.remedy} for one in adjusted.held
+        ],
+        "variance_factor": adjusted.variance_factor,
+        "redundancy": adjusted.redundancy,
+        "global_test": adjusted.global_test,
+        "iterations": adjusted.iterations,
+        "matchings": adjusted.matchings,
+        "groups": [
+            {"group": group.group, "observations": group.observations, "variance_factor": group.variance_factor}
+            for group in adjusted.groups
+        ],
+        "strips": {"before": strips_entry(before), "after": strips_entry(after)},
+        "profiles": profiles_entry(done.check),
+        "refused": dict(done.features.refused),
+        "notes": list(done.notes),
+        "inputs": [{"name": name, "sha256": digest} for name, digest in inputs],
+    }
+
+
+def strips_entry(report: StripReport) -> dict[str, Any]:
+    """Height differences of all pairs together, and pair by pair."""
+    return {
+        "all": _numbers(report.all.height),
+        "pairs": [{"first": pair.first, "second": pair.second, **_numbers(pair.height)} for pair in report.pairs],
+    }
+
+
+def profiles_entry(check: Check) -> dict[str, Any]:
+    """What profiles say beside the adjustment, and each of them; SI."""
+    profiles = [
+        {
+            "kind": one.kind,
+            "scanner": one.scanner,
+            "strips": list(one.names),
+            "separation_m": one.separation_m,
+            "baseline_m": one.baseline_m,
+            "found": one.found,
+            "pieces": one.pieces,
+            "formula": one.formula,
+        }
+        for one in check.profiles
+    ]
+    compared = [asdict(one) | {"normalised": one.normalised} for one in check.comparisons]
+    missing = [{"scanner": scanner, "kind": kind, "why": why} for (scanner, kind), why in check.missing.items()]
+    return {"comparisons": compared, "missing": missing, "profiles": profiles}
+
+
+def _numbers(height: Any) -> dict[str, Any]:
+    values = {"n": height.count, "mean_m": height.mean_m, "std_m": height.std_m, "rms_m": height.rms_m}
+    return {
+        key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in values.items()
+    }
+
+
+def _verdict_entry(verdict: Verdict) -> dict[str, Any]:
+    reasons = [{"level": one.level.name.lower(), "what": one.what, "remedy": one.change} for one in verdict.reasons]
+    return {"level": verdict.level.name.lower(), "sentence": verdict.sentence, "reasons": reasons}
+
+
+def _report(
+    wish: CalibrateWish,
+    done: Calibrated,
+    headers: Mapping[str, Header],
+    before: StripReport,
+    after: StripReport,
+    inputs: list[tuple[str, str]],
+) -> ReportInput:
+    return ReportInput(
+        flight=done.flight,
+        features=done.features,
+        adjusted=done.adjusted,
+        headers=headers,
+        before=_pairs(before),
+        after=_pairs(after),
+        differences=difference_map(before, after),
+        check=done.check,
+        inputs=inputs,
+        settings=_settings(wish, done),
+        notes=[note for note in done.notes if note not in done.adjusted.notes],  # which the report has anyway
+    )
+
+
+def _report_files(folder: Path, done: Calibrated, report: ReportInput) -> dict[Path, bytes]:
+    """The page, the same on paper, and a record a scanner as XML and JSON."""
+    from calib.record import RecordInput, record_json, record_of, record_xml
+    from calib.report import html, pdf
+    from calib.report_profiles import pictures
+
+    report = replace(report, profiles=pictures(done.check, done.kept.flight))
+    files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
+    for name, header in report.headers.items():
+        one = RecordInput(done.flight, done.features, done.adjusted, name, header, settings=report.settings)
+        record = record_of(one)
+        files[folder / f"{name}.record.xml"] = record_xml(record).encode()
+        files[folder / f"{name}.record.json"] = record_json(record).encode()
+    return files
+
+
+def _pairs(report: StripReport) -> dict[tuple[str, str], Numbers]:
+    return {(pair.first, pair.second): pair.height for pair in report.pairs if pair.height.count}
+
+
+def difference_map(before: StripReport, after: StripReport) -> DifferenceMap | None:
+    """Height differences of all pairs on one grid in t, the largest of a cell; None: there are none."""
+    places = np.concatenate([report.checks.point[report.checks.gentle] for report in (before, after)])
+    if not len(places):
+        return None
+    cell_m = max(before.cell_m, after.cell_m, float(np.ptp(places[:, :2], axis=0).max()) / MAP_CELLS)
+    west_m, south_m = np.floor(places[:, :2].min(axis=0) / cell_m) * cell_m
+    columns, rows = (np.ceil((places[:, :2].max(axis=0) - (west_m, south_m)) / cell_m) + 1).astype(int)
+    grids = []
+    for report in (before, after):
+        checks = report.checks.take(report.checks.gentle)
+        order = np.argsort(np.abs(checks.height_m), kind="stable")
+        at = ((checks.point[order, :2] - (west_m, south_m)) / cell_m).astype(int)
+        grid = np.full((rows, columns), np.nan)
+        grid[at[:, 1], at[:, 0]] = checks.height_m[order]  # of a cell's the largest comes last
+        grids.append(grid)
+    return DifferenceMap(float(west_m), float(south_m), cell_m, *grids)
+
+
+def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
+    air = done.kept.logged[0].setup.config.atmosphere
+    return {
+        "Swath": importlib.metadata.version("swath"),
+        "model": wish.model.model,
+        "observed": ", ".join(wish.observe) + (", control" if done.control else ""),
+        "trajectory": "; ".join(trajectory.name for trajectory in done.flight.trajectories),
+        "trajectory errors": "; ".join(done.prior.notes) or f"{len(done.prior)} knots",
+        "atmosphere": f"ranges {air.ranges}, refraction {air.refraction}",
+    }
+
+
+# ---------------------------------------------------------------------- for people
+
+
+def _lines(done: Calibrated, before: StripReport, after: StripReport) -> list[str]:
+    adjusted = done.adjusted
+    lines = [f"{'parameter':34}{'start':>14}{'found':>14}{'sigma':>12}"]
+    lines += _parameter_lines(adjusted)
+    for held in adjusted.held:
+        remedy = f"; {held.remedy}" if held.remedy else ""
+        lines.append(f"not estimated: {held.scanner} {_key(held.name)}: {held.why}{remedy}")
+    planes, ties = len(done.features.planes), len(done.features.ties)
+    seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
+    lines.append(
+        f"{' and '.join(seen)}, redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
+    )
+    rms = [report.all.height.rms_m for report in (before, after)]
+    lines.append(f"strips differ by {rms[0]:.3f} m (RMS) before, {rms[1]:.3f} m after")
+    lines += _profile_lines(done.check)
+    return [*lines, *(f"note: {note}" for note in done.notes)]
+
+
+def _profile_lines(check: Check) -> list[str]:
+    told = [f"{one.scanner}.{_key(one.parameter)} {one.normalised:+.1f}" for one in check.comparisons]
+    return [f"profiles less adjustment, in sigmas: {', '.join(told)}"] if told else []
+
+
+def _parameter_lines(adjusted: Adjusted) -> list[str]:
+    factors = {parameter.name: (parameter.key, parameter.factor) for parameter in PARAMETERS}
+    lines = []
+    for name, start, value, sigma in zip(
+        adjusted.names, adjusted.start.tolist(), adjusted.values.tolist(), adjusted.sigmas.tolist(), strict=True
+    ):
+        scanner, _, bare = name.partition(".")
+        key, factor = factors.get(bare, (bare, 1.0))
+        lines.append(f"{scanner + '.' + key:34}{start / factor:14.5f}{value / factor:14.5f}{sigma / factor:12.5f}")
+    return lines
+
+
+def _key(name: str) -> str:
+    return next((parameter.key for parameter in PARAMETERS if parameter.name == name), name)

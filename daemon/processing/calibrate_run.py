@@ -1,0 +1,298 @@
+"""`swath calibrate`: from the logs of a calibration flight to parameters, their sigmas and the proof.
+
+    returns of the strips as measured, and the trajectory's own joint covariance     calibration_flight
+    coarse boresight, so that the same roof is found in every strip                  calib.prealign
+    planes, tie points, control                                                      calib.plane_search, …
+    adjustment, with correspondences found anew until they stay                      calib.adjust
+    height differences of strips, before and after; files, record, report            calibrate_products
+
+All files are made out of sight and put in their place at the end: what looks like a calibration is one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.adjust import adjust
+from calib.control import ControlError, control_planes, in_t, read_control
+from calib.control_doubts import doubts
+from calib.features import ControlPoint, Features
+from calib.flight import Flight, FlightError
+from calib.normals import NormalError
+from calib.outcome import Adjusted
+from calib.parameters import ParameterError
+from calib.parameters import Wish as Model
+from calib.picked_points import PickedError
+from calib.plane_given import given_planes
+from calib.plane_matching import rematch
+from calib.plane_search import find_planes
+from calib.plane_settings import PlaneError, PlaneSettings
+from calib.prealign import PrealignError, prealign
+from calib.profile_check import Check, check
+from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
+from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from daemon.processing.flights import Wish
+from daemon.processing.strips_run import refuse_installations
+from georef.calibration import Calibration
+from georef.mapping import MappingError
+from georef.navigation.cross_covariance import error_chain
+from georef.strips import StripError
+from georef.trajectory import TrajectoryError
+
+if TYPE_CHECKING:
+    from georef.navigation.cross_covariance import ErrorChain
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+KNOT_S = 0.4
+# All returns of a patch share what the attitude does between two knots, some millimetres: the mean of 25 is as good as
+# that, and the mean of thousands would be taken for better than it is.
+PLANES = PlaneSettings(most_points=25)
+ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
+REFUSED = (
+    ControlError,
+    FlightError,
+    MappingError,
+    NormalError,
+    ParameterError,
+    PickedError,
+    PlaneError,
+    PolygonError,
+    PrealignError,
+    StripError,
+    TrajectoryError,
+)
+
+
+@dataclass(frozen=True)
+class CalibrateWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs: what is read and how; what it says of products does not count.
+        output: the calibration file; of several scanners a folder for theirs.
+        model: what is estimated.
+        control: CSV of surveyed points.
+        ties: CSV of points picked in several strips; beside what is observed.
+        polygons: CSV of polygons that planes fill; instead of those that would be found.
+        observe: planes or ties, and markings: what is looked for.
+        report: folder for the report, the record and the pictures; None: none.
+        limit_deg, limit_m: how far boresight and range offset may lead from where they began.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Wish
+    output: Path
+    model: Model = field(default_factory=Model)
+    control: Path | None = None
+    ties: Path | None = None
+    polygons: Path | None = None
+    observe: tuple[str, ...] = ("planes",)
+    report: Path | None = None
+    limit_deg: float = 5.0
+    limit_m: float = 10.0
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What came of it.
+
+    Attributes:
+        kept: the flight as read.
+        flight: placed with the calibrations found.
+        prealigned: by scanner, what the adjustment began with.
+        check: what profiles say of the outcome.
+        notes: for people, a line each.
+    """
+
+    kept: KeptFlight
+    flight: Flight
+    features: Features
+    prior: TrajectoryPrior
+    prealigned: Mapping[str, Calibration]
+    adjusted: Adjusted
+    control: tuple[ControlPoint, ...]
+    check: Check
+    notes: tuple[str, ...]
+
+
+def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+    """Calibrate.
+
+    Args:
+        wish: what is asked for.
+        folder: for the returns, some 150 bytes each, while it goes on.
+        tell: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    try:
+        return _calibrate(wish, folder, tell)
+    except REFUSED as error:
+        raise UserError(str(error)) from error
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    except OSError as error:
+        raise UserError(f"{error.filename or folder}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+    kept = read_flight(wish.logs, folder, tell)
+    _refuse_one_strip(kept)
+    points = _control(wish, kept.flight)
+    workers = wish.logs.workers
+    tell("pre-alignment", 0, 1)
+    start = _aligned(kept.flight)
+    flight = replaced(kept.flight, start, folder, "aligned", workers)
+    notes = _doubts(flight, points)
+    tell("planes", 0, 1)
+    rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
+    picked = [] if wish.ties is None else [ties_of(wish.ties, kept)]
+
+    def search() -> Features:
+        if rings is not None:
+            return given_planes(flight, rings, PLANES)
+        with ThreadPoolExecutor(workers) as pool:
+            return find_planes(flight, PLANES, pool.map)
+
+    def match() -> Features:
+        with ThreadPoolExecutor(workers) as pool:
+            return rematch(flight, planes, PLANES, pool.map)
+
+    planes, searched = search(), 1
+    refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)
+    features = Features.joined([_features(wish, flight, planes, points), *picked])
+    prior = _prior(kept)
+
+    def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
+        nonlocal flight, planes, features, searched
+        tell("planes again", 0, 1)
+        flight = replaced(kept.flight, calibrations, folder, "matched", workers)
+        # once more: roofs at a swath's edges that the pre-alignment left apart lie on each other now
+        again = searched == 1 or rings is not None
+        planes, searched = search() if again else match(), searched + 1
+        features = Features.joined([_features(wish, flight, planes, points), *picked])
+        return features
+
+    tell("adjustment", 0, 1)
+    adjusted = adjust(flight, features, wish.model, prior, start=start, rematch=found_anew)
+    _refuse_far(wish, kept.flight, adjusted)
+    flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
+    tell("profiles", 0, 1)
+    checked = check(flight, adjusted, prior, points)
+    return Calibrated(kept, flight, features, prior, start, adjusted, points, checked, (*notes, *adjusted.notes))
+
+
+def _aligned(flight: Flight) -> dict[str, Calibration]:
+    """Coarse boresight; the range offset stays, which heights of strips alone hardly tell."""
+    starts = flight.starts()
+    return {
+        name: found.changed(range_offset_m=starts[name].value("range_offset_m"))
+        for name, found in prealign(flight).items()
+    }
+
+
+def _refuse_one_strip(kept: KeptFlight) -> None:
+    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    log = kept.logged[0].log
+    if len(strips) < 2:
+        raise UserError(
+            f"{log}: {len(strips) or 'no'} strip with returns; a calibration compares strips: want at least two that "
+            "overlap, better opposite, crossing and parallel ones at two heights"
+        )
+    refuse_installations(kept.logged)
+
+
+def refuse_no_planes(log: str, planes: Features) -> None:
+    """UserError where strips have no plane in common."""
+    if planes.planes:
+        return
+    why = ", ".join(f"{count:,} {reason}" for reason, count in planes.refused.most_common(3))
+    raise UserError(
+        f"{log}: no plane is seen by two strips ({why or 'no candidates'}); want strips that overlap over roofs and "
+        "open ground, with some 2 returns a square metre"
+    )
+
+
+# ---------------------------------------------------------------------- observations
+
+
+def _control(wish: CalibrateWish, flight: Flight) -> tuple[ControlPoint, ...]:
+    if wish.control is None:
+        return ()
+    return in_t(read_control(text_of(wish.control), str(wish.control)), flight.frame)
+
+
+def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
+    """What is doubtful of control; UserError where it cannot be used at all.
+
+    That all its heights differ alike is only a doubt here: so does a range offset, which is to be found; what is more
+    than that may be, is refused in the end (`_refuse_far`).
+    """
+    found = doubts(flight, points)
+    whole = [doubt.text for doubt in found if doubt.kind not in ("point", "height")]
+    if whole:
+        raise UserError("\n".join(whole))
+    return tuple(doubt.text for doubt in found)
+
+
+def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
+    """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
+    found = [planes]
+    if "ties" in wish.observe:
+        from calib.tie_points import find_ties
+
+        found = [find_ties(flight, planes)]
+    if points:
+        found.append(control_planes(flight, points))
+    if "markings" in wish.observe:
+        from calib.markings import find_markings
+
+        found.append(find_markings(flight))
+    return Features.joined(found)
+
+
+def _prior(kept: KeptFlight) -> TrajectoryPrior:
+    """The trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
+    chains: list[ErrorChain] = []
+    knots = knots_of(kept.flight, KNOT_S)
+    for number, flight in enumerate(kept.logged):
+        legs = [] if flight.navigated is None else flight.navigated.legs
+        if len(legs) != 1:
+            return gauss_markov(kept.flight)
+        chains.append(error_chain(legs[0].solved.run, knots.time_ns[knots.flown == number]))
+    return from_smoother(kept.flight, chains, KNOT_S)
+
+
+# ---------------------------------------------------------------------- results
+
+
+def _refuse_far(wish: CalibrateWish, flight: Flight, adjusted: Adjusted) -> None:
+    """Nothing is written that led away from what anybody would believe."""
+    log = wish.logs.logs[0]
+    if not adjusted.converged:
+        raise UserError(f"{log}: the adjustment does not converge; look at the strips with swath view first")
+    for head in flight.heads:
+        found = adjusted.calibrations[head.name]
+        for name in ANGLES:
+            away_deg = math.degrees(found.value(name) - head.start.value(name))
+            if abs(away_deg) > wish.limit_deg:
+                raise UserError(
+                    f"{log}: {head.name}: {name.removesuffix('_rad')} would change by {away_deg:.2f}°, more than "
+                    f"--limit-deg {wish.limit_deg:g}; is the installation matrix right?"
+                )
+        away_m = found.value("range_offset_m") - head.start.value("range_offset_m")
+        if abs(away_m) > wish.limit_m:
+            raise UserError(
+                f"{log}: {head.name}: the range offset would change by {away_m:.2f} m, more than --limit-m "
+                f"{wish.limit_m:g}; are the control's heights ellipsoidal, and of this datum?"
+            )

@@ -1,0 +1,254 @@
+"""Navigates logs: start, filter, smoother, diagnosis, leg by leg; one trajectory of each session."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.log.reader import Session, open_logs
+from daemon.processing.ins_point import point_doubts
+from daemon.processing.mapped_storage import MappedStorage
+from daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from georef.navigation.inputs import (
+    OBSERVATION_DTYPE,
+    Kind,
+    NavigationError,
+    Solution,
+    sort_observations,
+)
+from georef.navigation.stores import IN_MEMORY, Storage
+from georef.records import FixType, StructArray
+from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, gps_text
+from georef.trajectory_buffer import TrajectoryBuffer
+
+if TYPE_CHECKING:
+    from georef.navigation.diagnosis import Finding
+    from georef.navigation.inputs import Setup, Start
+    from georef.navigation.solve import Solved
+
+FloatArray = NDArray[np.float64]
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+NAVIGATED = "navigation of the log's IMU and GNSS"
+GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # of an attitude that somebody says by hand
+COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class NavigateWish:
+    """What the command line says of the run.
+
+    Attributes:
+        inputs: of what is read.
+        smooth: the smoother runs too; False: as it was in real time.
+        attitude_rad: roll, pitch, heading at the start; None: they are found.
+    """
+
+    inputs: InputWish = field(default_factory=InputWish)
+    smooth: bool = True
+    attitude_rad: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NavigatedLeg:
+    """A leg and what came of it."""
+
+    leg: Leg
+    start: Start
+    setup: Setup
+    solved: Solved
+    findings: list[Finding]
+
+    def solution(self, *, smooth: bool) -> Solution:
+        """The one asked for."""
+        return self.solved.smoothed if smooth else self.solved.forward
+
+    def noise_found(self) -> dict[str, float]:
+        """Factors on the receiver's own sigmas with which it was navigated."""
+        rows = self.solved.forward.innovations
+        fixes = sorted(set(rows["fix_type"][rows["kind"] == Kind.POSITION].tolist()))
+        scales = {fix: self.setup.gnss_sigma_scale[fix] for fix in fixes if fix in self.setup.gnss_sigma_scale}
+        return {f"positions, {FixType(fix).name.lower().replace('_', ' ')}": scale for fix, scale in scales.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Navigated:
+    """A session's trajectory and how it came about.
+
+    Attributes:
+        legs: those that could be navigated.
+        holes: what is missing, a line each, those of the inputs included.
+        doubts: lines for the user.
+    """
+
+    inputs: NavigationInputs
+    smooth: bool
+    legs: list[NavigatedLeg]
+    holes: list[str]
+    doubts: list[str]
+
+    @property
+    def session_id(self) -> str:
+        """The session's."""
+        return self.inputs.session.session_id
+
+    def solutions(self) -> list[Solution]:
+        """Of the legs, in order of time."""
+        return [leg.solution(smooth=self.smooth) for leg in self.legs]
+
+    def trajectory(self, name: str = NAVIGATED) -> Trajectory:
+        """Of all legs; between them are gaps."""
+        return joined_trajectory([solution.trajectory() for solution in self.solutions()], name)
+
+    def velocity_sigma_l(self) -> FloatArray:
+        """(n, 3) m/s of the trajectory's epochs."""
+        return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
+
+
+def navigate_log(paths: Sequence[Path], wish: NavigateWish | None = None) -> Trajectory:
+    """The smoothed trajectory of the body in one session's log; the same log gives the same, bit for bit.
+
+    Raises:
+        UserError: it cannot be navigated, a line each.
+    """
+    try:
+        sessions = open_logs(paths)
+        if len(sessions) != 1:
+            raise UserError(f"{paths[0]}: {len(sessions)} sessions, want one", ExitCode.USAGE)
+        return navigate_session(sessions[0], wish or NavigateWish()).trajectory()
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+
+
+def navigate_session(session: Session, wish: NavigateWish, tell: Tell = lambda what, done, total: None) -> Navigated:
+    """Read a session and navigate it.
+
+    Raises:
+        UserError: it cannot be navigated, a line each.
+        LogError, OSError: the log cannot be read.
+    """
+    tell("clocks, IMU and GNSS", 0, 1)
+    storage = MappedStorage()
+    inputs = read_inputs(session, wish.inputs, storage)
+    storage.rest()
+    return navigate_inputs(inputs, wish, tell, storage)
+
+
+def navigate_inputs(
+    inputs: NavigationInputs,
+    wish: NavigateWish,
+    tell: Tell = lambda what, done, total: None,
+    storage: Storage = IN_MEMORY,
+) -> Navigated:
+    """Navigate what was read; runs and solutions are kept in the storage.
+
+    Raises:
+        UserError: no leg of it can be navigated, a line each.
+    """
+    legs: list[NavigatedLeg] = []
+    holes = list(inputs.holes)
+    for number, leg in enumerate(inputs.legs):
+        tell("filter and smoother" if wish.smooth else "filter", number, len(inputs.legs))
+        try:
+            legs.append(_navigated(inputs, leg, wish, storage))
+            storage.rest()
+        except NavigationError as error:
+            holes.append(f"{inputs.log}: from {gps_text(leg.span[0])} to {gps_text(leg.span[1])}: {error}")
+            holes += _why_not(inputs, leg)
+    if not legs:
+        why = holes[len(inputs.holes) :] or [
+            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough to be navigated"
+        ]
+        raise UserError("\n".join(why))
+    doubts = [*inputs.doubts, *_unreached(inputs, legs, smooth=wish.smooth)]
+    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts)
+    navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
+    return navigated
+
+
+def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: Storage) -> NavigatedLeg:
+    from georef.navigation.alignment import align
+    from georef.navigation.diagnosis import diagnose
+    from georef.navigation.earlier_start import earlier_start
+    from georef.navigation.solve import solve
+    from georef.navigation.stillness import with_still_seconds
+
+    rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
+    start = align(leg.inertial, rows, inputs.setup)
+    if wish.smooth:
+        start = earlier_start(leg.inertial, leg.observations, inputs.setup, start)
+    setup, rows = inputs.setup, with_still_seconds(leg.inertial, leg.observations)
+    solved = solve(leg.inertial, rows, setup, start, storage=storage)
+    setup = solved.report.setup
+    return NavigatedLeg(leg, start, setup, solved, diagnose(leg.inertial, leg.observations, setup, solved))
+
+
+def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
+    """What is wrong with a leg's data that gave no start."""
+    from georef.navigation.diagnosis import diagnose
+
+    found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
+    return [f"{inputs.log}: {finding.text}" for finding in found]
+
+
+def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> StructArray:
+    """The observations, and an attitude that is known at the leg's beginning."""
+    row = np.zeros(1, OBSERVATION_DTYPE)
+    row["time_ns"], row["kind"] = leg.inertial.time_ns[0], Kind.ATTITUDE
+    row["value"], row["sigma"] = attitude_rad, GIVEN_SIGMA_RAD
+    return sort_observations(np.concatenate([leg.observations, row]))
+
+
+def _unreached(inputs: NavigationInputs, legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[str]:
+    """Where samples are and the trajectory is not: before the start that was found."""
+    lines: list[str] = []
+    for leg in legs:
+        first = int(leg.solution(smooth=smooth).time_ns[0])
+        missing_s = (first - leg.leg.span[0]) / 1e9
+        if missing_s > 1.0:
+            lines.append(
+                f"{inputs.log}: {missing_s:.1f} s before {gps_text(first)} have no trajectory: no start was found "
+                "earlier"
+            )
+    return lines
+
+
+def _ins_doubts(inputs: NavigationInputs, navigated: Trajectory) -> list[str]:
+    """Of the device's own INS, against what was navigated."""
+    source = inputs.sources.ins_source
+    if source is None or len(inputs.ins) < 2:
+        return []
+    buffer = TrajectoryBuffer(protocol_of(inputs.sources, source), name=source)
+    buffer.append(inputs.ins)
+    lines = point_doubts(buffer.snapshot(), navigated, list(inputs.setup.lever_arms_b), source)
+    return [f"{inputs.log}: {line}" for line in lines]
+
+
+def joined_trajectory(parts: Sequence[Trajectory], name: str, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> Trajectory:
+    """One trajectory of several that follow each other."""
+    if len(parts) == 1:
+        return replace(parts[0], name=name, max_gap_ns=max_gap_ns)
+    columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in COLUMNS}
+    return Trajectory(**columns, max_gap_ns=max_gap_ns, name=name)
+
+
+def attitude_of_text(text: str) -> tuple[float, float, float]:
+    """``roll,pitch,heading`` in degrees; rad.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        roll, pitch, heading = (float(part) for part in text.split(","))
+    except ValueError:
+        roll = pitch = heading = math.nan
+    if not (abs(roll) <= 180.0 and abs(pitch) <= 90.0 and abs(heading) <= 360.0):
+        raise UserError(f'--start: got "{text}", want roll,pitch,heading in degrees, as 0.5,-1.2,273', ExitCode.USAGE)
+    return math.radians(roll), math.radians(pitch), math.radians(heading)

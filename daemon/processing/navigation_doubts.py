@@ -1,0 +1,121 @@
+"""What a log lacks for navigation, in a line, and what of it is to be doubted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from daemon.errors import UserError
+from daemon.processing.navigation_log import NavigationLog
+from daemon.processing.navigation_observations import Observed
+from daemon.processing.navigation_sources import NavigationSources
+from daemon.processing.navigation_times import ImuTimes
+from georef.navigation.inputs import Inertial, Kind
+from georef.records import StructArray
+from georef.trajectory import gps_text
+
+TIME_IS_KNOWN_S = 1e-4  # a better time of the IMU's samples needs no offset to be found: 6 mm at 60 m/s
+
+
+def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path) -> None:
+    """A log without one of the two that navigation needs."""
+    if not len(found.imu):
+        hint = "; it has an INS's own solutions: want --ins as-is for these" if len(found.ins) else ""
+        raise UserError(f"{log}: no samples of {sources.imu_source}: {_heard(found, sources.imu_source)}{hint}")
+    if not found.fixes:
+        raise UserError(
+            f"{log}: no position of {sources.gnss_source}, and an IMU alone cannot be navigated: "
+            f"{_heard(found, sources.gnss_source)}"
+        )
+
+
+def _heard(found: NavigationLog, source: str) -> str:
+    """What came of a source that gave nothing, and what that means."""
+    size, skipped, messages = found.heard.get(source, (0, 0, Counter()))
+    if not size:
+        return "not a byte of it is in the log; is its wire recorded?"
+    told = [f"{count:,} {name}" for name, count in messages.most_common(4)]
+    told += [f"{count:,} with {why.replace('_', ' ')}" for why, count in found.refused.get(source, Counter()).items()]
+    of_it = f" ({', '.join(told)})" if told else ""
+    share = f", {skipped / size:.0%} of them of no message it knows" if skipped else ""
+    return f"{size:,} bytes came{share}{of_it}; want another protocol, or other messages of the device"
+
+
+def no_time(found: NavigationLog, sources: NavigationSources, log: Path) -> str:
+    if sources.clock is None:
+        return f"{log}: the configuration has neither [pps.…] nor [gnss.…]: nobody tells GPS time"
+    status = found.host.status(sources.clock, int(found.imu["host_time_ns"][-1]))
+    return (
+        f"{log}: {sources.clock}: the host's clock is {status.state.value}, so no sample of {sources.imu_source} has "
+        f"GPS time; want PPS edges, or at least time messages of {sources.gnss_source}"
+    )
+
+
+def refuse_elsewhere(inertial: Inertial, observations: StructArray, sources: NavigationSources, log: Path) -> None:
+    """Observations there must be, and of the time of the samples."""
+    positions = observations[observations["kind"] == Kind.POSITION]
+    if not len(positions):
+        raise UserError(
+            f"{log}: no usable position of {sources.gnss_source}: its fixes have no ellipsoidal height, no time, or "
+            "none is valid; want other messages of the receiver, or --gnss FILE"
+        )
+    begin, end = int(inertial.time_ns[0]), int(inertial.time_ns[-1])
+    first, last = int(positions["time_ns"][0]), int(positions["time_ns"][-1])
+    if last < begin or first > end:
+        raise UserError(
+            f"{log}: no common time: {sources.imu_source} from {gps_text(begin)} to {gps_text(end)}, positions from "
+            f"{gps_text(first)} to {gps_text(last)}"
+        )
+
+
+# ---------------------------------------------------------------------- what is to be told
+
+
+def input_doubts(
+    found: NavigationLog, sources: NavigationSources, times: ImuTimes, parts: Mapping[str, Observed], log: Path
+) -> list[str]:
+    lines: list[str] = []
+    if times.by == "arrival":
+        lines.append(
+            f"{log}: {sources.imu_source} says no time of its own: its samples are placed by their arrival, to about "
+            f"{times.sigma_s * 1e3:.1f} ms; an offset is estimated"
+        )
+    elif times.sigma_s > TIME_IS_KNOWN_S:
+        lines.append(
+            f"{log}: the times of {sources.imu_source} are good to {times.sigma_s * 1e3:.1f} ms only; want PPS edges "
+            "that it latches; an offset is estimated"
+        )
+    if sources.imu_is_in_receiver and not parts["fix"].refused["blended_by_ins"]:
+        blended = sorted({fix.message for fix in found.fixes} & {"BESTPOS", "BESTVEL"})
+        if blended:
+            lines.append(
+                f"{log}: {' and '.join(blended)} of a receiver with an INS are blended with it, so that its errors "
+                "come twice; want BESTGNSSPOS and BESTGNSSVEL"
+            )
+    without = parts["heading"].refused["no_secondary_lever_arm"]
+    if without:
+        lines.append(
+            f"{log}: {without:,} headings of {sources.gnss_source} are left out: want "
+            f"gnss.{sources.gnss_name}.secondary_lever_arm_m, the second antenna's place"
+        )
+    lines += [f"{log}: the recorder lost {count:,} units of {source}" for source, count in sorted(found.lost.items())]
+    lines += _baseline_doubts(found, sources, log)
+    return lines
+
+
+def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
+    """The receiver measures the baseline too: another length is another lever arm."""
+    told = [heading.baseline_m for heading in found.headings if heading.valid and heading.baseline_m]
+    baseline = sources.setup().baseline_b
+    if not told or baseline is None:
+        return []
+    measured, configured = float(np.median(told)), float(np.linalg.norm(baseline))
+    if abs(measured - configured) <= max(0.05, 0.05 * configured):
+        return []
+    return [
+        f"{log}: {sources.gnss_source} measures {measured:.2f} m between its antennas, lever_arm_m and "
+        f"secondary_lever_arm_m are {configured:.2f} m apart: one of them is wrong"
+    ]

@@ -1,0 +1,270 @@
+"""A receiver's fixes and headings as observations: one position and one velocity an epoch, in GPS time, with sigmas.
+
+Receivers say an epoch in several messages (BESTPOS and BESTVEL), or the same twice (BESTPOS and BESTGNSSPOS); some say
+no sigmas. Here each becomes at most one row of each kind, and what becomes none is counted by the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.earth import e_from_geodetic
+from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
+from georef.records import FixType, GnssFix, GnssHeading, Int64Array, StructArray, TimeTag
+from georef.stream_clocks import HostClocks
+from georef.timescales import complete_time
+
+FloatArray = NDArray[np.float64]
+
+# One standard deviation where a receiver says none: horizontal and vertical, of positions in m, of velocities in m/s.
+# Usual figures of an antenna in flight; a fix type that is not here is not navigated with.
+DEFAULT_SIGMAS: dict[FixType, tuple[tuple[float, float], tuple[float, float]]] = {
+    FixType.SINGLE: ((2.0, 4.0), (0.10, 0.20)),
+    FixType.DIFFERENTIAL: ((0.8, 1.6), (0.08, 0.16)),
+    FixType.RTK_FLOAT: ((0.3, 0.5), (0.05, 0.10)),
+    FixType.RTK_FIXED: ((0.02, 0.04), (0.03, 0.06)),
+    FixType.PPP: ((0.1, 0.2), (0.05, 0.10)),
+}
+GREATEST_SIGMA = 1e4  # m or m/s: beyond, a receiver says that it does not know
+DEFAULT_BASELINE_SIGMA_M = 0.01  # across a baseline, whose length makes an angle of it
+DEFAULT_HEADING_SIGMA_RAD = math.radians(0.5)  # of a baseline of unknown length
+DEFAULT_INS_SIGMAS_RAD = (math.radians(0.05), math.radians(0.05), math.radians(0.2))
+HEADING_REACH_NS = 500_000_000  # a heading without time belongs to the fix that arrives nearest to it, so near
+BLENDED_BY_INS = {"BESTPOS": "BESTGNSSPOS", "BESTVEL": "BESTGNSSVEL"}  # message: the one of satellites alone
+
+# Errors of headings (multipath) and of an INS's attitude last: neighbours repeat each other. One every so often is
+# taken, with the sigma of a white error that averages as slowly: share of sigma that is correlated, and for how long.
+HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S = 5_000_000_000, 0.6, 60.0
+INS_STEP_NS, INS_SHARE, INS_TAU_S = 20_000_000_000, 1.0, 120.0
+RANK = {FixType.RTK_FIXED: 5, FixType.PPP: 4, FixType.RTK_FLOAT: 3, FixType.DIFFERENTIAL: 2, FixType.SINGLE: 1}
+
+
+@dataclass(slots=True)
+class Observed:
+    """Observations of a session.
+
+    Attributes:
+        rows: OBSERVATION_DTYPE, sorted.
+        refused: what became no observation, by reason.
+        assumed: observations whose sigmas are defaults, by kind.
+    """
+
+    rows: StructArray
+    refused: Counter[str]
+    assumed: Counter[str]
+
+
+def gps_times(
+    host: HostClocks, source: str, host_ns: Sequence[int], tags: Sequence[TimeTag | None]
+) -> list[int | None]:
+    """GPS ns of a receiver's tags by what arrived when; None where one cannot be placed.
+
+    Args:
+        host: complete clocks.
+        source: of the receiver, ``gnss/rover``.
+        host_ns: of arrival.
+        tags: None: it says no time.
+    """
+    if not tags:
+        return []
+    clock = host.by_source[source]
+    near, sigma = host.gps_from_host(source, np.array(host_ns, np.int64))
+    placed: list[int | None] = []
+    for tag, near_ns, known in zip(tags, near.tolist(), np.isfinite(sigma).tolist(), strict=True):
+        if tag is None:
+            placed.append(None)
+            continue
+        leap = clock.leap_seconds_at(near_ns) if known else None
+        placed.append(complete_time(tag, near_ns if known else None, leap))
+    return placed
+
+
+def fix_observations(
+    fixes: Sequence[GnssFix], time_ns: Sequence[int | None], antennas: int, said: Collection[str] = ()
+) -> Observed:
+    """Positions and velocities of fixes at GPS times; ``antennas`` of the receiver have a known lever arm.
+
+    ``said``: names of messages that came beside these, earlier.
+    """
+    refused: Counter[str] = Counter()
+    assumed: Counter[str] = Counter()
+    names = {*said, *(fix.message for fix in fixes)}
+    best: dict[tuple[int, int, int], tuple[int, GnssFix]] = {}
+    for fix, at_ns in zip(fixes, time_ns, strict=True):
+        reason = _why_not(fix, at_ns, antennas, names)
+        if reason is not None:
+            refused[reason] += 1
+            continue
+        assert at_ns is not None
+        antenna, rank = int(fix.antenna == "secondary"), RANK.get(fix.fix_type, 0)
+        placed, moving = None not in (fix.lat_rad, fix.height_m), fix.velocity_l is not None
+        for kind in [Kind.POSITION] * placed + [Kind.VELOCITY] * moving:
+            key = (at_ns, int(kind), antenna)
+            if key in best:
+                refused["repeated_in_epoch"] += 1
+            if key not in best or rank > best[key][0]:
+                best[key] = (rank, fix)
+    rows = np.zeros(len(best), OBSERVATION_DTYPE)
+    for row, ((epoch_ns, of_kind, antenna), (_, fix)) in zip(rows, best.items(), strict=True):
+        row["time_ns"], row["kind"], row["antenna"] = epoch_ns, of_kind, antenna
+        row["fix_type"], row["satellites"] = int(fix.fix_type), min(fix.satellites or 0, 255)
+        (_fill_position if of_kind == Kind.POSITION else _fill_velocity)(row, fix, assumed)
+    return Observed(sort_observations(rows), refused, assumed)
+
+
+def _why_not(fix: GnssFix, at_ns: int | None, antennas: int, said: set[str]) -> str | None:
+    """Why a fix is no observation; None: it is one."""
+    if not fix.valid:
+        return "not_valid"
+    if fix.fix_type not in DEFAULT_SIGMAS:
+        return f"fix_type_{fix.fix_type.name.lower()}"
+    if at_ns is None:
+        return "no_time"
+    if BLENDED_BY_INS.get(fix.message) in said:
+        return "blended_by_ins"
+    if fix.antenna == "secondary" and antennas < 2:
+        return "no_lever_arm"
+    if fix.lat_rad is None and fix.velocity_l is None:
+        return "empty"
+    if fix.lat_rad is not None and fix.height_m is None and fix.velocity_l is None:
+        return "no_ellipsoidal_height"
+    numbers = [value for value in (fix.lat_rad, fix.lon_rad, fix.height_m) if value is not None]
+    return None if all(map(math.isfinite, numbers)) else "not_finite"
+
+
+def _fill_position(row: np.void, fix: GnssFix, assumed: Counter[str]) -> None:
+    assert fix.lat_rad is not None
+    assert fix.lon_rad is not None
+    assert fix.height_m is not None
+    row["value"] = e_from_geodetic(fix.lat_rad, fix.lon_rad, fix.height_m)
+    horizontal, vertical = DEFAULT_SIGMAS[fix.fix_type][0]
+    _fill_sigmas(row, fix.position_cov_l, (horizontal, horizontal, vertical), assumed, "position")
+
+
+def _fill_velocity(row: np.void, fix: GnssFix, assumed: Counter[str]) -> None:
+    assert fix.velocity_l is not None
+    row["value"] = fix.velocity_l
+    horizontal, vertical = DEFAULT_SIGMAS[fix.fix_type][1]
+    _fill_sigmas(row, fix.velocity_cov_l, (horizontal, horizontal, vertical), assumed, "velocity")
+
+
+def _fill_sigmas(
+    row: np.void, covariance: FloatArray | None, default: tuple[float, float, float], assumed: Counter[str], kind: str
+) -> None:
+    """Sigmas and correlations of a covariance, axis by axis the default where it says nothing that can be."""
+    given = np.full((3, 3), np.nan) if covariance is None else np.asarray(covariance, np.float64)
+    variance = np.diag(given)
+    said = np.isfinite(variance) & (variance > 0.0) & (variance < GREATEST_SIGMA**2)
+    sigma = np.sqrt(np.where(said, variance, np.square(default)))
+    row["sigma"] = sigma
+    if not said.all():
+        assumed[kind] += 1
+    for place, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        correlation = given[i, j] / (sigma[i] * sigma[j]) if said[i] and said[j] else 0.0
+        row["correlation"][place] = correlation if abs(correlation) < 1.0 else 0.0
+
+
+def heading_times(
+    headings: Sequence[GnssHeading],
+    time_ns: Sequence[int | None],
+    fixes: Sequence[GnssFix],
+    fix_time_ns: Sequence[int | None],
+) -> list[int | None]:
+    """GPS ns of headings; of one that says no time (HDT) that of the fix that arrived nearest to it."""
+    placed = [(fix.host_time_ns, at) for fix, at in zip(fixes, fix_time_ns, strict=True) if at is not None]
+    placed.sort()
+    arrived = np.array([host_ns for host_ns, _ in placed], np.int64)
+    found: list[int | None] = []
+    for heading, at_ns in zip(headings, time_ns, strict=True):
+        if heading.time is not None or not placed:
+            found.append(at_ns)
+            continue
+        near = int(np.argmin(np.abs(arrived - heading.host_time_ns)))
+        found.append(placed[near][1] if abs(int(arrived[near]) - heading.host_time_ns) <= HEADING_REACH_NS else None)
+    return found
+
+
+def heading_observations(
+    headings: Sequence[GnssHeading], time_ns: Sequence[int | None], baseline_m: float | None
+) -> Observed:
+    """Directions of a baseline at GPS times; ``baseline_m`` by the configuration, None: it names no second antenna."""
+    refused: Counter[str] = Counter()
+    assumed: Counter[str] = Counter()
+    best: dict[int, GnssHeading] = {}
+    for heading, at_ns in zip(headings, time_ns, strict=True):
+        if not heading.valid or not math.isfinite(heading.heading_rad):
+            refused["not_valid"] += 1
+        elif at_ns is None:
+            refused["no_time"] += 1
+        elif baseline_m is None:
+            refused["no_secondary_lever_arm"] += 1
+        elif at_ns in best:
+            refused["repeated_in_epoch"] += 1
+        else:
+            best[at_ns] = heading
+    taken = _spaced(np.array(sorted(best), np.int64), HEADING_STEP_NS)
+    refused["repeats_neighbours"] = len(best) - len(taken)
+    more_careful = white_factor(HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S)
+    usual = DEFAULT_HEADING_SIGMA_RAD if baseline_m is None else math.atan(DEFAULT_BASELINE_SIGMA_M / baseline_m)
+    rows = np.zeros(len(taken), OBSERVATION_DTYPE)
+    for row, time in zip(rows, taken.tolist(), strict=True):
+        heading = best[time]
+        row["time_ns"], row["kind"] = time, Kind.HEADING
+        pitch = math.nan if heading.pitch_rad is None else heading.pitch_rad
+        row["value"] = (heading.heading_rad, pitch, math.nan)
+        sigma = _angle_sigma(heading.heading_sigma_rad, usual), _angle_sigma(heading.pitch_sigma_rad, 2.0 * usual)
+        row["sigma"] = (more_careful * sigma[0], more_careful * sigma[1], math.nan)
+        assumed["heading"] += heading.heading_sigma_rad is None
+    return Observed(sort_observations(rows), +refused, +assumed)
+
+
+def white_factor(step_ns: int, share: float, tau_s: float) -> float:
+    """Factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
+
+    With it the mean of many has the variance that it really has, as if their errors were white.
+    """
+    stays = math.exp(-step_ns * 1e-9 / tau_s)
+    return math.sqrt(1.0 - share**2 + share**2 * (1.0 + stays) / (1.0 - stays))
+
+
+def _spaced(time_ns: Int64Array, step_ns: int) -> Int64Array:
+    """Those of rising times (n,) that are the first of their step."""
+    found: Int64Array = time_ns[np.unique(time_ns // step_ns, return_index=True)[1]]
+    return found
+
+
+def _angle_sigma(said: float | None, usual: float) -> float:
+    return said if said is not None and 0.0 < said < math.pi else usual
+
+
+def ins_observations(
+    rows: StructArray, is_solution: Callable[[NDArray[np.uint32]], NDArray[np.bool_]] | None
+) -> Observed:
+    """Attitudes of a device's own INS, now and then: its positions rest on the fixes, which are taken already."""
+    usable = np.isfinite(rows["roll_rad"]) & np.isfinite(rows["pitch_rad"]) & np.isfinite(rows["heading_rad"])
+    if is_solution is not None:
+        usable &= is_solution(rows["status"])
+    taken = rows[usable & (rows["gps_ns"] > 0)]
+    _, first = np.unique(taken["gps_ns"] // INS_STEP_NS, return_index=True)
+    taken = taken[first]
+    found = np.zeros(len(taken), OBSERVATION_DTYPE)
+    found["time_ns"], found["kind"] = taken["gps_ns"], Kind.ATTITUDE
+    found["value"] = np.stack([taken["roll_rad"], taken["pitch_rad"], taken["heading_rad"]], axis=1)
+    sigma = taken["attitude_sigma_rad"].astype(np.float64)
+    said = np.isfinite(sigma) & (sigma > 0.0)
+    careful = white_factor(INS_STEP_NS, INS_SHARE, INS_TAU_S)
+    found["sigma"] = careful * np.where(said, sigma, np.array(DEFAULT_INS_SIGMAS_RAD))
+    assumed = Counter({"attitude": int((~said.all(axis=1)).sum())})
+    return Observed(sort_observations(found), Counter({"no_solution": int((~usable).sum())}), +assumed)
+
+
+def joined(parts: Sequence[Observed]) -> StructArray:
+    """All rows, sorted."""
+    rows = [part.rows for part in parts]
+    return sort_observations(np.concatenate(rows) if rows else np.empty(0, OBSERVATION_DTYPE))

@@ -1,0 +1,246 @@
+"""Which IMU and which receiver a log is navigated with, their parsers and clocks, and what the filter knows of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
+from daemon.config.tables import GnssConfig, ImuConfig, MtaConfig, NoiseConfig, OutputConfig
+from daemon.errors import ConfigError, ExitCode, UserError
+from daemon.log.format import LogError, SessionInfo
+from daemon.log_parsers import stored_config
+from daemon.processing.models import gimbal_sources
+from daemon.processing.setup import Options
+from daemon.processing.setup import Setup as PointSetup
+from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
+from drivers.core.registry import UnknownProtocolError, find_driver
+from georef.navigation.inputs import GRADES, ImuNoise, Setup, imu_noise
+from georef.records import FixType
+from georef.stream_clocks import ClockPlan, DevicePlan
+
+if TYPE_CHECKING:
+    from daemon.log.reader import Session
+
+FloatArray = NDArray[np.float64]
+
+# Receivers' sigmas of positions are those of the noise from epoch to epoch. As much again lasts for a minute or so:
+# multipath, the atmosphere, the orbits. So half of a variance that is twice theirs is time-correlated.
+CORRELATED_SHARE, CORRELATION_S, SIGMA_FACTOR = 0.5, 60.0, math.sqrt(2.0)
+MIN_BASELINE_M = 0.1  # a shorter one tells no heading
+
+
+class NavigationSources:
+    """The sources of a session.
+
+    Args:
+        config: of the log, or another one.
+        attachments: the files that it names, by their names in a log.
+        imu, gnss: names; None: the first IMU that is no gimbal's, the first receiver.
+
+    Attributes:
+        imu_name, gnss_name: of the configuration.
+        clock: source that shows the host's time beside the IMU.
+        ins_source: whose own INS there may be; None: nobody's.
+
+    Raises:
+        ConfigError, UserError: there are none, or they cannot be used.
+    """
+
+    def __init__(
+        self, config: Config, attachments: Mapping[str, bytes], imu: str | None = None, gnss: str | None = None
+    ) -> None:
+        self.config = config
+        self._attachments = dict(attachments)
+        gimbals = {source for name in config.scanner for _, source in gimbal_sources(config, name)}
+        of_aircraft = [name for name in config.imu if f"imu/{name}" not in gimbals]
+        self.imu_name = _chosen("imu", imu, list(config.imu), of_aircraft)
+        receivers = [name for name in config.gnss if f"gnss/{name}" not in gimbals]
+        self.gnss_name = _chosen("gnss", gnss, list(config.gnss), receivers)
+        table = {self.imu_name: config.imu[self.imu_name]}
+        self._points = PointSetup(without_scanners(config, imu=table), attachments, Options(uncertainty=False))
+        self.clock = self._points.clock_of_imu
+        self.ins_source = self._points.ins_source
+
+    @property
+    def imu(self) -> ImuConfig:
+        """The IMU's table."""
+        return self.config.imu[self.imu_name]
+
+    @property
+    def gnss(self) -> GnssConfig:
+        """The receiver's table."""
+        return self.config.gnss[self.gnss_name]
+
+    @property
+    def imu_source(self) -> str:
+        """``imu/main``."""
+        return f"imu/{self.imu_name}"
+
+    @property
+    def gnss_source(self) -> str:
+        """``gnss/rover``."""
+        return f"gnss/{self.gnss_name}"
+
+    @property
+    def imu_is_in_receiver(self) -> bool:
+        """An IMU that the receiver itself makes an INS of."""
+        return self.imu.transport == f"gnss:{self.gnss_name}"
+
+    # ------------------------------------------------------------------ reading
+
+    def parsers(self) -> dict[str, Parser]:
+        """New parsers of the IMU and of all receivers, by source.
+
+        Raises:
+            ConfigError: a driver cannot work with its settings.
+        """
+        made: dict[str, Parser] = {}
+        for kind, name, table in self.config.device_tables():
+            if kind in ("scanner", "corrections") or (kind == "imu" and name != self.imu_name):
+                continue
+            source = f"{kind}/{name}"
+            try:
+                settings = DeviceSettings(source, plain_table(table), self._files(name, table), compiled=True)
+                made[source] = find_driver(kind, table.protocol).make_parser(settings)
+            except UnknownProtocolError as error:
+                raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
+            except DriverSettingsError as error:
+                raise ConfigError(f"{kind}.{name}: {error}") from error
+        return made
+
+    def _files(self, name: str, table: Any) -> dict[str, bytes]:
+        found: dict[str, bytes] = {}
+        for key, path in self.config.files_of(table).items():
+            stored = self._attachments.get(attachment_name(key, name, path))
+            if key in PARSER_FILES and stored is not None:
+                found[key] = stored
+        return found
+
+    def inside(self, source: str) -> list[str]:
+        """Sources whose messages stand in a wire's bytes."""
+        return self._points.inside(source)
+
+    def edge_of(self, source: str) -> str | None:
+        """Polarity of the edges of ``pps/name``; None: no such source."""
+        return self._points.edge_of(source)
+
+    def clock_plan(self, info: SessionInfo) -> ClockPlan:
+        """The clocks of a session; the IMU's own is kept beside them."""
+        plan = self._points.clock_plan(info)
+        devices = {} if self.clock is None else {self.imu_source: DevicePlan(self.clock)}
+        return replace(plan, devices=devices)
+
+    # ------------------------------------------------------------------ what the filter knows of them
+
+    @property
+    def rot_b_from_imu(self) -> FloatArray:
+        """(3, 3) of ``rotation_b_imu``."""
+        return np.array(self.imu.rotation_b_imu, dtype=np.float64)
+
+    def ins_rows_in_b(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+        """Solutions of the device's INS with the attitude of b."""
+        return self._points.ins_rows(rows)
+
+    def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
+        """Lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be found."""
+        primary = np.array(self.gnss.lever_arm_m, dtype=np.float64)
+        arms, baseline = [primary], None
+        if self.gnss.secondary_lever_arm_m is not None:
+            arms.append(np.array(self.gnss.secondary_lever_arm_m, dtype=np.float64))
+            baseline = arms[1] - primary
+            length_m = float(np.linalg.norm(baseline))
+            if length_m < MIN_BASELINE_M:
+                raise ConfigError(
+                    f"gnss.{self.gnss_name}.secondary_lever_arm_m: is {length_m:.2f} m from lever_arm_m; "
+                    f"want the second antenna's place, {MIN_BASELINE_M:g} m or more away, or leave it out"
+                )
+        return Setup(
+            noise=noise_of(self.imu.noise),
+            lever_arms_b=np.stack(arms),
+            baseline_b=baseline,
+            estimate_time_offset_s=time_sigma_s,
+            gnss_correlation_s=CORRELATION_S,
+            gnss_correlated_share=CORRELATED_SHARE,
+            gnss_sigma_scale={int(fix): SIGMA_FACTOR for fix in FixType},
+        )
+
+
+def files_of(session: Session, config: Config | None) -> dict[str, bytes]:
+    """What a configuration names, by the names in a log: of the log's own (or None) the log's, else those on the disk.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    stored = session.attachments()
+    if config is None or stored.get("config.toml") == config.text.encode():
+        return stored
+    return {name: data for name, _, data in config.attachments()}
+
+
+def config_of_log(attachments: Mapping[str, bytes]) -> Config:
+    """The configuration that is stored in a log.
+
+    Raises:
+        UserError: there is none, or one that cannot be used.
+    """
+    try:
+        config = stored_config(attachments)
+    except LogError as error:
+        raise UserError(f"{error}; give another configuration with --config") from error
+    if config is None:
+        raise UserError("the log holds no configuration; give one with --config")
+    return config
+
+
+def without_scanners(config: Config, **tables: Any) -> Config:
+    """Scanners, their calibrations and the mapping frame do not matter to the way the aircraft went."""
+    update: dict[str, Any] = {
+        "scanner": {},
+        "output": OutputConfig.model_validate({}),
+        "mta": MtaConfig.model_validate({}),
+    }
+    return Config(config.tables.model_copy(update=update | tables), config.path, config.text)
+
+
+def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -> str:
+    """A name of the configuration; the first of those usually meant where none is asked for."""
+    if wanted is not None:
+        if wanted in known:
+            return wanted
+        option = "--imu" if kind == "imu" else "--gnss-name"
+        raise UserError(
+            f"{option}: the configuration has no [{kind}.{wanted}]; there are: {', '.join(known) or 'none'}",
+            ExitCode.USAGE,
+        )
+    if usual:
+        return usual[0]
+    what = {
+        "imu": "no IMU of the aircraft: want [imu.NAME], or a finished trajectory from elsewhere",
+        "gnss": "no GNSS receiver, which tells where it was and when: want [gnss.NAME]",
+    }[kind]
+    raise UserError(f"the configuration names {what}", ExitCode.USAGE)
+
+
+def noise_of(table: NoiseConfig) -> ImuNoise:
+    """What ``[imu.….noise]`` says; what it leaves out is its grade's."""
+    said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
+    keys = {
+        "angle_random_walk_deg_per_sqrt_h": "angle_random_walk",
+        "velocity_random_walk_m_per_s_per_sqrt_h": "velocity_random_walk",
+        "gyro_bias_deg_per_h": "gyro_bias",
+        "accel_bias_mg": "accel_bias",
+        "bias_correlation_h": "bias_correlation_s",
+        "gyro_scale_ppm": "gyro_scale",
+        "accel_scale_ppm": "accel_scale",
+        "misalignment_mrad": "misalignment",
+    }
+    grade = GRADES[table.grade]
+    in_si = imu_noise(**(dict.fromkeys(keys, 0.0) | said))
+    chosen = {keys[key]: getattr(in_si, keys[key]) for key in said}
+    return ImuNoise(**({field.name: getattr(grade, field.name) for field in fields(grade)} | chosen))

@@ -1,0 +1,101 @@
+"""GPS time of an IMU's samples: by its own GPS time, its latch of the PPS, its counter, or by when they arrived."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
+from georef.stream_clocks import HostClocks
+from georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
+
+GREATEST_SIGMA_NS = 1e9  # of a time that is of any use: an offset of this size can still be found
+PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is taken to have missed samples
+
+
+@dataclass(frozen=True, slots=True)
+class ImuTimes:
+    """Which samples have a time.
+
+    Attributes:
+        rows: `IMU_DTYPE` of those that have.
+        gps_ns: (n,) of their stamps.
+        sigma_s: usual standard deviation (median).
+        by: gps (it says GPS time itself), latch (of the PPS), counter, arrival.
+        refused: samples without a time, by reason.
+    """
+
+    rows: StructArray
+    gps_ns: Int64Array
+    sigma_s: float
+    by: str
+    refused: Counter[str]
+
+
+def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: float) -> ImuTimes:
+    """Place the samples of a session.
+
+    Args:
+        rows: in order of arrival.
+        host: complete clocks.
+        clock: source that shows the host's time; None: there is none.
+        rate_hz: nominal rate, for a unit that says no time of its own.
+    """
+    own = rows["gps_week"] >= 0
+    if own.any():
+        taken = rows[own]
+        gps_ns = taken["gps_week"].astype(np.int64) * WEEK_NS + taken["device_time_ns"]
+        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())))
+    if clock is None or not len(rows):
+        return ImuTimes(rows[:0], np.empty(0, np.int64), 0.0, "arrival", _reasons(no_clock=len(rows)))
+    counted = rows["device_time_ns"] >= 0
+    if counted.any():
+        taken, device_ns = rows[counted], rows["device_time_ns"][counted]
+    else:
+        taken, device_ns = rows, counted_arrivals(rows["host_time_ns"], rate_hz)
+    gps_ns, sigma_ns, latched = _by_device(taken, device_ns, host, clock)
+    good = sigma_ns <= GREATEST_SIGMA_NS
+    by = "arrival" if not counted.any() else "latch" if latched else "counter"
+    sigma_s = float(np.median(sigma_ns[good])) / SECOND_NS if good.any() else 0.0
+    refused = _reasons(no_device_time=len(rows) - len(taken), no_clock=int((~good).sum()))
+    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused)
+
+
+def _by_device(
+    rows: StructArray, device_ns: Int64Array, host: HostClocks, clock: str
+) -> tuple[Int64Array, NDArray[np.float64], bool]:
+    """GPS ns and sigma ns (n,) by a device's clock, and whether it latches the PPS."""
+    said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
+    said["host_time_ns"], said["device_time_ns"], said["pps_time_ns"] = (
+        rows["host_time_ns"],
+        device_ns,
+        rows["pps_time_ns"],
+    )
+    said["pps_count"] = said["locked"] = -1
+    device = DeviceClock(host.by_source[clock], keep_history=True)
+    raw_ns = host.timeline.raw_from_host(rows["host_time_ns"])
+    device.add(said, raw_ns)
+    gps_ns, sigma_ns = device.gps_from_device(device_ns, raw_ns)
+    return gps_ns, sigma_ns, device.status().latched
+
+
+def counted_arrivals(host_ns: Int64Array, rate_hz: float) -> Int64Array:
+    """A counter (n,), ns, for samples that have none: one interval each, and the host's time over pauses.
+
+    Units arrive in bunches and late; the samples themselves are evenly spaced. The interval is the mean of those
+    between the pauses, so that crystal and nominal rate may differ.
+    """
+    steps = np.diff(host_ns)
+    paused = steps > PAUSE_S * SECOND_NS
+    flowing_ns, flowing = int(steps[~paused].sum()), int((~paused).sum())
+    interval_ns = flowing_ns / flowing if flowing > rate_hz else SECOND_NS / rate_hz
+    counter = np.concatenate([[0.0], np.cumsum(np.where(paused, steps, interval_ns))])
+    device_ns: Int64Array = np.rint(counter).astype(np.int64)
+    return device_ns
+
+
+def _reasons(**counts: int) -> Counter[str]:
+    return +Counter(counts)

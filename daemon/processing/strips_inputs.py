@@ -1,0 +1,237 @@
+"""Strips to be compared: products of `swath georef`, any LAS or LAZ files, or logs; all as one thing.
+
+What the quick look reads for its maps says where strips overlap; the returns there are read in a second pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.effects import SeenFrom
+from calib.flight import Flight, Tangent
+from calib.strip_cells import Cells, FlightStrip, Gathered, StripBlock, StripRules, blocks_of, gather, thinned
+from daemon.errors import ExitCode, UserError
+from daemon.processing.quicklook import Look, StripFacts, look_at
+from daemon.processing.quicklook_grids import Surface, cell_for, frame_of
+from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
+from daemon.processing.quicklook_read import NOISE_CLASSES, Block, QuickLookError, StripBook, Units
+from daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE, StripCells, compare
+from georef.formats.trajectory_file import read_trajectory
+from georef.mapping import Mapping, MappingError
+from georef.trajectory import Trajectory, TrajectoryError
+
+FloatArray = NDArray[np.float64]
+Told = Callable[[str, int, int], None]
+
+BLOCK_POINTS = 500_000
+LAS_EPOCH_S = 1_000_000_000  # of adjusted standard GPS time
+WANTED = Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
+WANTED |= Selection.POINT_SOURCE_ID | Selection.GPS_TIME
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Strips as they were read.
+
+    Attributes:
+        what: the folder or log, for people.
+        look: of the quick look, for maps and gridded differences.
+        gathered: returns in cells of the overlap, in t where it is known, else in metres of the map.
+        cell_m: side of these.
+        seen: where from; None: no trajectory is known.
+        notes: what the user should know.
+    """
+
+    what: str
+    look: Look
+    gathered: Gathered
+    cell_m: float
+    seen: SeenFrom | None
+    notes: list[str] = field(default_factory=list)
+
+
+def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Strips:
+    """Of LAS or LAZ files and folders.
+
+    Raises:
+        UserError: they cannot be read, or are one strip.
+    """
+    what = ", ".join(map(str, paths))
+    try:
+        look = look_at(paths, told=lambda done, of: told(f"reading {what}", done, of))
+    except QuickLookError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    notes = list(look.notes)
+    refuse_one(what, look)
+    cells = cells_of(look, rules)
+    gathered = gather(_file_blocks(look), cells)
+    try:
+        seen, place = _seen_from(look)
+    except (TrajectoryError, MappingError, OSError, KeyError, TypeError) as error:
+        notes.append(f"{what}: no signatures: {error}")
+        return Strips(what, look, gathered, cells.cell_m, None, notes)
+    if seen is None:
+        notes.append(f"{what}: no signatures: there is no trajectory beside the points; want a folder of swath georef")
+        return Strips(what, look, gathered, cells.cell_m, None, notes)
+    return Strips(what, look, replace(gathered, points=place(gathered.points)), cells.cell_m, seen, notes)
+
+
+def strips_of_flight(what: str, flight: Flight, rules: StripRules) -> Strips:
+    """Of a flight as its points are placed; the map's coordinates are those of t.
+
+    Raises:
+        UserError: it is one strip.
+    """
+    look = look_of_flight(flight)
+    refuse_one(what, look)
+    cells = cells_of(look, rules)
+    gathered = gather(blocks_of([FlightStrip(swath) for swath in flight.swaths]), cells)
+    return Strips(what, look, gathered, cells.cell_m, SeenFrom.of(flight))
+
+
+def refuse_one(what: str, look: Look) -> None:
+    """UserError where there is nothing to compare."""
+    if len(look.names) < 2:
+        raise UserError(f"{what}: one strip only; differences want at least two strips that overlap")
+    if not look.overlap.cells:
+        raise UserError(
+            f"{what}: no two of the {len(look.names)} strips share smooth ground; differences want strips that overlap"
+        )
+    for row in look.overlap.rows:
+        if row["max_m"] == 0.0:
+            names = look.names[row["first"]], look.names[row["second"]]
+            raise UserError(f"{what}: strips {names[0]} and {names[1]} are the same returns under two names; want one")
+
+
+def cells_of(look: Look, rules: StripRules) -> Cells:
+    """Cells of the quick look in which two strips have returns enough."""
+    cells = look.cells
+    found = []
+    for strip in range(len(cells.tiles)):
+        up, across = np.nonzero(cells.tiles[strip] >= 0)
+        tile, inside = np.nonzero(cells.moments[cells.tiles[strip, up, across], :, 1] >= FEWEST_RETURNS)
+        row, column = up[tile] * TILE + inside // TILE, across[tile] * TILE + inside % TILE
+        found.append((row.astype(np.int64) << 32) + column)
+    numbers, strips = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]), return_counts=True)
+    origin = (cells.frame.west_m, cells.frame.south_m)
+    return thinned(Cells(cells.frame.cell_m, numbers[strips > 1], origin), rules)
+
+
+# ---------------------------------------------------------------------- files
+
+
+def _file_blocks(look: Look) -> Iterator[tuple[int, StripBlock]]:
+    """Blocks by strip, numbered as the quick look numbered them: it read the same files in the same order."""
+    book = StripBook()
+    for source in look.sources:
+        try:
+            with PointReader(source.path, WANTED) as reader:
+                while len(points := reader.read(BLOCK_POINTS)):
+                    yield from _by_strip(points, book.numbers(source.path, np.asarray(points["point_source_id"])), look)
+        except UNREADABLE:
+            continue  # the quick look has noted the damage
+
+
+def _by_strip(points: Any, strip: NDArray[np.int32], look: Look) -> Iterator[tuple[int, StripBlock]]:
+    good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES) & (np.asarray(points["withheld"]) == 0)
+    units = look.units
+    places = np.stack([points.x * units.east_m, points.y * units.north_m, points.z * units.up_m], axis=1)
+    time_ns = np.zeros(len(strip), np.int64)
+    if "gps_time" in points.point_format.dimension_names:
+        seconds = np.asarray(points["gps_time"], np.float64)
+        time_ns = np.rint(seconds * 1e9).astype(np.int64) + LAS_EPOCH_S * 1_000_000_000
+    flag = np.asarray(points["scan_direction_flag"])
+    direction = (2 * flag.astype(np.int8) - 1) * np.int8(flag.any() and not flag.all())
+    single = np.asarray(points["number_of_returns"]) <= 1
+    for number in np.unique(strip[good]):
+        own = good & (strip == number)
+        yield int(number), StripBlock(np.asarray(places[own]), time_ns[own], single[own], direction[own])
+
+
+def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:
+    """The trajectories beside the points, and the way from the map's metres to t."""
+    sidecars = [source.sidecar for source in look.sources]
+    trajectories = _trajectories(look)
+    if not trajectories or not all(sidecars):
+        return None, lambda points: points
+    crs, options = sidecars[0]["crs"], sidecars[0].get("options", {})
+    mapping = Mapping(crs["crs"], datum=options.get("datum"), epoch=crs.get("epoch"))
+    middle = trajectories[0].position_e[len(trajectories[0]) // 2]
+    mapping.settle(middle[np.newaxis])
+    frame = Tangent.at(middle)
+    unit_m = np.array([look.units.east_m, look.units.north_m, look.units.up_m])
+
+    def place(points: FloatArray) -> FloatArray:
+        return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
+
+    flown = [_flown(look, number, trajectories) for number in range(len(look.names))]
+    return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names)), place
+
+
+def _trajectories(look: Look) -> list[Trajectory]:
+    folders = {source.path.parent for source in look.sources}
+    files = sorted(file for folder in folders for file in folder.glob("*_trajectory.csv"))
+    return [read_trajectory(file.read_bytes(), str(file)) for file in files]
+
+
+def _flown(look: Look, number: int, trajectories: Sequence[Trajectory]) -> int:
+    """The trajectory of a strip, by the times that its sidecar says of it; the only one, if there is one."""
+    if len(trajectories) == 1:
+        return 0
+    for source in look.sources:
+        for entry in source.sidecar.get("strips", []):
+            if str(entry.get("number")) == look.names[number] and entry.get("first_gps_ns"):
+                spans = [trajectory.span for trajectory in trajectories]
+                inside = [begin <= entry["first_gps_ns"] <= end for begin, end in spans]
+                if any(inside):
+                    return inside.index(True)
+    return 0
+
+
+# ---------------------------------------------------------------------- a flight
+
+
+def look_of_flight(flight: Flight) -> Look:
+    """A quick look at a flight's points in t."""
+    full = [swath for swath in flight.swaths if len(swath)]
+    corners = [(np.nanmin(swath.points_t, axis=0), np.nanmax(swath.points_t, axis=0)) for swath in full]
+    low = np.min([corner[0] for corner in corners], axis=0) if full else np.zeros(3)
+    high = np.max([corner[1] for corner in corners], axis=0) if full else np.ones(3)
+    area_m2 = max(float(np.prod((high - low)[:2])), 1.0)
+    density = max((len(swath) for swath in full), default=1) / area_m2
+    surface = Surface(frame_of(low, high, float(np.clip(cell_for(density, 4), 0.25, 50.0))))
+    cells = StripCells(
+        frame_of(low, high, float(np.clip(cell_for(density, 16), 0.5, 20.0))), float(low[2] + high[2]) / 2
+    )
+    for number, swath in enumerate(flight.swaths):
+        for begin in range(0, len(swath), BLOCK_POINTS):
+            block = _block(
+                swath.points_t[begin : begin + BLOCK_POINTS], swath.rows[begin : begin + BLOCK_POINTS], number
+            )
+            surface.add(block)
+            cells.add(block)
+    facts = [StripFacts(swath.name, len(swath), len(swath), 0.0, density, 0.0, None, None) for swath in flight.swaths]
+    names = [swath.name for swath in flight.swaths]
+    return Look([], Units(), names, surface, cells, compare(cells), facts, None, density, area_m2, 0, [])
+
+
+def _block(points_t: FloatArray, rows: NDArray[np.void], number: int) -> Block:
+    good = np.isfinite(points_t).all(axis=1)
+    points, rows = points_t[good], rows[good]
+    return Block(
+        x_m=np.ascontiguousarray(points[:, 0]),
+        y_m=np.ascontiguousarray(points[:, 1]),
+        z_m=np.ascontiguousarray(points[:, 2]),
+        intensity=np.ascontiguousarray(rows["intensity"]),
+        strip=np.full(len(points), number, np.int32),
+        first=np.asarray(rows["return_number"] <= 1),
+        single=np.asarray(rows["number_of_returns"] <= 1),
+        sigma_m=np.empty((0, 3), np.float32),
+        skipped=0,
+    )

@@ -1,0 +1,191 @@
+"""The files of a trajectory: SBET and smrmsg, CSV, and what goes beside them; written out of sight, put in place whole.
+
+Epochs are written in blocks, so that five hours of them do not stand in memory twice.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.errors import ExitCode, UserError
+from georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
+from georef.formats.trajectory_csv import csv_text
+from georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
+from georef.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+BLOCK = 1 << 16  # epochs written at once
+SBETS = (".sbet", ".out")
+PARTIAL = ".partial"
+COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryFiles:
+    """Where the files of a run go.
+
+    Attributes:
+        sbet, smrmsg, csv: None: not wanted.
+        summary: the JSON, written last.
+        page: the plots.
+    """
+
+    sbet: Path | None
+    smrmsg: Path | None
+    csv: Path | None
+    summary: Path
+    page: Path
+
+    def all(self) -> list[Path]:
+        """Those wanted."""
+        named = (self.sbet, self.smrmsg, self.csv, self.page, self.summary)
+        return [path for path in named if path is not None]
+
+    @classmethod
+    def of_output(cls, output: Path, session: str, *, csv: bool) -> TrajectoryFiles:
+        """By what ``-o`` says: a file .sbet, .out or .csv, or a folder for files with the session's name.
+
+        Raises:
+            UserError: it is neither.
+        """
+        suffix = output.suffix.lower()
+        if suffix == ".csv":
+            return cls(None, None, output, output.with_suffix(".json"), output.with_suffix(".html"))
+        if suffix in SBETS:
+            text = output.with_suffix(".csv") if csv else None
+            return cls(output, _smrmsg_of(output), text, output.with_suffix(".json"), output.with_suffix(".html"))
+        if suffix and not output.is_dir():
+            raise UserError(f"-o {output}: want a name that ends in .sbet, .out or .csv, or a folder", ExitCode.USAGE)
+        stem = output / f"{session}_trajectory"
+
+        def ending(suffix: str) -> Path:
+            return stem.with_name(stem.name + suffix)
+
+        text = ending(".csv") if csv else None
+        return cls(ending(".sbet"), ending(".smrmsg"), text, ending(".json"), ending(".html"))
+
+    def refuse_existing(self, *others: Path | None) -> None:
+        """UserError where a file is there already, another one that is to be written included."""
+        for path in [*self.all(), *(other for other in others if other is not None)]:
+            if path.exists():
+                raise UserError(f"{path}: is there already; want another name, or --overwrite", ExitCode.USAGE)
+
+
+def _smrmsg_of(sbet: Path) -> Path:
+    """The name under which the sigmas of an SBET are looked for."""
+    if sbet.name.startswith("sbet") and sbet.suffix == ".out":
+        return sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet"))
+    return sbet.with_suffix(".smrmsg")
+
+
+def write_trajectory(
+    files: TrajectoryFiles, trajectory: Trajectory, velocity_sigma_l: FloatArray | None
+) -> list[tuple[Path, Path]]:
+    """SBET, smrmsg and CSV as far as they are wanted, under names that `put_in_place` takes away.
+
+    Args:
+        files: where to.
+        trajectory: of the body's origin.
+        velocity_sigma_l: (n, 3) north, east, down; None: unsaid.
+
+    Returns:
+        What was written, and where it belongs.
+
+    Raises:
+        OSError: it cannot be written; nothing is left then.
+    """
+    written: list[tuple[Path, Path]] = []
+    wanted: tuple[tuple[Path | None, Callable[[IO[bytes]], None]], ...] = (
+        (files.sbet, lambda stream: _write(stream, _sbet_blocks(trajectory))),
+        (files.smrmsg, lambda stream: _write(stream, _smrmsg_blocks(trajectory, velocity_sigma_l))),
+        (files.csv, lambda stream: _write(stream, _csv_blocks(trajectory))),
+    )
+    try:
+        for path, write in wanted:
+            if path is not None:
+                written.append((write_aside(path, write), path))
+    except OSError:
+        remove(written)
+        raise
+    return written
+
+
+def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
+    """Write a file beside its place; gives where it stands. OSError: it cannot be written, and is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + PARTIAL)
+    try:
+        with aside.open("wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError:
+        aside.unlink(missing_ok=True)
+        raise
+    return aside
+
+
+def put_in_place(written: list[tuple[Path, Path]]) -> None:
+    """Files to their names, in the order given."""
+    for aside, path in written:
+        aside.replace(path)
+
+
+def remove(written: list[tuple[Path, Path]]) -> None:
+    """What was written aside, where it came to nothing."""
+    for aside, _ in written:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
+
+
+def _write(stream: IO[bytes], blocks: Iterator[bytes]) -> None:
+    for block in blocks:
+        stream.write(block)
+
+
+def _part(trajectory: Trajectory, first: int, last: int) -> Trajectory:
+    return replace(trajectory, **{column: getattr(trajectory, column)[first:last] for column in COLUMNS})
+
+
+def _of_week_s(trajectory: Trajectory, first: int, last: int) -> FloatArray:
+    """Seconds of the week of the trajectory's first epoch, running past its end."""
+    week, _ = week_from_gps(trajectory.span[0])
+    since: FloatArray = (trajectory.time_ns[first:last] - week * WEEK_NS) / SECOND_NS
+    return since
+
+
+def _sbet_blocks(trajectory: Trajectory) -> Iterator[bytes]:
+    """An epoch beyond the block gives its last one's acceleration and rates; the very last has those before it."""
+    n = len(trajectory)
+    for first in range(0, n, BLOCK):
+        last = min(first + BLOCK, n)
+        begin = first - 1 if last == n and first else first
+        part = _part(trajectory, begin, min(last + 1, n))
+        table = np.frombuffer(sbet_bytes(part), "<f8").reshape(-1, SBET_DOUBLES)[first - begin :][: last - first].copy()
+        table[:, 0] = _of_week_s(trajectory, first, last)
+        yield table.tobytes()
+
+
+def _smrmsg_blocks(trajectory: Trajectory, velocity_sigma_l: FloatArray | None) -> Iterator[bytes]:
+    for first in range(0, len(trajectory), BLOCK):
+        last = min(first + BLOCK, len(trajectory))
+        sigma = None if velocity_sigma_l is None else velocity_sigma_l[first:last]
+        data = smrmsg_bytes(_part(trajectory, first, last), sigma)
+        table = np.frombuffer(data, "<f8").reshape(-1, SMRMSG_DOUBLES).copy()
+        table[:, 0] = _of_week_s(trajectory, first, last)
+        yield table.tobytes()
+
+
+def _csv_blocks(trajectory: Trajectory) -> Iterator[bytes]:
+    for first in range(0, len(trajectory), BLOCK):
+        text = csv_text(_part(trajectory, first, first + BLOCK))
+        yield (text if not first else text.partition("\n")[2]).encode()

@@ -1,0 +1,184 @@
+"""`swath trajectory`: from logs to the files of one trajectory, its summary and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.log.reader import Session, open_logs
+from daemon.processing.event_marks import EventTable, event_table
+from daemon.processing.ins_as_is import ins_as_is
+from daemon.processing.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
+from daemon.processing.navigation_inputs import Mark
+from daemon.processing.trajectory_files import (
+    TrajectoryFiles,
+    put_in_place,
+    remove,
+    write_aside,
+    write_trajectory,
+)
+from daemon.processing.trajectory_summary import pages_of, summary_head, summary_of_run, write_json
+from georef.trajectory import Trajectory, TrajectoryError, gps_text
+
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+Written = list[tuple[Path, Path]]
+AS_IS = "as-is"
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs, output: where from, where to.
+        navigate: how.
+        csv: a CSV file too.
+        events: event marks go there; None: nowhere.
+        page: the page of plots is made.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Sequence[Path]
+    output: Path
+    navigate: NavigateWish = field(default_factory=NavigateWish)
+    csv: bool = False
+    events: Path | None = None
+    page: bool = True
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class TrajectoryReport:
+    """What was made: the summary's content, and where it is."""
+
+    record: dict[str, Any]
+    summary: Path
+    files: list[Path]
+
+
+def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
+    """Make the files.
+
+    Raises:
+        UserError: there is no trajectory, a line each; no file is left then.
+    """
+    try:
+        sessions = open_logs(wish.logs)
+        files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
+        if not wish.overwrite:
+            files.refuse_existing(wish.events)
+        if wish.navigate.inputs.ins == AS_IS:
+            return _write_as_is(wish, files, _in_order(sessions))
+        flights = [navigate_session(session, wish.navigate, tell) for session in _in_order(sessions)]
+        return _write(wish, files, flights, tell)
+    except TrajectoryError as error:
+        raise UserError(str(error)) from error
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    except OSError as error:
+        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def _in_order(sessions: Sequence[Session]) -> list[Session]:
+    return sorted(sessions, key=lambda session: session.info.realtime_ns)
+
+
+def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell) -> TrajectoryReport:
+    tell("files", 0, 1)
+    trajectory = _joined(flights)
+    sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
+    written = write_trajectory(files, trajectory, sigma)
+    try:
+        events = _write_events(wish, flights, trajectory, written)
+        verdicts, figures = _write_pages(wish, files, flights, written)
+        record = summary_of_run(wish, flights, verdicts, figures, events)
+        record["files"] = [path.name for _, path in written]
+        written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
+    except BaseException:
+        remove(written)
+        raise
+    put_in_place(written)
+    tell("files", 1, 1)
+    return TrajectoryReport(record, files.summary, [path for _, path in written])
+
+
+def _write_as_is(wish: TrajectoryWish, files: TrajectoryFiles, sessions: Sequence[Session]) -> TrajectoryReport:
+    """The devices' own INS, without a page."""
+    if wish.events is not None:
+        raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
+    found = [ins_as_is(session, wish.navigate.inputs.config) for session in sessions]
+    _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in zip(sessions, found, strict=True)])
+    trajectory = joined_trajectory([one.trajectory for one in found], found[0].trajectory.name)
+    record = summary_head(wish, AS_IS, sessions, [line for one in found for line in one.holes], [])
+    record["sessions"] = [
+        {"session": session.session_id, "ins": one.source, "solutions": dict(sorted(one.solutions.items()))}
+        for session, one in zip(sessions, found, strict=True)
+    ]
+    written = write_trajectory(files, trajectory, None)
+    record["files"] = [path.name for _, path in written]
+    try:
+        written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
+    except BaseException:
+        remove(written)
+        raise
+    put_in_place(written)
+    return TrajectoryReport(record, files.summary, [path for _, path in written])
+
+
+def _joined(flights: Sequence[Navigated]) -> Trajectory:
+    """All sessions' trajectories as one; UserError where two are of one time."""
+    parts = [flight.trajectory(flight.session_id) for flight in flights]
+    _refuse_overlap([(flight.inputs.log, part) for flight, part in zip(flights, parts, strict=True)])
+    return joined_trajectory(parts, parts[0].name)
+
+
+def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
+    for (first, one), (second, other) in pairwise(parts):
+        if other.span[0] <= one.span[1]:
+            raise UserError(
+                f"{second}: begins at {gps_text(other.span[0])}, before {first} ends at {gps_text(one.span[1])}: two "
+                "recordings of one time; navigate them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def _write_events(
+    wish: TrajectoryWish, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
+) -> EventTable | None:
+    marks: list[Mark] = [mark for flight in flights for mark in flight.inputs.marks]
+    if wish.events is None:
+        return event_table(marks, trajectory) if marks else None
+    table = event_table(marks, trajectory)
+    data = table.text.encode()
+
+    def write(stream: IO[bytes]) -> None:
+        stream.write(data)
+
+    written.append((write_aside(wish.events, write), wish.events))
+    return table
+
+
+def _write_pages(
+    wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
+) -> tuple[list[Any], list[Any]]:
+    """A page a leg; verdicts and figures of all legs, in order."""
+    verdicts: list[Any] = []
+    figures: list[Any] = []
+    for page in pages_of(flights):
+        path = files.page if not verdicts else files.page.with_stem(f"{files.page.stem}_{len(verdicts) + 1}")
+        if wish.page:
+            verdict, own, aside = page.write(path)
+            written.append((aside, path))
+        else:
+            verdict, own = page.judge()
+        verdicts.append(verdict)
+        figures.append(own)
+    return verdicts, figures

@@ -1,0 +1,264 @@
+"""`swath validate`: a calibration against logs, control and its own history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from calib.control import ControlError, in_t, read_control
+from calib.control_doubts import doubts
+from calib.features import ControlPoint
+from calib.flight import Flight, FlightError
+from calib.history import History, HistoryError, history
+from calib.plane_search import find_planes
+from calib.plane_settings import PlaneError
+from calib.validation import Method, Validation, same_logs, validate
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.processing.calibration_flight import KeptFlight, read_flight
+from daemon.processing.flights import Wish
+from daemon.processing.sidecar import sha256_of
+from daemon.processing.strips_run import finite, refuse_installations
+from georef.calibration import Calibration, CalibrationError, read_calibration
+from georef.mapping import MappingError
+from georef.strips import StripError
+
+Told = Callable[[str, int, int], None]
+RECORD, PICTURE = "validation.json", "history.png"
+REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, CalibrationError, ControlError)
+
+
+@dataclass(frozen=True)
+class ValidateWish:
+    """What the command line asks for.
+
+    Attributes:
+        calibrations: files to be validated, one a scanner.
+        logs: what is read and how; its calibrations are those.
+        control: CSV of surveyed points; None: none.
+        histories: calibration files, or folders of them.
+        anew: parameters are estimated anew from the logs, and compared.
+        output: folder for record and picture; None: none.
+    """
+
+    calibrations: Sequence[Path]
+    logs: Wish
+    control: Path | None = None
+    histories: Sequence[Path] = ()
+    anew: bool = False
+    output: Path | None = None
+
+
+@dataclass(frozen=True)
+class Validated:
+    """The record for scripts, lines for people, and what is wrong: nothing, or a line."""
+
+    record: dict[str, Any]
+    lines: list[str]
+    problem: str
+
+
+@dataclass
+class _Found:
+    calibrations: dict[str, Calibration]
+    validation: Validation | None = None
+    histories: tuple[History, ...] = ()
+    notes: list[str] = field(default_factory=list)
+
+
+def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
+    """Validate.
+
+    Args:
+        wish: what is asked for.
+        folder: for returns, while it goes on.
+        told: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    try:
+        calibrations = [read_file(path) for path in wish.calibrations]
+        found = _Found({one.scanner: one for one in calibrations})
+        if wish.histories:
+            found.histories = _histories(wish.histories, calibrations)
+        if wish.logs.logs:
+            _against_logs(wish, found, folder, told)
+    except REFUSED as error:
+        raise UserError(str(error)) from error
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    return _written(wish, found)
+
+
+def read_file(path: Path) -> Calibration:
+    """A calibration file; UserError where it cannot be read."""
+    try:
+        return read_calibration(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a calibration file"
+        raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
+    except CalibrationError as error:
+        raise UserError(str(error), ExitCode.USAGE) from error
+
+
+def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple[History, ...]:
+    """Of the scanners and installations of those that are validated."""
+    files = [one for path in paths for one in (sorted(path.rglob("*.toml")) if path.is_dir() else [path])]
+    entries = [entry for path in files if (entry := _entry(path, paths)) is not None]
+    read = {one.id: one for one in [*entries, *validated]}
+    wanted = {(one.scanner, one.header.get("installation")) for one in validated}
+    own = [one for one in read.values() if (one.scanner, one.header.get("installation")) in wanted]
+    return history(own)
+
+
+def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
+    """A calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
+    if path in named or "[calibration]" in path.read_text(encoding="utf-8", errors="replace"):
+        return read_file(path)
+    return None
+
+
+def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -> None:
+    kept = read_flight(wish.logs, folder, told)
+    refuse_installations(kept.logged)
+    _refuse_others(wish, found, kept)
+    flight = kept.flight
+    points, notes = _control(wish, flight)
+    told("planes", 0, 1)
+    planes = find_planes(flight)
+    if not planes.planes:
+        raise UserError(f"{wish.logs.logs[0]}: no planes that two strips see; a validation wants strips that overlap")
+    anew = _anew(wish, found, kept, told) if wish.anew else None
+    told("tests", 0, 1)
+    validation = validate(flight, planes, found.calibrations, points, anew)
+    paths = [part.path for logged in kept.logged for part in logged.session.parts]
+    logs = [(path.name, sha256_of(path)) for path in paths]
+    dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, logs))
+    found.validation = replace(validation, dependent=dependent)
+    found.notes += notes
+
+
+def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
+    """UserError where the logs are not of the calibrations' scanners, or are one strip; what is odd is noted."""
+    scanners = {head.name for head in kept.flight.heads}
+    log = kept.logged[0].log
+    for name, calibration in found.calibrations.items():
+        if name not in scanners:
+            raise UserError(f"{log}: has no scanner {name}, whose calibration {calibration.id} is; {sorted(scanners)}")
+        made, flown = calibration.header.get("installation", ""), kept.logged[0].setup.config.profile.installation
+        if made and flown and made != flown:
+            found.notes.append(f'{log}: is of installation "{flown}", calibration {calibration.id} of "{made}"')
+    for name in sorted(scanners - set(found.calibrations)):
+        head = next(head for head in kept.flight.heads if head.name == name)
+        found.calibrations[name] = head.start
+        found.notes.append(f"{log}: {name}: no calibration named; validated along with {head.start.id}")
+    if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
+        raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
+
+
+def _control(wish: ValidateWish, flight: Flight) -> tuple[tuple[ControlPoint, ...], list[str]]:
+    if wish.control is None:
+        return (), []
+    try:
+        text = wish.control.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want CSV"
+        raise UserError(f"{wish.control}: cannot be read: {why}", ExitCode.IO) from error
+    points = in_t(read_control(text, str(wish.control)), flight.frame)
+    found = doubts(flight, points)
+    refusing = [f"{wish.control}: {one.text}" for one in found if one.refuses and one.kind != "shift"]
+    if refusing:
+        raise UserError(refusing[0])
+    return points, [f"{wish.control}: {one.text}" for one in found]
+
+
+def _anew(wish: ValidateWish, found: _Found, kept: KeptFlight, told: Told) -> Mapping[str, Calibration]:
+    """Parameters from these logs alone."""
+    from calib.adjust import adjust
+    from calib.parameters import Wish as Model
+    from calib.trajectory_errors import gauss_markov
+
+    told("parameters anew", 0, 1)
+    model = Model("scanner")
+    adjusted = adjust(kept.flight, find_planes(kept.flight), model, gauss_markov(kept.flight), start=found.calibrations)
+    return adjusted.calibrations
+
+
+# ---------------------------------------------------------------------- what is told
+
+
+def _written(wish: ValidateWish, found: _Found) -> Validated:
+    record: dict[str, Any] = {"calibrations": {name: one.id for name, one in found.calibrations.items()}}
+    lines: list[str] = []
+    wrong: list[str] = []
+    if found.validation is not None:
+        record["validation"] = _record(found.validation)
+        lines += [method.sentence for method in found.validation.methods] + [found.validation.sentence]
+        wrong += [] if found.validation.passed else [found.validation.sentence]
+        found.notes += found.validation.dependent
+    if found.histories:
+        record["history"] = [one.record() for one in found.histories]
+        for one in found.histories:
+            lines += _table(one) + list(one.sentences)
+            wrong += list(one.sentences) if one.moved else []
+    record["notes"] = found.notes
+    record = finite(record)
+    if wish.output is not None:
+        lines += _write(wish.output, record, found.histories)
+    return Validated(record, [*lines, *found.notes], "; ".join(wrong))
+
+
+def _record(validation: Validation) -> dict[str, Any]:
+    return {
+        "passed": validation.passed,
+        "sentence": validation.sentence,
+        "independent": not validation.dependent,
+        "methods": [_method(method) for method in validation.methods],
+    }
+
+
+def _method(method: Method) -> dict[str, Any]:
+    numbers = method.numbers
+    names = ("count", "mean_m", "std_m", "rms_m", "max_m", "median_m", "p95_m")
+    tests = [
+        {"kind": one.kind, "value": one.value, "freedom": one.freedom, "p": one.p, "passed": one.passed}
+        for one in method.tests
+    ]
+    return {
+        "method": method.name,
+        "code": method.code,
+        "passed": method.passed,
+        "numbers": None if numbers is None else {name: getattr(numbers, name) for name in names},
+        "tests": tests,
+        "sentence": method.sentence,
+    } | dict(method.more)
+
+
+def _table(one: History) -> list[str]:
+    lines = [f"{'calibration':<28}{'created':<22}" + "".join(f"{key:>20}" for key in ("omega °", "phi °", "kappa °"))]
+    for row in one.table():
+        values = [
+            f"{row[key]:.4f} ± {row[f'{key}_sigma']:.4f}" if row[f"{key}_sigma"] else f"{row[key]:.4f}"
+            for key in ("omega_deg", "phi_deg", "kappa_deg")
+        ]
+        lines.append(f"{row['id']:<28}{row['created']:<22}" + "".join(f"{value:>20}" for value in values))
+    return lines
+
+
+def _write(output: Path, record: dict[str, Any], histories: Sequence[History]) -> list[str]:
+    files = {output / RECORD: (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()}
+    if histories:
+        from calib.history_plots import history_png
+
+        files[output / PICTURE] = history_png(histories)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        for path, data in files.items():
+            path.write_bytes(data)
+    except OSError as error:
+        raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+    return [str(path) for path in files]

@@ -1,0 +1,179 @@
+"""``swath calibrate`` from logs to files: the truth within its sigmas, and mistakes in one line."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from calib.features import Features, Plane
+from daemon.cli.main import run_app
+from daemon.errors import UserError
+from daemon.processing.calibrate_run import refuse_no_planes
+from daemon.processing.warm_calibration import warm_calibration
+from georef.calibration import read_calibration
+from tests.calib.village import Made, village
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow, pytest.mark.timeout(300)]
+
+ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return village(tmp_path_factory.mktemp("village"), prf_hz=20_000.0, lines=(0, 1, 2, 3, 4))
+
+
+def arguments(made: Made, output: Path, *more: str) -> list[str]:
+    trajectory = made.flown.folder / "true_trajectory.csv"
+    return [
+        *("calibrate", str(made.flown.log), "-o", str(output), "--trajectory", str(trajectory)),
+        *("--trajectory-datum", "same", "--workers", "1", "--model", "basic", *more),
+    ]
+
+
+def loops() -> set[str]:
+    """Of calib, those that this process has compiled or read from the cache, with the types they are for."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("calib.")]
+    known = [one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)]
+    return {f"{one.py_func.__qualname__} {types}" for one in known for types in one.overloads}
+
+
+@pytest.fixture(scope="module")
+def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of one run, and in ``new_loops`` what it needed that a warm-up does not make."""
+    folder = tmp_path_factory.mktemp("products")
+    control = made.flown.folder / "control.csv"
+    report = ("--report", str(folder / "report"), "--control", str(control))
+    warm_calibration()
+    warm = loops()
+    assert len(warm) > 5
+    assert run_app(arguments(made, folder / "left.toml", *report)) == 0
+    (folder / "new_loops").write_text("\n".join(sorted(loops() - warm)))
+    return folder
+
+
+def refused(capsys: pytest.CaptureFixture[str], output: Path, given: list[str]) -> str:
+    """The one line of a command that made nothing."""
+    capsys.readouterr()
+    assert run_app(given) in (1, 2, 3)
+    line = capsys.readouterr().err
+    assert line.startswith("swath: ")
+    assert line.count("\n") == 1, line
+    assert "internal error" not in line
+    assert not output.exists()
+    return line
+
+
+def test_the_truth_is_within_the_sigmas(made: Made, products: Path) -> None:
+    found = read_calibration((products / "left.toml").read_text(), "left.toml")
+    for name in (*ANGLES, "range_offset_m"):
+        sigma = math.sqrt(found.covariance()[list_of(name), list_of(name)])
+        assert 0.0 < sigma < (0.02 if name == "range_offset_m" else math.radians(0.01)), name
+        assert abs(found.value(name) - made.truth.value(name)) < 3.0 * sigma, name
+    assert found.method == "combined"
+
+
+def list_of(name: str) -> int:
+    from georef.calibration import INDEX
+
+    return INDEX[name]
+
+
+def test_strips_agree_afterwards(products: Path) -> None:
+    told = json.loads((products / "report" / "calibration.json").read_text())
+    before, after = (told["strips"][when]["all"]["rms_m"] for when in ("before", "after"))
+    assert before > 0.3
+    assert after < 0.03
+    assert told["redundancy"] > 1000
+    assert told["verdict"]["level"] in ("good", "care")
+    assert "strips agree to" in told["verdict"]["sentence"]
+
+
+def test_report_and_record_stand_beside(products: Path) -> None:
+    page = (products / "report" / "report.html").read_text()
+    assert "boresight" in page
+    assert "src='http" not in page
+    assert 'src="http' not in page
+    assert (products / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
+    record = json.loads((products / "report" / "left.record.json").read_text())
+    assert record
+
+
+def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:
+    assert (products / "new_loops").read_text() == ""
+
+
+def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
+    """The option for the first of the strips only."""
+    strips = folder / "strips.csv"
+    spans = [f"{int(swath.time_ns[0])},{int(swath.time_ns[-1])}" for swath in made.flight.swaths[:count]]
+    strips.write_text("\n".join(["start_gps_ns,end_gps_ns", *spans]) + "\n")
+    return "--strips", str(strips)
+
+
+def test_one_strip_is_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "left.toml"
+    line = refused(capsys, output, arguments(made, output, *first_strips(made, 1, tmp_path)))
+    assert "1 strip" in line
+
+
+def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = (made.flown.folder / "control.csv").read_text().splitlines()
+    lowered = [lines[0]]
+    for line in lines[1:]:
+        name, lat, lon, height, sigma = line.split(",")
+        lowered.append(",".join((name, lat, lon, f"{float(height) - 47.6:.4f}", sigma)))
+    control = tmp_path / "control.csv"
+    control.write_text("\n".join(lowered) + "\n")
+    output = tmp_path / "left.toml"
+    line = refused(capsys, output, arguments(made, output, "--control", str(control)))
+    assert "orthometric" in line
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--observe", "trees"), "--observe"),
+        (("--fix", "phi"), "phi"),
+        (("--prior", "phi_deg=much"), "--prior"),
+        (("--control", "nowhere.csv"), "nowhere.csv"),
+        (("--scanner", "right"), "right"),
+    ],
+)
+def test_wrong_use(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], said: str
+) -> None:
+    output = tmp_path / "left.toml"
+    assert said in refused(capsys, output, arguments(made, output, *more))
+
+
+def test_a_line_of_control_that_is_none_is_named(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    control = tmp_path / "control.csv"
+    control.write_text("name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m\nGCP1,47.18,nine,450.0,0.01\n")
+    output = tmp_path / "left.toml"
+    line = refused(capsys, output, arguments(made, output, "--control", str(control)))
+    assert "control.csv" in line
+    assert "line 2" in line
+
+
+def test_where_strips_have_no_plane_in_common_it_says_why() -> None:
+    refuse_no_planes("log", Features((Plane("roof 1", np.zeros(3), np.array([0.0, 0.0, 1.0]), ()),)))
+    with pytest.raises(UserError, match=r"log: no plane is seen by two strips \(7 too rough, 2 curved\)"):
+        refuse_no_planes("log", Features(refused=Counter({"curved": 2, "too rough": 7})))
+
+
+def test_a_calibration_too_far_from_the_start_is_refused(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "left.toml"
+    line = refused(capsys, output, arguments(made, output, "--limit-deg", "0.3"))
+    assert "--limit-deg" in line

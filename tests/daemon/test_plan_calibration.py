@@ -1,0 +1,149 @@
+"""``swath plan-calibration``: verdicts of plans whose answer is known, the picture, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli.plan_calibration import command
+from daemon.errors import ExitCode, UserError
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+HEAD = """
+[flight]
+name = "planned"
+lead_s = 3.0
+bank_max_deg = 38.0
+
+[terrain]
+height_m = 450.0
+relief_m = 0.0
+cell_m = 10.0
+
+[imu.main]
+grade = "{grade}"
+
+[control]
+points = 10
+
+[scanner.left]
+kind = "{kind}"
+prf_hz = 100_000.0
+range_max_m = 2500.0
+"""
+VILLAGE = """
+[[terrain.village]]
+center_m = [0.0, 0.0]
+size_m = [300.0, 300.0]
+heading_deg = 20.0
+houses = 40
+"""
+OPPOSITE = (("there", (-350, 0), (350, 0), 1150), ("back", (350, 0), (-350, 0), 1150))
+CROSSING = (
+    *OPPOSITE,
+    ("beside", (-350, 200), (350, 200), 1150),
+    ("down", (0, 350), (0, -350), 1150),
+    ("up", (150, -350), (150, 350), 1150),
+)
+
+
+def plan_of(
+    folder: Path, lines: Any = CROSSING, more: str = "", grade: str = "tactical", kind: str = "oscillating"
+) -> str:
+    text = HEAD.format(grade=grade, kind=kind) + more
+    for name, (x0, y0), (x1, y1), height in lines:
+        text += (
+            f'[[line]]\nname = "{name}"\nfrom_m = [{x0}.0, {y0}.0]\nto_m = [{x1}.0, {y1}.0]\nheight_m = {height}.0\n'
+        )
+    path = folder / "plan.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def planned(plan: str, picture: Path, **options: Any) -> None:
+    asked = {"model": "basic", "sigmas": None, "no_control": False, "control_sigma": 0.01, "as_json": True, **options}
+    command(plan, picture, **asked)
+
+
+def test_lines_over_a_village_determine_the_boresight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Sigmas of an honest size, a picture of one page; with half the trajectory's sigmas, hardly more than half."""
+    plan, picture = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png"
+    planned(plan, picture)
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"] == "This flight determines boresight and range offset."
+    assert told["picture"] == str(picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert told["planes"] > 60
+    assert told["control_points"] >= 8
+    assert told["trajectory_sigmas"] == {"position_m": 0.02, "roll_pitch_deg": 0.004, "heading_deg": 0.01}
+    sigma = {row["name"]: row["sigma"] for row in told["parameters"]}
+    assert 0.001 < sigma["omega_deg"] < 0.004
+    assert 0.002 < sigma["kappa_deg"] < 0.01
+    assert sigma["range_offset_m"] < 0.02
+    planned(plan, picture, sigmas="0.01,0.002,0.005")
+    halved = {row["name"]: row["sigma"] for row in json.loads(capsys.readouterr().out)["parameters"]}
+    for name in ("omega_deg", "phi_deg", "kappa_deg"):
+        assert 0.45 < halved[name] / sigma[name] < 0.7
+
+
+def test_opposite_lines_over_flat_ground_determine_roll_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pitch, heading and range are declared not determinable, each with what to fly. Control gives the range."""
+    plan, picture = plan_of(tmp_path, OPPOSITE), tmp_path / "plan.pdf"
+    with pytest.raises(UserError, match=r"does not determine pitch \(φ\), heading \(κ\) and range offset\.") as ended:
+        planned(plan, picture, no_control=True, as_json=False)
+    assert ended.value.exit_code == ExitCode.PROBLEM
+    told = capsys.readouterr().out
+    assert "left phi_deg: " in told
+    assert "to determine it: fly opposite lines over roofs or slopes that face along the track" in told
+    assert "left range_offset_m: " in told
+    assert "at least 8 points at 1 cm" in told
+    assert picture.read_bytes().startswith(b"%PDF")
+    with pytest.raises(UserError, match=r"does not determine pitch \(φ\) and heading \(κ\)\."):
+        planned(plan, picture)
+
+
+def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same lines with a MEMS unit: its attitude is too poor for these sigmas."""
+    with pytest.raises(UserError, match="does not determine"):
+        planned(plan_of(tmp_path, more=VILLAGE, grade="mems"), tmp_path / "plan.svg")
+    told = json.loads(capsys.readouterr().out)
+    assert any(not row["determined"] and row["sigma"] for row in told["parameters"])
+
+
+@pytest.mark.parametrize(
+    ("made", "options", "words"),
+    [
+        (
+            {"kind": "nutating"},
+            {},
+            "a nutating scanner cannot be planned for; want one of oscillating, polygon, monogon",
+        ),
+        ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no roof and no ground is seen from two lines"),
+        ({}, {"model": "all"}, "model: got 'all', want one of basic, scanner, full"),
+        ({}, {"sigmas": "0.02,0.004"}, '--sigmas: got "0.02,0.004", want three numbers'),
+        ({}, {"sigmas": "0.02,0,0.01"}, '--sigmas: got "0.02,0,0.01", want numbers above 0'),
+    ],
+)
+def test_what_cannot_be_planned_is_one_line(
+    tmp_path: Path, made: dict[str, Any], options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(UserError) as ended:
+        planned(plan_of(tmp_path, **made), tmp_path / "plan.png", **options)
+    assert words in ended.value.message
+    assert "\n" not in ended.value.message
+    assert ended.value.exit_code == ExitCode.USAGE
+
+
+def test_pictures_that_cannot_be_written_are_one_line(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, OPPOSITE)
+    with pytest.raises(UserError, match=r"plan.bmp: want a picture's name that ends in one of .pdf, .png, .svg"):
+        planned(plan, tmp_path / "plan.bmp")
+    with pytest.raises(UserError, match="No such file") as ended:
+        planned(plan, tmp_path / "none" / "plan.png")
+    assert ended.value.exit_code == ExitCode.IO

@@ -1,0 +1,200 @@
+"""``swath strips`` on files as `swath georef` makes them, and on a flight: verdicts, exit codes, words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from pyproj import CRS
+
+from calib.flight import Flight
+from calib.strip_cells import StripRules
+from daemon.cli import strips
+from daemon.errors import ExitCode, UserError
+from daemon.processing.strips_inputs import strips_of_flight
+from daemon.processing.strips_run import refuse_installations
+from georef.formats.trajectory_csv import csv_text
+from georef.mapping import Mapping
+from tests.calib.cast_flight import Cast, cast_flight
+from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+LINES = ((-150, 0, 150, 0, 850), (150, 40, -150, 40, 850))
+FLAT = "height_m = 450.0\nrelief_m = 0.0"
+
+
+def run(*arguments: str) -> None:
+    """The command, in this process."""
+    app = typer.Typer()
+    app.command()(strips.command)
+    app(args=list(arguments), standalone_mode=False)
+
+
+def lifted(folder: Path, lift_m: float, south_m: float = 30.0) -> Path:
+    """Two strips over a slope, the second higher."""
+    folder.mkdir()
+    for number, (south, lift) in enumerate([(0.0, 0.0), (south_m, lift_m)], start=1):
+        x, y = lattice(EAST_M, NORTH_M + south, 120.0, 50.0, 0.5)
+        write(folder / f"s{number}.laz", x, y, plane(x, y) + lift, number, crs=CRS.from_epsg(25832))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made() -> Cast:
+    """Two opposite lines over flat ground."""
+    return cast_flight(FLAT, LINES, prf_hz=40_000.0, true={})
+
+
+def products(folder: Path, flight: Flight) -> Path:
+    """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar."""
+    folder.mkdir()
+    mapping = Mapping("EPSG:25832", datum="same")
+    for number, swath in enumerate(flight.swaths, start=1):
+        points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
+        seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
+        number_of = np.asarray(swath.rows["number_of_returns"])
+        write(
+            folder / f"a_strip{number:02d}.laz",
+            points[:, 0],
+            points[:, 1],
+            points[:, 2],
+            number,
+            crs=CRS.from_epsg(25832),
+            gps_time=seconds,
+            return_number=np.asarray(swath.rows["return_number"]),
+            number_of_returns=number_of,
+        )
+    (folder / "a_trajectory.csv").write_text(csv_text(flight.trajectories[0]))
+    sidecar = {
+        "strips": [{"number": number, "file": f"a_strip{number:02d}.laz"} for number in (1, 2)],
+        "crs": {"crs": "EPSG:25832", "epoch": None},
+        "options": {"datum": "same"},
+    }
+    (folder / "a.json").write_text(json.dumps(sidecar))
+    return folder
+
+
+def test_numbers_of_a_lifted_strip_in_the_record_and_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lifted(tmp_path / "now", 0.07)
+    run(str(folder), "-o", str(tmp_path / "out"), "--json")
+    record = json.loads(capsys.readouterr().out)
+    (pair,) = record["pairs"]
+    assert (pair["first"], pair["second"]) == ("1", "2")
+    for numbers in (pair["dz"], pair["gridded"], record["all"]["gridded"]):
+        assert numbers["mean_m"] == pytest.approx(-0.07, abs=2e-4)
+        assert numbers["rms_m"] == pytest.approx(0.07, abs=2e-4)
+        assert numbers["max_m"] == pytest.approx(0.07, abs=5e-4)
+        assert numbers["std_m"] == pytest.approx(0.0, abs=1e-3)
+    assert pair["point_to_plane"]["mean_m"] == pytest.approx(-0.07 / np.hypot(1.0, np.hypot(0.12, 0.07)), abs=2e-4)
+    assert record["quality"]["best"] == "QL2"  # 4 pulses a square metre are too few for QL1
+    assert record["signatures"] is None
+    assert any("no trajectory" in line or "no signatures" in line for line in record["notes"])
+    assert json.loads((tmp_path / "out" / "strips.json").read_text()) == record
+    assert (tmp_path / "out" / "differences.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    now, then = lifted(tmp_path / "now", 0.01), lifted(tmp_path / "then", 0.20)
+    run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
+    told = capsys.readouterr().out
+    assert "before: RMS 19.8 cm, largest 19.8 cm; now: 1.0 cm, 1.0 cm" in told
+    assert "strips keep QL2; QL1 not for its limit of pulses per m² 8" in told
+    assert "confirm them against the edition in the contract" in told
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "differences.png",
+        "differences_before.png",
+        "strips.json",
+    ]
+
+
+def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
+    folder = lifted(tmp_path / "now", 0.12)
+    run(str(folder), "--level", "QL3")
+    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of metres RMSDz 0\.08") as caught:
+        run(str(folder), "--level", "QL2")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+
+
+def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = products(tmp_path / "good", made.flight)
+    run(str(good), "--json")
+    record = json.loads(capsys.readouterr().out)
+    effects = {one["name"]: one for one in record["signatures"]["effects"]}
+    assert effects["roll"]["level"] == "none"
+    assert record["notes"] == []
+    bad = products(tmp_path / "bad", made.flight.placed({"left": made.truth.changed(omega_rad=4e-4)}))
+    with pytest.raises(UserError, match=r"roll: opposite strips tilt .* to omega_rad") as caught:
+        run(str(bad), "--json")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+    roll = next(one for one in json.loads(capsys.readouterr().out)["signatures"]["effects"] if one["name"] == "roll")
+    assert roll["value"] == pytest.approx(np.degrees(-4e-4), abs=3.5 * roll["sigma"])
+    assert roll["sigma"] < 0.005
+
+
+def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
+    """Both ways to the same differences: arrays in t, and LAZ in a projection."""
+    from daemon.processing.strips_inputs import strips_of_files
+
+    of_flight = strips_of_flight("flight", made.flight, StripRules())
+    of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda what, done, of: None)
+    numbers = [one.look.overlap.numbers() for one in (of_flight, of_files)]
+    assert numbers[0] is not None
+    assert numbers[1] is not None
+    assert numbers[0]["rms_m"] == pytest.approx(numbers[1]["rms_m"], rel=0.1)
+    heights = of_files.gathered.points[:, 2], of_flight.gathered.points[:, 2]
+    assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
+
+
+@pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level"])
+def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
+    folder = lifted(tmp_path / "now", 0.0, 500.0 if what == "apart" else 30.0)
+    arguments, said = [str(folder)], ""
+    if what == "one":
+        (folder / "s2.laz").unlink()
+        said = "now: one strip only; differences want at least two strips that overlap"
+    elif what == "apart":
+        said = "now: no two of the 2 strips share smooth ground"
+    elif what == "twice":
+        x, y = lattice(EAST_M, NORTH_M, 120.0, 50.0, 0.5)
+        write(folder / "s2.laz", x, y, plane(x, y), 2, crs=CRS.from_epsg(25832))
+        said = "strips 1 and 2 are the same returns under two names"
+    elif what == "nothing":
+        (tmp_path / "empty").mkdir()
+        arguments, said = [str(tmp_path / "empty")], "holds neither LAS or LAZ files nor logs"
+    elif what == "absent":
+        arguments, said = [str(tmp_path / "no")], "no such file or folder"
+    else:
+        arguments, said = [str(folder), "--level", "QL9"], 'got "QL9", want one of QL0, QL1, QL2, QL3'
+    with pytest.raises(UserError, match=said) as caught:
+        run(*arguments)
+    assert "\n" not in caught.value.message
+    codes = {"nothing": ExitCode.IO, "absent": ExitCode.IO, "level": ExitCode.USAGE}
+    assert caught.value.exit_code == codes.get(what, ExitCode.PROBLEM)
+
+
+def logged(name: str, installation: str) -> Any:
+    """A flight as logged, as far as its installation goes."""
+    profile = SimpleNamespace(installation=installation)
+    return SimpleNamespace(log=Path(name), setup=SimpleNamespace(config=SimpleNamespace(profile=profile)))
+
+
+def test_logs_of_different_installations_are_refused() -> None:
+    refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/1")])
+    with pytest.raises(
+        UserError, match=r'b\.mcap: is of installation "HB-ABC/2", a\.mcap of "HB-ABC/1"; want logs of one'
+    ):
+        refuse_installations([logged("a.mcap", "HB-ABC/1"), logged("b.mcap", "HB-ABC/2")])
+
+
+def test_a_flight_of_one_strip_is_refused(made: Cast) -> None:
+    with pytest.raises(UserError, match="one strip only"):
+        strips_of_flight("x.mcap", replace(made.flight, swaths=made.flight.swaths[:1]), StripRules())

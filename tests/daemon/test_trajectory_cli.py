@@ -1,0 +1,345 @@
+"""``swath trajectory``: where the truth is, within its own sigmas; everything accounted for; mistakes in one line."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+from scipy.spatial.transform import Rotation
+
+from daemon.cli.main import run_app
+from daemon.processing.event_marks import PLACED
+from daemon.processing.navigate import attitude_of_text, navigate_log
+from georef.formats.trajectory_file import read_trajectory
+from georef.trajectory import Trajectory
+from tests.daemon.short_flight import MARK_AFTER_NS, Flown, fly_short
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+S = 1_000_000_000
+PLAN = """
+[flight]
+name = "navigated"
+seed = 5
+speed_mps = 50.0
+
+[[line]]
+name = "1"
+from_m = [-500, 0]
+to_m = [500, 0]
+height_m = 700
+
+[[line]]
+name = "2"
+from_m = [500, 400]
+to_m = [-500, 400]
+height_m = 700
+
+[gnss.rover]
+rate_hz = 2
+secondary_lever_arm_m = [0.1, 1.15, -1.2]
+
+[imu.main]
+rate_hz = 100
+
+[scanner.left]
+prf_hz = 500
+"""
+SECONDS = 55.0
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return fly_short(tmp_path_factory.mktemp("navigated"), PLAN, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def made(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Smoothed, with everything."""
+    folder = tmp_path_factory.mktemp("made")
+    arguments = [
+        "trajectory",
+        str(flown.log),
+        "-o",
+        str(folder / "a.sbet"),
+        "--csv",
+        "--events",
+        str(folder / "marks.csv"),
+    ]
+    assert run_app(arguments) == 0
+    return folder
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    read: dict[str, Any] = json.loads((folder / "a.json").read_text())
+    return read
+
+
+def read(folder: Path, flown: Flown) -> Trajectory:
+    span = flown.truth().span
+    smrmsg = (folder / "a.smrmsg").read_bytes()
+    return read_trajectory((folder / "a.sbet").read_bytes(), "a.sbet", span_ns=span, smrmsg=smrmsg)
+
+
+def errors(trajectory: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) of position, north, east, down, m, and of attitude, rad, where both say something."""
+    inside = truth.fates(trajectory.time_ns) == 0
+    part = Trajectory(
+        *(
+            getattr(trajectory, name)[inside]
+            for name in ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+        )
+    )
+    poses = truth.poses(part.time_ns)
+    true = Trajectory(
+        part.time_ns,
+        poses.position_e,
+        poses.q_e_from_b,
+        poses.velocity_e,
+        part.position_sigma_l,
+        part.attitude_sigma_rad,
+    )
+    lat, lon, _ = true.geodetic()
+    down = np.stack([-np.cos(lat) * np.cos(lon), -np.cos(lat) * np.sin(lon), -np.sin(lat)], axis=1)
+    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], axis=1)
+    north = np.cross(east, down)
+    apart = part.position_e - true.position_e
+    position = np.stack([(apart * axis).sum(axis=1) for axis in (north, east, down)], axis=1)
+    angles = np.stack(part.attitude(), axis=1) - np.stack(true.attitude(), axis=1)
+    return position, (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+class TestSmoothed:
+    def test_it_is_where_the_truth_is_within_its_own_sigmas(self, flown: Flown, made: Path) -> None:
+        trajectory, truth = read(made, flown), flown.truth()
+        inside = truth.fates(trajectory.time_ns) == 0
+        position, attitude = errors(trajectory, truth)
+        assert inside.sum() > (SECONDS - 3) * 100  # from the first position on, though the start was found later
+        assert np.sqrt((position**2).mean(axis=0)).max() < 0.03  # RTK of 1 cm, 1 cm, 2 cm
+        assert np.degrees(np.sqrt((attitude**2).mean(axis=0))).max() < 0.2
+        normalised = np.concatenate(
+            [position / trajectory.position_sigma_l[inside], attitude / trajectory.attitude_sigma_rad[inside]], axis=1
+        )
+        spread = np.sqrt((normalised**2).mean(axis=0))
+        assert (spread < 3.0).all(), spread  # one flight: its errors are few independent ones
+        assert np.sqrt((normalised**2).mean()) > 0.2  # nor are the sigmas large for fear of that
+
+    def test_the_summary_tells_what_it_is_made_of(self, flown: Flown, made: Path) -> None:
+        told = summary(made)
+        assert (told["format"], told["solution"], told["point"]) == ("swath.trajectory", "smoothed", "body")
+        assert (told["complete"], told["holes"]) == (True, [])
+        digest = hashlib.sha256(flown.log.read_bytes()).hexdigest()
+        assert told["logs"] == [{"name": flown.log.name, "sha256": digest}]
+        assert set(told["files"]) | {"a.json"} == {path.name for path in made.iterdir()}
+        (session,) = told["sessions"]
+        assert session["imu"]["samples"]["taken"] == pytest.approx(SECONDS * 100, abs=5)
+        assert session["imu"]["time_by"] == "latch"
+        assert session["legs"][0]["setup"]["lever_arms_b"][0] == [0.1, -0.05, -1.2]
+        (leg,) = session["legs"]
+        fates = leg["figures"]["observations"]["position"]
+        assert fates["seen"] == sum(fates[fate] for fate in ("taken", "inflated", "reacquired", "rejected", "unusable"))
+        assert leg["verdict"]["level"] in {"good", "care"}
+        assert leg["start"]["words"]
+
+    def test_its_page_says_the_same(self, made: Path) -> None:
+        page = (made / "a.html").read_text()
+        assert summary(made)["sessions"][0]["session"] in page
+        assert "data:image/png" in page
+
+    def test_marks_are_where_the_aircraft_was(self, flown: Flown, made: Path) -> None:
+        rows = list(csv.DictReader((made / "marks.csv").read_text().splitlines()))
+        assert len(rows) >= SECONDS - 2
+        assert summary(made)["events"] == {
+            fate: sum(row["fate"] == fate for row in rows) for fate in {row["fate"] for row in rows}
+        }
+        placed = [row for row in rows if row["fate"] == PLACED]
+        assert len(placed) >= SECONDS - 15
+        truth = flown.truth()
+        lat, _, height = truth.geodetic()
+        for row in placed:
+            assert abs(int(row["gps_ns"]) % S - MARK_AFTER_NS) <= 200
+            since = truth.time_ns - int(row["gps_ns"])
+            assert float(row["lat_deg"]) == pytest.approx(np.degrees(np.interp(0.0, since, lat)), abs=1e-6)
+            assert float(row["height_m"]) == pytest.approx(np.interp(0.0, since, height), abs=0.1)
+
+    def test_the_function_for_georeferencing_gives_the_same(self, flown: Flown, made: Path) -> None:
+        trajectory, again = read(made, flown), navigate_log([flown.log])
+        assert np.abs(again.position_e - trajectory.position_e).max() < 1e-6
+        assert np.abs(again.position_sigma_l - trajectory.position_sigma_l).max() < 1e-12
+
+
+class TestOtherwise:
+    def test_in_real_time_it_is_the_filters(
+        self, flown: Flown, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        output = tmp_path / "a.sbet"
+        capsys.readouterr()
+        assert run_app(["trajectory", str(flown.log), "-o", str(output), "--realtime", "--no-page", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == summary(tmp_path)
+        assert summary(tmp_path)["solution"] == "realtime"
+        assert not (tmp_path / "a.html").exists()
+        filtered, smoothed = read(tmp_path, flown), read(made, flown)
+        both = np.isin(filtered.time_ns, smoothed.time_ns)
+        ours, theirs = (t.between(int(filtered.time_ns[both][0]), t.span[1]) for t in (filtered, smoothed))
+        assert (ours.attitude_sigma_rad.mean(axis=0) > 1.2 * theirs.attitude_sigma_rad.mean(axis=0)).all()
+        position, _ = errors(filtered, flown.truth())
+        assert np.sqrt((position**2).mean(axis=0)).max() < 0.2
+
+    def test_a_csv_in_a_folder_that_is_not_there_yet_is_the_same_bit_for_bit(
+        self, flown: Flown, made: Path, tmp_path: Path
+    ) -> None:
+        output = tmp_path / "new" / "t.csv"
+        assert run_app(["trajectory", str(flown.log), "-o", str(output), "--no-page"]) == 0
+        assert {path.name for path in output.parent.iterdir()} == {"t.csv", "t.json"}
+        assert output.read_bytes() == (made / "a.csv").read_bytes()
+
+    def test_antennas_that_are_swapped_are_named(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        primary, secondary = "= [0.1, -0.05, -1.2]", "= [0.1, 1.15, -1.2]"
+        flown.changed("swapped.toml", **{primary: "= [0, 0, 0]", secondary: primary, "= [0, 0, 0]": secondary})
+        capsys.readouterr()
+        arguments = ["-o", str(tmp_path / "a.sbet"), "--no-page", "--config", str(flown.folder / "swapped.toml")]
+        assert run_app(["trajectory", str(flown.log), *arguments]) == 1
+        why, *findings = capsys.readouterr().err.splitlines()
+        assert "no alignment: inertial samples do not fit" in why
+        assert "the antennas are swapped; exchange lever_arm_m and secondary_lever_arm_m" in findings[0]
+        assert all(line.startswith(f"swath: {flown.log}: ") for line in (why, *findings))
+        assert not list(tmp_path.iterdir())
+
+    def test_an_imu_mounted_otherwise_is_not_to_be_used(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Its position is right, for an attitude turned with it fits as well; only gravity and course tell."""
+        turned = "rotation_b_imu = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]"
+        alone = {"secondary_lever_arm_m": "# ", "lever_arm_m = [0.1, -0.05, -1.2]": "lever_arm_m = [0, 0, 0]"}
+        plain = "rotation_b_imu = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]"
+        flown.changed("turned.toml", **{plain: turned}, **alone)
+        capsys.readouterr()
+        arguments = ["-o", str(tmp_path / "a.sbet"), "--no-page", "--config", str(flown.folder / "turned.toml")]
+        assert run_app(["trajectory", str(flown.log), *arguments]) == 1
+        told = capsys.readouterr().err
+        assert "body y reads +1 g" in told
+        assert "rotation_b_imu" in told
+
+    def test_an_attitude_given_by_hand_starts_it(self, flown: Flown, tmp_path: Path) -> None:
+        flown.changed("alone.toml", **{"secondary_lever_arm_m": "# "})
+        arguments = ["-o", str(tmp_path / "a.sbet"), "--no-page", "--config", str(flown.folder / "alone.toml")]
+        assert run_app(["trajectory", str(flown.log), *arguments, "--start", "-1.3,2.0,90.3", "--imu", "main"]) == 0
+        (leg,) = summary(tmp_path)["sessions"][0]["legs"]
+        assert leg["start"]["method"] == "given"
+        _, attitude = errors(read(tmp_path, flown), flown.truth())
+        assert np.degrees(np.sqrt((attitude**2).mean(axis=0))).max() < 0.5
+
+
+class TestRefusals:
+    def refused(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+        capsys.readouterr()
+        assert run_app(["trajectory", *arguments]) in (1, 2, 3)
+        line = capsys.readouterr().err
+        assert line.startswith("swath: ")
+        assert line.count("\n") == 1, line
+        assert "internal error" not in line
+        return line
+
+    def test_what_is_there_is_kept(self, flown: Flown, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        before = (made / "a.sbet").stat().st_mtime_ns
+        assert "--overwrite" in self.refused(capsys, str(flown.log), "-o", str(made / "a.sbet"))
+        assert (made / "a.sbet").stat().st_mtime_ns == before
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--imu", "none"], "--imu: the configuration has no [imu.none]"),
+            (["--start", "north"], '--start: got "north", want roll,pitch,heading in degrees'),
+            (["--ins", "maybe"], "want ignore, observe, as-is"),
+            (["--ins", "as-is"], "no INS solution in the log"),
+            (["--gnss", "nowhere.pos"], "--gnss nowhere.pos: cannot be read"),
+        ],
+    )
+    def test_mistakes_of_the_command_line(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    ) -> None:
+        assert said in self.refused(capsys, str(flown.log), "-o", str(tmp_path / "a.sbet"), *arguments)
+        assert not list(tmp_path.iterdir())
+
+    def test_no_log(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        said = self.refused(capsys, str(tmp_path / "no.mcap"), "-o", str(tmp_path / "a.sbet"))
+        assert "no such file or directory" in said
+
+    def test_a_damaged_log_is_partial(self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        data = bytearray(flown.log.read_bytes())
+        log = tmp_path / flown.log.name
+        log.write_bytes(data[: len(data) * 9 // 10])
+        assert "a.json: partial: " in self.refused(capsys, str(log), "-o", str(tmp_path / "a.sbet"), "--no-page")
+        told = summary(tmp_path)
+        assert not told["complete"]
+        assert log.name in told["holes"][0]
+        assert read(tmp_path, flown).span[1] > flown.truth().span[0] + 35 * S
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,nan", "200,0,0", "0,91,0", "0,0,400", ""])
+def test_an_attitude_that_cannot_be_is_refused(text: str) -> None:
+    with pytest.raises(Exception, match="want roll,pitch,heading in degrees"):
+        attitude_of_text(text)
+
+
+def test_an_attitude_by_hand_is_in_degrees() -> None:
+    assert attitude_of_text("1.5, -2,270") == pytest.approx(np.radians([1.5, -2.0, 270.0]).tolist())
+
+
+POS_HEAD = """% program   : RTKLIB
+%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio
+"""
+PPK_M = np.array([0.003, 0.003, 0.006])  # north, east, up
+ARM_B = np.array([0.1, -0.05, -1.2])
+
+
+def post_processed(truth: Trajectory, span_ns: tuple[int, int]) -> str:
+    """What RTKLIB would write: the antenna each half second, wrong by `PPK_M` from one to the next."""
+    rng = np.random.default_rng(12)
+    time_ns = np.arange(-(-span_ns[0] // S) * S, span_ns[1], S // 2)
+    poses = truth.poses(time_ns)
+    antenna_e = poses.position_e + Rotation.from_quat(poses.q_e_from_b[:, [1, 2, 3, 0]]).apply(ARM_B)
+    lon, lat, height = Transformer.from_crs(4978, 4979, always_xy=True).transform(*antenna_e.T)
+    off = PPK_M * rng.standard_normal((len(time_ns), 3))
+    lat, lon = lat + off[:, 0] / 111_200.0, lon + off[:, 1] / (111_320.0 * np.cos(np.radians(lat)))
+    text = POS_HEAD
+    for k, at in enumerate(time_ns.tolist()):
+        day = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(microseconds=at // 1000)
+        sigma = " ".join(f"{value:.4f}" for value in PPK_M)
+        text += (
+            f"{day:%Y/%m/%d %H:%M:%S}.{day.microsecond // 1000:03d} {lat[k]:.9f} {lon[k]:.9f} "
+            f"{height[k] + off[k, 2]:.4f} 1 14 {sigma} 0 0 0 0.00 99.9\n"
+        )
+    return text
+
+
+def test_post_processed_positions_make_it_better(flown: Flown, made: Path, tmp_path: Path) -> None:
+    """They replace the receiver's; errors shrink, the sigmas with them, and all are counted."""
+    truth = flown.truth()
+    file = tmp_path / "ppk.pos"
+    file.write_text(post_processed(truth, truth.span))
+    assert (
+        run_app(["trajectory", str(flown.log), "-o", str(tmp_path / "a.sbet"), "--gnss", str(file), "--no-page"]) == 0
+    )
+    before, after = read(made, flown), read(tmp_path, flown)
+    (old, _), (new, attitude) = errors(before, truth), errors(after, truth)
+    assert np.sqrt((new**2).mean()) < 0.6 * np.sqrt((old**2).mean())
+    inside = truth.fates(after.time_ns) == 0
+    spread = np.sqrt(((new / after.position_sigma_l[inside]) ** 2).mean(axis=0))
+    assert (spread < 2.0).all(), spread
+    turned = np.sqrt(((attitude / after.attitude_sigma_rad[inside]) ** 2).mean(axis=0))
+    assert (turned < 3.0).all(), turned
+    assert after.position_sigma_l[inside].mean() < before.position_sigma_l[inside].mean()
+    (session,) = summary(tmp_path)["sessions"]
+    lines = len(file.read_text().splitlines()) - 2
+    assert session["gnss"]["observations"]["position"] == lines
+    assert session["gnss"]["refused"]["fix_replaced_from_outside"] == pytest.approx(2 * SECONDS, abs=3)

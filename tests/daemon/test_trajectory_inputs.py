@@ -1,0 +1,466 @@
+"""What navigation reads of a log: samples, positions, velocities and headings are the flight's, at their own time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pyproj import Transformer
+from scipy.spatial.transform import Rotation
+
+from daemon.errors import UserError
+from daemon.log_parsers import stored_config
+from daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
+from daemon.processing.navigation_observations import (
+    DEFAULT_SIGMAS,
+    fix_observations,
+    heading_observations,
+    heading_times,
+    ins_observations,
+    white_factor,
+)
+from daemon.processing.navigation_sources import noise_of
+from daemon.processing.navigation_times import counted_arrivals, imu_times
+from georef.formats.antenna_positions import read_antenna_positions
+from georef.navigation.inputs import GRADES, Kind
+from georef.records import (
+    IMU_DTYPE,
+    INS_DTYPE,
+    FixType,
+    GnssFix,
+    GnssHeading,
+    NamesEdge,
+    PpsEdge,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+from georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
+from georef.trajectory import Poses
+from tests.daemon.short_flight import CLOCK_SIGMA_S, MARK_AFTER_NS, Flown, fly_short
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+S = 1_000_000_000
+PLAN = """
+[flight]
+name = "inputs"
+seed = 3
+speed_mps = 50.0
+noise = false
+
+[[line]]
+name = "1"
+from_m = [-400, 0]
+to_m = [400, 0]
+height_m = 700
+
+[gnss.rover]
+rate_hz = 5
+secondary_lever_arm_m = [0.9, 0.6, -1.2]
+
+[imu.main]
+rate_hz = 100
+grade = "perfect"
+rotation_b_imu = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+
+[scanner.left]
+prf_hz = 500
+"""
+ARM = np.array([0.1, -0.05, -1.2])
+BASELINE = np.array([0.8, 0.65, 0.0])
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return fly_short(tmp_path_factory.mktemp("inputs"), PLAN, 18.0)
+
+
+@pytest.fixture(scope="module")
+def inputs(flown: Flown) -> NavigationInputs:
+    return read_inputs(flown.session(), InputWish())
+
+
+def turned(poses: Poses, vector_b: FloatArray) -> FloatArray:
+    """To e, by another library's rotations."""
+    vector_e: FloatArray = Rotation.from_quat(poses.q_e_from_b[:, [1, 2, 3, 0]]).apply(vector_b)
+    return vector_e
+
+
+class TestOfALog:
+    def test_positions_are_the_antennas_at_their_time(self, flown: Flown, inputs: NavigationInputs) -> None:
+        rows = inputs.legs[0].observations
+        rows, truth = rows[rows["kind"] == Kind.POSITION], flown.truth()
+        rows = rows[truth.fates(rows["time_ns"]) == 0]
+        assert len(rows) > 60
+        assert set(np.diff(rows["time_ns"])) == {200_000_000}
+        poses = truth.poses(rows["time_ns"])
+        assert np.abs(rows["value"] - poses.position_e - turned(poses, ARM)).max() < 2e-3  # a degree's last digits
+        assert np.all(rows["fix_type"] == FixType.RTK_FIXED)
+        assert rows["satellites"].min() >= 5
+        assert ((rows["sigma"] > 0.001) & (rows["sigma"] < 0.1)).all()
+
+    def test_velocities_are_of_the_moment_that_their_latency_tells(
+        self, flown: Flown, inputs: NavigationInputs
+    ) -> None:
+        rows = inputs.legs[0].observations
+        rows, truth = rows[rows["kind"] == Kind.VELOCITY][3:], flown.truth()
+        rows = rows[truth.fates(rows["time_ns"]) == 0]
+        poses = truth.poses(rows["time_ns"])
+        moved_e = poses.velocity_e + turned(poses, np.cross(poses.rate_eb_b, ARM))
+        lon, lat, _ = np.radians(Transformer.from_crs(4978, 4979, always_xy=True).transform(*poses.position_e.T))
+        up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+        east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], axis=1)
+        expected = np.stack([(moved_e * axis).sum(axis=1) for axis in (np.cross(up, east), east, -up)], axis=1)
+        assert np.abs(rows["value"] - expected).max() < 0.01
+        assert (np.abs(rows["time_ns"] % 200_000_000 - 150_000_000) <= 1).all()  # 50 ms before each epoch
+        assert inputs.assumed["velocity"] == (inputs.legs[0].observations["kind"] == Kind.VELOCITY).sum()
+
+    def test_headings_are_those_of_the_baseline(self, flown: Flown, inputs: NavigationInputs) -> None:
+        rows = inputs.legs[0].observations
+        rows, truth = rows[rows["kind"] == Kind.HEADING], flown.truth()
+        rows = rows[truth.fates(rows["time_ns"]) == 0]
+        assert len(rows) == 5
+        assert inputs.setup.baseline_b == pytest.approx(BASELINE)
+        _, _, heading = truth.attitude()
+        at = np.interp(rows["time_ns"] - truth.time_ns[0], truth.time_ns - truth.time_ns[0], np.unwrap(heading))
+        of_baseline = at + np.arctan2(BASELINE[1], BASELINE[0])
+        off = (rows["value"][:, 0] - of_baseline + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(off).max() < radians(0.6)  # roll and pitch of some degrees turn the baseline's horizontal part
+
+    def test_increments_turn_and_push_as_the_flight_does(self, flown: Flown, inputs: NavigationInputs) -> None:
+        """Axes of b, though the IMU's own are others; each at the time of its interval."""
+        truth, (leg,) = flown.truth(), inputs.legs
+        sample = leg.inertial
+        inside = (sample.time_ns < truth.time_ns[-1] - S) & (sample.time_ns > truth.time_ns[0] + S)
+        ends, begins = (
+            sample.time_ns[inside],
+            sample.time_ns[inside] - np.rint(sample.interval_s[inside] * S).astype(int),
+        )
+        q0, q1 = (Rotation.from_quat(truth.poses(t).q_e_from_b[:, [1, 2, 3, 0]]) for t in (begins, ends))
+        relative_to_e = (q0.inv() * q1).as_rotvec()
+        of_earth = q0.inv().apply([0.0, 0.0, 7.292115e-5]) * sample.interval_s[inside, np.newaxis]
+        assert np.abs(sample.angle_b[inside] - relative_to_e - of_earth).max() < 2e-5
+        force = sample.velocity_b[inside] / sample.interval_s[inside, np.newaxis]
+        assert force.mean(axis=0)[2] == pytest.approx(-9.81, abs=0.5)
+        assert inputs.samples == {"taken": len(sample)}
+        assert inputs.imu_time[0] == "latch"
+        assert inputs.imu_time[1] < 1e-6
+
+    def test_marks_have_the_time_that_the_receiver_stamped(self, inputs: NavigationInputs) -> None:
+        assert len(inputs.marks) > 10
+        for mark in inputs.marks:
+            assert mark.gps_ns is not None
+            assert abs(mark.gps_ns % S - MARK_AFTER_NS) <= 200  # a double of seconds of the week
+            assert mark.event.sigma_s == pytest.approx(CLOCK_SIGMA_S)
+
+    def test_nothing_is_doubted_and_nothing_missing(self, inputs: NavigationInputs) -> None:
+        assert (inputs.doubts, inputs.holes) == ([], [])
+        assert set(inputs.refused) == {"heading_repeats_neighbours"}
+
+    def test_the_logs_own_configuration_needs_no_file_beside_it(
+        self, flown: Flown, inputs: NavigationInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        config = stored_config(flown.session().attachments())
+        again = read_inputs(flown.session(), InputWish(config=config))
+        assert again.samples == inputs.samples
+
+    def test_the_same_log_gives_the_same(self, flown: Flown, inputs: NavigationInputs) -> None:
+        again = read_inputs(flown.session(), InputWish())
+        assert np.array_equal(again.legs[0].inertial.velocity_b, inputs.legs[0].inertial.velocity_b)
+        assert again.legs[0].observations.tobytes() == inputs.legs[0].observations.tobytes()
+
+
+class TestRefusals:
+    def refused(self, flown: Flown, wish: InputWish) -> str:
+        with pytest.raises(UserError) as caught:
+            read_inputs(flown.session(), wish)
+        assert "\n" not in caught.value.message
+        return caught.value.message
+
+    def test_names_that_are_not_there(self, flown: Flown) -> None:
+        assert self.refused(flown, InputWish(imu="other")).endswith(
+            "--imu: the configuration has no [imu.other]; there are: main"
+        )
+        assert "--gnss-name" in self.refused(flown, InputWish(gnss="base"))
+
+    def test_an_imu_that_says_nothing(self, flown: Flown) -> None:
+        config = flown.changed("other_wire.toml", **{"[imu.main": "[imu.second"})
+        said = self.refused(flown, InputWish(config=config))
+        assert said.endswith("no samples of imu/second: not a byte of it is in the log; is its wire recorded?")
+
+    def test_a_receiver_that_speaks_otherwise(self, flown: Flown) -> None:
+        config = flown.changed("nmea.toml", **{'protocol = "novatel"': 'protocol = "nmea"'})
+        said = self.refused(flown, InputWish(config=config))
+        assert "no position of gnss/rover" in said
+        assert said.endswith("of no message it knows; want another protocol, or other messages of the device")
+
+    def test_a_log_without_a_configured_receiver(self, flown: Flown) -> None:
+        config = flown.changed("other_receiver.toml", **{"[gnss.rover]": "[gnss.away]"})
+        assert "no position of gnss/away, and an IMU alone cannot be navigated: not a byte" in self.refused(
+            flown, InputWish(config=config)
+        )
+
+    def test_positions_of_another_day(self, flown: Flown, tmp_path: Path) -> None:
+        file = tmp_path / "ppk.pos"
+        file.write_text(POS.format("2026/11/01"))
+        assert "of another flight" in self.refused(flown, InputWish(positions=file))
+
+    def test_a_finished_trajectory_is_no_antenna(self, flown: Flown, tmp_path: Path) -> None:
+        file = tmp_path / "done.csv"
+        file.write_text("gps_ns,lat_deg,lon_deg\n")
+        assert "finished trajectory" in self.refused(flown, InputWish(positions=file))
+        assert "cannot be read" in self.refused(flown, InputWish(positions=tmp_path / "none.pos"))
+
+    def test_antennas_in_one_place(self, flown: Flown) -> None:
+        config = flown.changed("one.toml", **{"[0.9, 0.6, -1.2]": "[0.1, -0.05, -1.2]"})
+        assert "secondary_lever_arm_m: is 0.00 m from lever_arm_m" in self.refused(flown, InputWish(config=config))
+
+
+class TestDoubts:
+    def test_a_baseline_that_is_not_the_configured_one(self, flown: Flown) -> None:
+        config = flown.changed("long.toml", **{"[0.9, 0.6, -1.2]": "[0.9, 1.6, -1.2]"})
+        (line,) = read_inputs(flown.session(), InputWish(config=config)).doubts
+        assert "measures 1.03 m between its antennas" in line
+        assert "are 1.83 m apart" in line
+
+    def test_headings_without_a_second_antenna(self, flown: Flown) -> None:
+        config = flown.changed("single.toml", **{"secondary_lever_arm_m": "# "})
+        inputs = read_inputs(flown.session(), InputWish(config=config))
+        assert inputs.observed["heading"] == 0
+        assert inputs.refused["heading_no_secondary_lever_arm"] > 60
+        assert "want gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
+
+    def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
+        config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
+        inputs = read_inputs(flown.session(), InputWish(config=config))
+        assert inputs.imu_time[0] == "arrival"
+        assert "placed by their arrival" in inputs.doubts[0]
+        assert inputs.setup.estimate_time_offset_s > 1e-3
+        latched = read_inputs(flown.session(), InputWish()).legs[0].inertial.time_ns
+        off_ns = inputs.legs[0].inertial.time_ns[200:1200] - latched[200:1200]
+        assert np.abs(off_ns - np.median(off_ns)).max() < 300_000
+        assert abs(np.median(off_ns)) < 12_000_000  # an interval of 10 ms: what a CAN frame is late, and no more
+
+
+POS = """% program   : RTKLIB
+%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio
+{0} 09:00:20.000  47.482000000  8.905000000  700.0000  1 12  0.01 0.02 0.03  0.005 -0.006 0.007  0.00  9.9
+{0} 09:00:20.200  47.482000000  8.905100000  700.0000  2 11  0.10 0.20 0.30  0.000  0.000 0.000  0.00  1.1
+{0} 09:00:20.400  47.482000000  8.905200000  700.0000  7  4  0.10 0.20 0.30  0.000  0.000 0.000  0.00  1.1
+"""
+
+
+def test_positions_from_outside_replace_those_of_the_receiver(flown: Flown, tmp_path: Path) -> None:
+    file = tmp_path / "ppk.pos"
+    file.write_text(POS.format("2026/06/15"))
+    first = flown.truth().time_ns[0]
+    inputs = read_inputs(flown.session(), InputWish(positions=file))
+    rows = inputs.legs[0].observations
+    rows = rows[rows["kind"] == Kind.POSITION]
+    assert rows["fix_type"].tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT]
+    assert rows["satellites"].tolist() == [12, 11]
+    assert rows["sigma"][0].tolist() == [0.01, 0.02, 0.03]
+    # covariances: 5² of 10·20, up is − down: −7² of 10·30, 6² of 20·30
+    assert rows["correlation"][0] == pytest.approx([25 / 200, -49 / 300, 36 / 600])
+    expected = Transformer.from_crs(4979, 4978, always_xy=True).transform(8.905, 47.482, 700.0)
+    assert rows["value"][0] == pytest.approx(expected, abs=1e-6)
+    week = 2423 * 604_800 * S  # of 2026-06-14; GPS time, as the file says
+    assert rows["time_ns"].tolist() == [week + round((86_400 + 32_420 + at) * S) for at in (0.0, 0.2)]
+    assert abs(int(rows["time_ns"][0]) - int(first)) < 30 * S
+    assert inputs.refused["outside_fix_type"] == 1
+    assert inputs.refused["fix_replaced_from_outside"] > 60
+    assert inputs.observed["velocity"] > 60  # the file has none, so the receiver's stay
+
+
+# ---------------------------------------------------------------------- records
+
+
+def fix(**changes: Any) -> GnssFix:
+    tag = TimeTag(TimeScale.GPS, 0, week=2423)
+    usual = GnssFix(0, tag, 0.8, 0.1, 500.0, fix_type=FixType.RTK_FIXED, satellites=9, message="BESTPOS")
+    return replace(usual, **changes)
+
+
+class TestFixes:
+    def test_messages_of_one_epoch_are_one_position_and_one_velocity(self) -> None:
+        moving = {"lat_rad": None, "lon_rad": None, "height_m": None, "velocity_l": (1.0, 2.0, 3.0)}
+        fixes = [fix(), fix(message="BESTVEL", **moving), fix(height_m=501.0), fix(fix_type=FixType.SINGLE)]
+        found = fix_observations(fixes, [5, 5, 5, 5], 1)
+        assert found.rows["kind"].tolist() == [Kind.POSITION, Kind.VELOCITY]
+        assert found.rows["sigma"][0] == pytest.approx([0.02, 0.02, 0.04])  # of the first, whose fix is the best
+        assert found.rows["value"][1].tolist() == [1.0, 2.0, 3.0]
+        assert found.refused == {"repeated_in_epoch": 2}
+
+    def test_the_better_fix_of_an_epoch_is_taken_whatever_came_first(self) -> None:
+        fixes = [fix(fix_type=FixType.SINGLE), fix(fix_type=FixType.RTK_FLOAT), fix(fix_type=FixType.DIFFERENTIAL)]
+        found = fix_observations(fixes, [5, 5, 5], 1)
+        assert found.rows["fix_type"].tolist() == [FixType.RTK_FLOAT]
+
+    @pytest.mark.parametrize(
+        ("changes", "at_ns", "why"),
+        [
+            ({"valid": False}, 5, "not_valid"),
+            ({"fix_type": FixType.DEAD_RECKONING}, 5, "fix_type_dead_reckoning"),
+            ({"fix_type": FixType.NONE}, 5, "fix_type_none"),
+            ({}, None, "no_time"),
+            ({"antenna": "secondary"}, 5, "no_lever_arm"),
+            ({"height_m": None}, 5, "no_ellipsoidal_height"),
+            ({"lat_rad": None, "height_m": None}, 5, "empty"),
+            ({"height_m": float("nan")}, 5, "not_finite"),
+        ],
+    )
+    def test_what_is_no_observation_is_counted(self, changes: dict[str, Any], at_ns: int | None, why: str) -> None:
+        found = fix_observations([fix(**changes)], [at_ns], 1)
+        assert (len(found.rows), dict(found.refused)) == (0, {why: 1})
+
+    def test_positions_that_the_receivers_ins_made_give_way_to_those_of_satellites(self) -> None:
+        found = fix_observations([fix(), fix(message="BESTGNSSPOS"), fix()], [5, 5, 6], 1)
+        assert found.rows["time_ns"].tolist() == [5]
+        assert found.refused == {"blended_by_ins": 2}
+
+    @pytest.mark.parametrize("kind", sorted(DEFAULT_SIGMAS))
+    def test_sigmas_that_are_not_said_are_the_defaults_of_the_fix(self, kind: FixType) -> None:
+        given = np.diag([0.5**2, np.nan, 0.0])
+        found = fix_observations([fix(fix_type=kind, position_cov_l=given)], [5], 1)
+        (horizontal, vertical), _ = DEFAULT_SIGMAS[kind]
+        assert found.rows["sigma"][0].tolist() == [0.5, horizontal, vertical]
+        assert found.assumed == {"position": 1}
+
+    def test_a_covariance_is_sigmas_and_correlations(self) -> None:
+        given = np.array([[4.0, 1.2, -0.4], [1.2, 9.0, 0.6], [-0.4, 0.6, 16.0]])
+        found = fix_observations([fix(position_cov_l=given)], [5], 1)
+        assert found.rows["sigma"][0].tolist() == [2.0, 3.0, 4.0]
+        assert found.rows["correlation"][0] == pytest.approx([0.2, -0.05, 0.05])
+        assert not found.assumed
+
+
+class TestHeadings:
+    def heading(self, **changes: Any) -> GnssHeading:
+        return replace(GnssHeading(100, TimeTag(TimeScale.GPS, 0), 1.0), **changes)
+
+    def test_sigma_of_a_baseline_follows_its_length(self) -> None:
+        short, long = (heading_observations([self.heading()], [5], length).rows["sigma"][0, 0] for length in (0.5, 5.0))
+        assert short / long == pytest.approx(10.0, rel=1e-3)
+        said = heading_observations([self.heading(heading_sigma_rad=0.1)], [5], 1.0)
+        assert said.rows["sigma"][0, 0] == pytest.approx(0.1 * white_factor(5 * S, 0.6, 60.0))
+        assert np.isnan(said.rows["value"][0, 1])
+
+    def test_one_without_time_is_of_the_fix_that_came_with_it(self) -> None:
+        fixes = [fix(host_time_ns=at) for at in (0, S, 2 * S)]
+        headings = [self.heading(time=None, host_time_ns=at) for at in (S + 100_000_000, 2 * S + 700_000_000)]
+        assert heading_times(headings, [None, None], fixes, [10, 20, 30]) == [20, None]
+
+
+@pytest.mark.parametrize(("step_s", "share", "tau_s"), [(5.0, 0.6, 60.0), (20.0, 1.0, 120.0), (1.0, 0.0, 60.0)])
+def test_correlated_errors_average_as_slowly_as_white_ones_with_their_factor(
+    step_s: float, share: float, tau_s: float
+) -> None:
+    """By the covariance of the errors themselves: the variance of the mean of many."""
+    n = 4000
+    apart = step_s * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    covariance = share**2 * np.exp(-apart / tau_s) + (1 - share**2) * np.eye(n)
+    assert white_factor(round(step_s * S), share, tau_s) ** 2 / n == pytest.approx(covariance.mean(), rel=0.02)
+
+
+def test_headings_that_repeat_their_neighbours_are_thinned() -> None:
+    headings = [GnssHeading(at, TimeTag(TimeScale.GPS, 0), 0.01 * at) for at in range(60)]
+    found = heading_observations(headings, [at * 200_000_000 for at in range(60)], 1.0)
+    assert found.rows["time_ns"].tolist() == [0, 5 * S, 10 * S]
+    assert found.rows["value"][:, 0] == pytest.approx([0.0, 0.25, 0.5])
+    assert found.refused == {"repeats_neighbours": 57}
+
+
+def test_attitudes_of_an_ins_are_few_and_only_of_solutions() -> None:
+    rows = np.zeros(250, INS_DTYPE)
+    rows["gps_ns"] = 1000 * S + np.arange(250) * 200_000_000
+    rows["heading_rad"], rows["attitude_sigma_rad"], rows["status"] = 1.5, np.nan, 3
+    rows["status"][:100] = 1
+    found = ins_observations(rows, lambda status: status == 3)
+    assert found.rows["time_ns"].tolist() == [1020 * S, 1040 * S]
+    assert set(found.rows["kind"]) == {Kind.ATTITUDE}
+    assert found.rows["value"][0].tolist() == [0.0, 0.0, 1.5]
+    assert found.refused == {"no_solution": 100}
+    assert found.assumed == {"attitude": 2}
+
+
+# ---------------------------------------------------------------------- times and noise
+
+
+def test_arrivals_in_bunches_are_spread_evenly() -> None:
+    """Reads of 16 ms, and a pause of two seconds in which samples were lost."""
+    true_ns = np.arange(2000) * 5_000_100
+    true_ns = np.delete(true_ns, slice(1000, 1400))
+    host_ns = (true_ns // 16_000_000 + 1) * 16_000_000
+    found = counted_arrivals(host_ns, 200.0)
+    off = found - (true_ns - true_ns[0])
+    assert np.abs(off - np.median(off)).max() < 20_000_000
+    assert np.diff(found)[:900].std() < 1.0
+
+
+def test_samples_with_gps_time_of_their_own_need_no_clock() -> None:
+    rows = np.zeros(3, IMU_DTYPE)
+    rows["gps_week"], rows["device_time_ns"] = [2423, 2423, -1], [5, 7, 9]
+    found = imu_times(rows, HostClocks(ClockPlan(0)), None, 100.0)
+    assert found.gps_ns.tolist() == [2423 * 604_800 * S + 5, 2423 * 604_800 * S + 7]
+    assert (found.by, found.refused) == ("gps", {"no_gps_week": 1})
+
+
+def test_samples_before_any_time_are_counted() -> None:
+    plan = ClockPlan(0, {"pps/main": PpsPlan()}, {"gnss/rover": GnssPlan("pps/main")})
+    host = HostClocks(plan, keep_history=True)
+    rows = np.zeros(10, IMU_DTYPE)
+    rows["host_time_ns"] = rows["device_time_ns"] = np.arange(10) * 10_000_000
+    rows["pps_time_ns"] = rows["gps_week"] = -1
+    assert imu_times(rows, host, "pps/main", 100.0).refused == {"no_clock": 10}
+    for second in range(20):
+        host.add_edge("pps/main", PpsEdge(second * S, second))
+        tag = TimeTag(TimeScale.GPS, (100 + second) * S, week=2423)
+        host.add_message("gnss/rover", TimeMessage(second * S + 100_000_000, tag, NamesEdge.PREVIOUS, bound=True))
+    host.update()
+    found = imu_times(rows, host, "pps/main", 100.0)
+    assert found.by == "counter"
+    assert np.abs(found.gps_ns - 2423 * 604_800 * S - 100 * S - rows["host_time_ns"]).max() < 5_000_000
+
+
+def test_noise_is_the_grades_where_the_configuration_says_nothing(flown: Flown) -> None:
+    table = flown.config.imu["main"].noise.model_copy(
+        update={"grade": "mems", "gyro_bias_deg_per_h": 3600.0, "accel_scale_ppm": 7.0}
+        | dict.fromkeys(("angle_random_walk_deg_per_sqrt_h", "accel_bias_mg", "bias_correlation_h", "gyro_scale_ppm"))
+        | {"velocity_random_walk_m_per_s_per_sqrt_h": 6.0, "misalignment_mrad": 0.25}
+    )
+    noise = noise_of(table)
+    assert noise.gyro_bias == pytest.approx(radians(1.0))
+    assert noise.accel_scale == pytest.approx(7e-6)
+    assert noise.velocity_random_walk == pytest.approx(0.1)
+    assert noise.misalignment == pytest.approx(2.5e-4)
+    for name in ("angle_random_walk", "accel_bias", "bias_correlation_s", "gyro_scale"):
+        assert getattr(noise, name) == getattr(GRADES["mems"], name)
+
+
+WAYPOINT = """Project:     rover
+Program:     GrafNav
+
+     Week     GPSTime        Latitude       Longitude       H-Ell  Q  NS  SDNorth  SDEast  SDHeight   VNorth
+               (sec)      (+/-D M S)      (+/-D M S)         (m)              (m)     (m)       (m)    (m/s)
+     2423  118820.00   47 28 55.20000   8 54 18.00000     700.000  1  12    0.010   0.011     0.020    1.000
+     2423  118820.20   47 28 55.20000   8 54 18.00100     700.000  2  11    0.100   0.110     0.200    1.000
+     2423  118820.40   47 28 55.20000   8 54 18.00200     700.000  6   5    1.000   1.100     2.000    1.000
+"""
+
+
+def test_waypoint_text_says_its_quality_too() -> None:
+    columns = read_antenna_positions(WAYPOINT.encode(), "rover.txt")
+    assert columns.fix_type is not None
+    assert columns.fix_type.tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT, FixType.SINGLE]
+    assert columns.satellites is not None
+    assert columns.satellites.tolist() == [12, 11, 5]
+    assert columns.position_sigma_l[2].tolist() == [1.0, 1.1, 2.0]
+    assert np.degrees(columns.lat_rad[0]) == pytest.approx(47.482, abs=1e-9)

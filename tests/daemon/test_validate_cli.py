@@ -1,0 +1,185 @@
+"""``swath validate``: calibration files in, sentences and exit codes out; logs stood in for by a made flight."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from calib.calibration_file import Header, calibration_text
+from daemon.cli import validate
+from daemon.errors import ExitCode, UserError
+from daemon.processing import validate_run
+from daemon.processing.calibration_flight import KeptFlight
+from georef.calibration import INDEX, Calibration, nominal, read_calibration
+from tests.calib.cast_flight import Cast, cast_flight
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+LINES = ((-150, 0, 150, 0, 850), (150, 40, -150, 40, 850), (0, 150, 0, -150, 850))
+PLACE = "HB-ABC/left"
+
+
+def run(*arguments: str) -> None:
+    """The command, in this process."""
+    app = typer.Typer()
+    app.command()(validate.command)
+    app(args=list(arguments), standalone_mode=False)
+
+
+def file_of(
+    path: Path, calibration: Calibration, month: int = 1, *, sigma_deg: float = 0.001, place: str = PLACE
+) -> Path:
+    """A calibration file of the boresight."""
+    sigmas = np.zeros(len(INDEX))
+    sigmas[[INDEX["omega_rad"], INDEX["phi_rad"], INDEX["kappa_rad"]]] = np.radians(sigma_deg)
+    header = Header(path.stem, dt.datetime(2026, month, 1, tzinfo=dt.UTC), method="planes", installation=place)
+    path.write_text(calibration_text(replace(calibration, sigmas=sigmas), header))
+    return path
+
+
+def boresight(phi_deg: float, scanner: str = "left") -> Calibration:
+    """Of so much pitch."""
+    return nominal(scanner, np.zeros(3), np.eye(3)).changed(phi_rad=float(np.radians(phi_deg)))
+
+
+# ---------------------------------------------------------------------- history
+
+
+def test_a_history_that_moved_is_told_drawn_and_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "past"
+    folder.mkdir()
+    for month, phi in ((1, 0.10), (2, 0.1005), (3, 0.109)):
+        file_of(folder / f"c{month}.toml", boresight(phi), month)
+    file_of(folder / "other.toml", boresight(0.5), 4, place="elsewhere")
+    (folder / "swath.toml").write_text("[session]\nname = 'x'\n")
+    with pytest.raises(UserError, match=r"moved between 2026-02-01 and 2026-03-01: phi_deg \+0\.0085") as caught:
+        run(str(folder / "c3.toml"), "--history", str(folder), "-o", str(tmp_path / "out"), "--json")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+    record = json.loads(capsys.readouterr().out)
+    (one,) = record["history"]
+    assert [row["id"] for row in one["calibrations"]] == ["c1", "c2", "c3"]
+    assert one["moved"] is True
+    assert json.loads((tmp_path / "out" / "validation.json").read_text()) == record
+    assert (tmp_path / "out" / "history.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_history_that_stayed_is_fine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [file_of(tmp_path / f"c{month}.toml", boresight(0.1 + 0.0003 * month), month) for month in (1, 2, 3)]
+    run(str(files[2]), "--history", str(files[0]), "--history", str(files[1]))
+    told = capsys.readouterr().out
+    assert "the boresight has not moved: 2 steps" in told
+    assert "0.1009 ± 0.0010" in told
+
+
+# ---------------------------------------------------------------------- logs
+
+
+@pytest.fixture(scope="module")
+def made() -> Cast:
+    """Two opposite lines and one across, a village below."""
+    return cast_flight(lines=LINES, prf_hz=40_000.0, true={})
+
+
+@pytest.fixture
+def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A log that reads as the made flight, placed with the calibrations that are validated."""
+    path = tmp_path / "flight.mcap"
+    path.write_bytes(b"bytes of a log")
+
+    def read(wish: Any, folder: Path, tell: Any) -> KeptFlight:
+        text, name = wish.options.calibrations.get("left", (None, ""))
+        head = made.flight.heads[0]
+        start = head.start if text is None else read_calibration(text, name)
+        flight = replace(made.flight, heads=(replace(head, start=start),)).placed({"left": start})
+        profile = SimpleNamespace(installation=PLACE)
+        logged: Any = SimpleNamespace(
+            log=path,
+            setup=SimpleNamespace(config=SimpleNamespace(profile=profile)),
+            session=SimpleNamespace(parts=[SimpleNamespace(path=path)]),
+        )
+        return KeptFlight(flight, [logged], [])
+
+    monkeypatch.setattr(validate_run, "read_flight", read)
+    return path
+
+
+def test_a_true_calibration_holds(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--json")
+    record = json.loads(capsys.readouterr().out)["validation"]
+    assert record["passed"] is True
+    assert record["independent"] is True
+    assert [one["code"] for one in record["methods"]] == ["001", "002", "003", "004", "005", "006"]
+    passed = {one["method"]: one["passed"] for one in record["methods"]}
+    assert passed["crossStripFlight"] is True
+    assert passed["other"] is True
+    assert passed["secondAltitude"] is None
+
+
+def test_a_wrong_calibration_does_not(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"the calibration does not hold: .*other") as caught:
+        run(str(file_of(tmp_path / "bad.toml", boresight(0.04))), str(log))
+    assert caught.value.exit_code == ExitCode.PROBLEM
+
+
+def test_the_calibrations_own_log_is_no_independent_proof(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from daemon.processing.sidecar import sha256_of
+
+    path = file_of(tmp_path / "own.toml", boresight(0.0))
+    text = path.read_text()
+    assert "logs = []" in text
+    path.write_text(text.replace("logs = []", f'logs = [{{ name = "x", sha256 = "{sha256_of(log)}" }}]'))
+    run(str(path), str(log))
+    told = capsys.readouterr().out
+    assert "the calibration holds (not independent)" in told
+    assert "flight.mcap: calibration own was made of this log" in told
+
+
+def test_control_above_the_geoid_is_refused(log: Path, made: Cast, tmp_path: Path) -> None:
+    from georef.earth import geodetic_from_e
+
+    rows = ["name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"]
+    for number, place in enumerate(made.true_t[0][20_000:180_000:8_000]):
+        lat, lon, height = geodetic_from_e(made.flight.frame.e_from_t(place))
+        rows.append(f"P{number},{np.degrees(lat):.9f},{np.degrees(lon):.9f},{height - 48.0:.4f},0.02")
+    control = tmp_path / "control.csv"
+    control.write_text("\n".join(rows))
+    with pytest.raises(UserError, match=r"control.csv: control lies 48\.0 m below the laser's ground everywhere"):
+        run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--control", str(control))
+
+
+def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="has no scanner right, whose calibration right is"):
+        run(str(file_of(tmp_path / "right.toml", boresight(0.0, "right"))), str(log))
+
+
+@pytest.mark.parametrize(
+    ("what", "said", "code"),
+    [
+        ("nothing", "nothing to validate against", ExitCode.USAGE),
+        ("absent", "cannot be read: No such file", ExitCode.IO),
+        ("no calibration", "calibration: missing", ExitCode.USAGE),
+        ("twice", "is the second calibration of one scanner", ExitCode.USAGE),
+    ],
+)
+def test_wrong_use_is_one_line(what: str, said: str, code: ExitCode, tmp_path: Path) -> None:
+    good = str(file_of(tmp_path / "good.toml", boresight(0.0)))
+    (tmp_path / "config.toml").write_text("[session]\nname = 'x'\n")
+    arguments = {
+        "nothing": [good],
+        "absent": [str(tmp_path / "no.toml"), "x.mcap"],
+        "no calibration": [str(tmp_path / "config.toml"), "x.mcap"],
+        "twice": [good, "x.mcap", "--also", good],
+    }[what]
+    with pytest.raises(UserError, match=said) as caught:
+        run(*arguments)
+    assert caught.value.exit_code == code
