@@ -1,10 +1,27 @@
 """All benchmarks, one after the other: ``python -m benchmarks``; each has options of its own, see its ``--help``."""
 
-from benchmarks import acquire, clock, decode, georef, georef_log, raycast
+from benchmarks import (
+    acquire,
+    adjustment,
+    clock,
+    decode,
+    georef,
+    georef_log,
+    navigation,
+    navigation_honesty,
+    navigation_seeds,
+    planes,
+    raycast,
+)
 
 decode.main()
 georef.main()
 georef_log.main()
 raycast.main()
+navigation.main()
+navigation_honesty.main()
+navigation_seeds.main()
+adjustment.main()
+planes.main()
 clock.main()
 acquire.main()

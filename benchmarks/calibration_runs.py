@@ -1,0 +1,270 @@
+"""A calibration flight whose observations are made anew in every run, from a truth that fits the model exactly.
+
+The flight is read and matched once. Of its returns on planes the ranges are then set so that every point lies on its
+plane with the true calibration on the smoothed trajectory: these two are the truth. A run takes from it what sensors
+would have said: trajectory errors from the smoother's joint covariance at each of its own nodes, which lie closer than
+the knots of the adjustment, and between nodes what gyroscopes walk; noise of range, scan angle and control.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky
+
+from calib.adjust import adjust
+from calib.control import control_planes, in_t, read_control
+from calib.features import Features, Patch, Plane
+from calib.flight import Flight, Swath
+from calib.parameters import MODELS, Wish
+from calib.plane_returns import thinned
+from calib.plane_search import find_planes
+from calib.plane_settings import PlaneSettings
+from calib.solve import Settings
+from calib.trajectory_errors import Knots, TrajectoryPrior, apply, from_smoother, knots_of
+from daemon.processing.calibrate_run import KNOT_S
+from daemon.processing.calibration_flight import read_flight, replaced
+from daemon.processing.flights import Wish as Logs
+from daemon.processing.flown import TrajectoryWish
+from daemon.processing.setup import Options
+from georef.calibration import Calibration, read_calibration
+from georef.navigation.cross_covariance import ErrorChain, error_chain
+from georef.records import Int64Array
+
+FloatArray = NDArray[np.float64]
+
+MODEL = Wish("scanner")
+SETTINGS = Settings(huber=0.0, family=0.0)  # there are no blunders
+MOST_POINTS = 2000  # of a plane in a strip that are drawn from
+NODE_S = 0.02  # closer than the smoother's nodes, so that each is taken
+STEP_NS = 20_000_000  # between nodes
+JITTER = 1e-9  # of a variance: neighbouring nodes' errors are nearly one
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The truth of all runs, and what they are adjusted with.
+
+    Attributes:
+        flight: its swaths have only what lies on planes, its heads start from what the papers say.
+        features: planes and control, every point on its plane.
+        truth: of the scanner.
+        prior: of the trajectory, at the adjustment's knots.
+        range_sigma_m: by swath, (n,) of the returns: of the range, and of the surface within the beam's footprint.
+        nodes: the smoother's.
+        walk: rad/√s of the attitude between them.
+    """
+
+    flight: Flight
+    features: Features
+    truth: Calibration
+    prior: TrajectoryPrior
+    range_sigma_m: tuple[FloatArray, ...]
+    nodes: Knots
+    walk: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of a run.
+
+    Attributes:
+        names: of the parameters.
+        error, sigma: (p,) of them, SI.
+        variance_factor: of all observations; groups: of each group.
+    """
+
+    names: tuple[str, ...]
+    error: FloatArray
+    sigma: FloatArray
+    variance_factor: float
+    groups: dict[str, float]
+    converged: bool
+
+
+def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[Reference, FloatArray]:
+    """Read and match.
+
+    Args:
+        folder: of the flight, as `swath sim fly` leaves it.
+        work: for its returns.
+        rows: wanted.
+        workers: processes.
+
+    Returns:
+        The reference, and the lower root (6k, 6k) of the nodes' joint covariance.
+    """
+    options = Options(datum="same", uncertainty=False)
+    wish = Logs([folder], work, TrajectoryWish(navigate=True), options, workers=workers)
+    kept = read_flight(wish, work, lambda *_: None)
+    (head,) = kept.flight.heads
+    told = read_calibration((folder / f"{head.name}.true.toml").read_text("utf-8"), "truth")
+    truth = head.start.changed(**{name: told.value(name) for name in MODELS[MODEL.model]})
+    flight = replaced(kept.flight, {head.name: truth}, work, "truth")
+    surveyed = in_t(read_control((folder / "control.csv").read_text("utf-8"), "control.csv"), flight.frame)
+    planes = find_planes(flight, PlaneSettings(most_points=MOST_POINTS))
+    features = fewer(Features.joined([planes, control_planes(flight, surveyed)]), rows)
+    compact, features = own_returns(flight, features)
+    compact, features, sigmas = consistent(compact, features, truth)
+    assert kept.logged[0].navigated is not None
+    run = kept.logged[0].navigated.legs[0].solved.run
+    knots, nodes = knots_of(flight, KNOT_S), knots_of(flight, NODE_S, 1_000_000)
+    prior = from_smoother(flight, [error_chain(run, knots.time_ns)], KNOT_S)
+    chain = error_chain(run, nodes.time_ns)
+    covariance = chain.covariance()
+    nodes = Knots(np.zeros(len(chain), np.int64), chain.time_ns, np.zeros(len(chain), np.int64), NODE_S, False)
+    reference = Reference(compact, features, truth, prior, sigmas, nodes, walked(chain, covariance))
+    return reference, root_of(covariance)
+
+
+def fewer(features: Features, rows: int) -> Features:
+    """With as many returns a patch that there are so many in all, at most."""
+    sizes = np.sort([len(patch.at) for plane in features.planes for patch in plane.patches])
+    before = np.concatenate([[0], np.cumsum(sizes)])[:-1]
+    caps = (rows - before) // np.arange(len(sizes), 0, -1)  # of the larger ones, if all smaller ones stay whole
+    most = max(int(caps[int(np.argmax(caps <= sizes))]) if (caps <= sizes).any() else MOST_POINTS, 1)
+    planes = tuple(
+        replace(plane, patches=tuple(Patch(patch.swath, thinned(patch.at, most)) for patch in plane.patches))
+        for plane in features.planes
+    )
+    return Features(planes)
+
+
+def own_returns(flight: Flight, features: Features) -> tuple[Flight, Features]:
+    """A flight of nothing but these returns, each plane with its own."""
+    swaths: list[Swath] = []
+    patches: list[dict[int, Patch]] = [{} for _ in features.planes]
+    for index, swath in enumerate(flight.swaths):
+        mine = [
+            (p, patch.at) for p, plane in enumerate(features.planes) for patch in plane.patches if patch.swath == index
+        ]
+        at = np.concatenate([one for _, one in mine])
+        owner = np.concatenate([np.full(len(one), p) for p, one in mine])
+        order = np.argsort(at, kind="stable")
+        at, owner = at[order], owner[order]
+        for p, _ in mine:
+            patches[p][index] = Patch(index, np.flatnonzero(owner == p))
+        columns: dict[str, Any] = {
+            name: np.ascontiguousarray(getattr(swath, name)[at])
+            for name in ("rows", "time_ns", "points_t", "encoder_rate", "encoder_acceleration")
+        }
+        swaths.append(replace(swath, **columns))
+    planes = (
+        replace(plane, patches=tuple(mine[one] for one in sorted(mine)))
+        for plane, mine in zip(features.planes, patches, strict=True)
+    )
+    return replace(flight, swaths=tuple(swaths)), Features(tuple(planes))
+
+
+def consistent(
+    flight: Flight, features: Features, truth: Calibration
+) -> tuple[Flight, Features, tuple[FloatArray, ...]]:
+    """Ranges and control such that all lies on its plane; and the sigma of every range."""
+    swaths, sigmas = [], []
+    for index, swath in enumerate(flight.swaths):
+        normal, centre = np.zeros((len(swath), 3)), np.zeros((len(swath), 3))
+        for plane in features.planes:
+            for patch in plane.patches:
+                if patch.swath == index:
+                    normal[patch.at], centre[patch.at] = plane.normal_t, plane.centre_t
+        rows = swath.rows.copy()
+        for _ in range(3):
+            here = flight.place(replace(swath, rows=rows), truth)
+            beyond = rows.copy()
+            beyond["range_m"] += 1.0
+            beam = flight.place(replace(swath, rows=beyond), truth) - here
+            along = (normal * beam).sum(axis=1)
+            rows["range_m"] -= (normal * (here - centre)).sum(axis=1) / along
+        cosine = np.abs(along) / np.linalg.norm(beam, axis=1)
+        noise = flight.heads[swath.head].noise
+        foot_m = 0.25 * noise.divergence_rad * rows["range_m"] * np.sqrt(1.0 - cosine**2) / cosine
+        sigmas.append(np.hypot(noise.range_m, foot_m))
+        swaths.append(replace(swath, rows=rows))
+    planes = []
+    for plane in features.planes:
+        points = tuple(
+            replace(
+                point,
+                position_t=point.position_t - plane.normal_t * (plane.normal_t @ (point.position_t - plane.centre_t)),
+            )
+            for point in plane.control
+        )
+        planes.append(replace(plane, control=points))
+    return replace(flight, swaths=tuple(swaths)), Features(tuple(planes)), tuple(sigmas)
+
+
+def walked(chain: ErrorChain, covariance: FloatArray) -> float:
+    """rad/√s that the attitude's errors move from node to node, where these are close."""
+    count = len(chain)
+    joint = covariance.reshape(count, 6, count, 6)
+    at, apart_s = np.arange(count - 1), np.diff(chain.time_ns) / 1e9
+    moved = sum(
+        joint[at, axis, at, axis] + joint[at + 1, axis, at + 1, axis] - 2.0 * joint[at, axis, at + 1, axis]
+        for axis in range(3, 6)
+    )
+    near = apart_s < 2.0 * np.median(apart_s)
+    return float(np.sqrt(np.median((moved / 3.0 / apart_s)[near])))
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Lower root of it, in its place: it has as many as 1e8 elements."""
+    sigmas = np.sqrt(np.diag(covariance))
+    covariance /= sigmas
+    covariance /= sigmas[:, np.newaxis]
+    covariance[np.diag_indices(len(sigmas))] += JITTER
+    root: FloatArray = cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
+    root *= sigmas[:, np.newaxis]
+    return root
+
+
+def errors_along(reference: Reference, at_nodes: FloatArray, rng: np.random.Generator) -> tuple[Int64Array, FloatArray]:
+    """Times and errors (m, 6), nodes' errors (k, 6) being known; attitude walks between nodes, as a bridge."""
+    nodes = reference.nodes.time_ns
+    times = np.unique(np.concatenate([nodes, np.arange(nodes[0], nodes[-1], STEP_NS)]))
+    near = np.abs(times - nodes[np.clip(np.searchsorted(nodes, times), 0, len(nodes) - 1)]) < 1_000_000_000
+    times = times[near]
+    since, at = (times - nodes[0]).astype(np.float64), (nodes - nodes[0]).astype(np.float64)
+    errors = np.stack([np.interp(since, at, column) for column in at_nodes.T], axis=1)
+    steps = rng.standard_normal((len(times), 3)) * np.sqrt(np.diff(times, prepend=times[0]) / 1e9)[:, np.newaxis]
+    walk = reference.walk * steps.cumsum(axis=0)
+    for axis in range(3):
+        errors[:, 3 + axis] += walk[:, axis] - np.interp(since, at, walk[np.isin(times, nodes), axis])
+    return times, errors
+
+
+def run(reference: Reference, at_nodes: FloatArray, seed: np.random.SeedSequence) -> Outcome:
+    """Make observations and adjust them from what the papers say.
+
+    Args:
+        reference: the truth.
+        at_nodes: (k, 6) errors of the trajectory at the nodes.
+        seed: of everything else.
+    """
+    rng = np.random.default_rng(seed)
+    times, errors = errors_along(reference, at_nodes, rng)
+    along = TrajectoryPrior(np.zeros(len(times), np.int64), times, np.zeros(len(times), np.int64), np.zeros((0, 0)))
+    flown = apply(reference.flight.trajectories[0], 0, along, -errors)
+    swaths = []
+    for swath, sigma_m in zip(reference.flight.swaths, reference.range_sigma_m, strict=True):
+        rows = swath.rows.copy()
+        rows["range_m"] += sigma_m * rng.standard_normal(len(rows))
+        rows["encoder_rad"] += reference.flight.heads[swath.head].noise.angle_rad * rng.standard_normal(len(rows))
+        swaths.append(replace(swath, rows=rows))
+    flight = replace(reference.flight, trajectories=(flown,), swaths=tuple(swaths))
+    features = Features(tuple(resurveyed(plane, rng) for plane in reference.features.planes))
+    found = adjust(flight, features, MODEL, reference.prior, SETTINGS)
+    truth = np.array([reference.truth.value(name.split(".", 1)[1]) for name in found.names])
+    groups = {one.group: one.variance_factor for one in found.groups}
+    return Outcome(found.names, found.values - truth, found.sigmas, found.variance_factor, groups, found.converged)
+
+
+def resurveyed(plane: Plane, rng: np.random.Generator) -> Plane:
+    """With errors of its control."""
+    points = (
+        replace(point, position_t=point.position_t + point.sigma_m * rng.standard_normal(3)) for point in plane.control
+    )
+    return replace(plane, control=tuple(points))

@@ -1,0 +1,134 @@
+"""What the search for planes costs on one core, beside a copy of the points.
+
+python -m benchmarks.planes [--repeats 3] [--json FILE]
+
+Figures are medians over the repeats, returns a second of this process's own CPU time: of finding planes anew, of
+finding the same ones again after a calibration, and of reading all points and writing them once. A flight of six
+strips over houses on rolling ground, some five returns a square metre, made of heights alone: the search asks nothing
+else of a flight.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cpu_time import cpu_seconds
+from calib.flight import Flight, Head, Swath, Tangent
+from calib.plane_matching import rematch
+from calib.plane_search import find_planes
+from daemon.memory import keep_freed_memory
+from georef.beams import LineGeometry
+from georef.calibration import nominal
+from georef.earth import e_from_geodetic
+from georef.records import RETURN_DTYPE
+from georef.trajectory import Trajectory
+from georef.uncertainty import Noise
+
+FloatArray = NDArray[np.float64]
+
+STRIPS, RETURNS = 6, 2_000_000  # of a strip
+LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 1000.0, 200.0, 500.0
+HOUSE_M, LOT_M = 12.0, 40.0
+SPEED_MPS = 50.0
+
+
+@dataclass
+class Figure:
+    """One line of the table; rates are returns a second of CPU."""
+
+    name: str
+    rate: float
+    target: float | None
+    limit: float
+
+
+def ground(east: FloatArray, north: FloatArray) -> FloatArray:
+    """Heights: hills, and a gabled roof on every lot."""
+    height = 4.0 * np.sin(east / 150.0) + 3.0 * np.cos(north / 120.0)
+    x, y = np.mod(east, LOT_M) - 0.5 * LOT_M, np.mod(north, LOT_M) - 0.5 * LOT_M
+    roof = (np.abs(x) < 0.5 * HOUSE_M) & (np.abs(y) < 0.5 * HOUSE_M)
+    lot_x, lot_y = east - x, north - y
+    base = 4.0 * np.sin(lot_x / 150.0) + 3.0 * np.cos(lot_y / 120.0)
+    turned = np.where(np.floor(lot_x / LOT_M + lot_y / LOT_M) % 2 == 0, x, y)
+    return np.where(roof, base + 8.0 - 0.7 * np.abs(turned), height)
+
+
+def strip(number: int, frame: Tangent, draws: np.random.Generator) -> tuple[Swath, FloatArray, NDArray[np.int64]]:
+    """A swath, where its aircraft was (k, 3) in e, and when."""
+    second = np.arange(RETURNS) * (LENGTH_M / SPEED_MPS / RETURNS)
+    along = SPEED_MPS * second - 0.5 * LENGTH_M
+    across = HALF_WIDTH_M * (2.0 * (50.0 * second % 1.0) - 1.0)
+    turn = number * np.pi / 2.0
+    east, north = along * np.cos(turn) - across * np.sin(turn), along * np.sin(turn) + across * np.cos(turn)
+    up = ground(east, north) + draws.normal(0.0, 0.02, RETURNS)
+    rows = np.zeros(RETURNS, RETURN_DTYPE)
+    rows["return_number"] = rows["number_of_returns"] = 1
+    rows["range_m"] = np.hypot(across, HEIGHT_M)
+    start_ns = number * 100_000_000_000
+    epochs = np.arange(0.0, LENGTH_M / SPEED_MPS, 0.1)
+    way = SPEED_MPS * epochs - 0.5 * LENGTH_M
+    place_t = np.stack([way * np.cos(turn), way * np.sin(turn), np.full(len(way), HEIGHT_M)], axis=1)
+    time_ns = start_ns + np.rint(1e9 * second).astype(np.int64)
+    points = np.stack([east, north, up], axis=1)
+    swath = Swath(f"{number:02d}", 0, number, 0, rows, time_ns, points)
+    return swath, frame.e_from_t(place_t), start_ns + np.rint(1e9 * epochs).astype(np.int64)
+
+
+def flight() -> Flight:
+    """All strips."""
+    frame = Tangent.at(np.asarray(e_from_geodetic(np.radians(47.4), np.radians(8.9), 0.0)))
+    draws = np.random.default_rng(7)
+    made = [strip(number, frame, draws) for number in range(STRIPS)]
+    position_e, time_ns = np.concatenate([one[1] for one in made]), np.concatenate([one[2] for one in made])
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_ns), 1))
+    unsaid = np.full_like(position_e, np.nan)
+    trajectory = Trajectory(time_ns, position_e, level, unsaid, unsaid, unsaid)
+    head = Head("left", nominal("left", np.zeros(3), np.eye(3)), LineGeometry(), Noise())
+    return Flight(frame, (head,), (trajectory,), tuple(one[0] for one in made))
+
+
+def measure(repeats: int) -> tuple[list[Figure], str]:
+    """All lines of the table, and what was found."""
+    whole = flight()
+    returns = sum(len(swath) for swath in whole.swaths)
+    found = find_planes(whole)
+    by = np.array([0.1, 0.0, 0.02])
+    moved = replace(whole, swaths=tuple(replace(swath, points_t=swath.points_t + by) for swath in whole.swaths))
+
+    def rate(work: object) -> float:
+        assert callable(work)
+        return returns / cpu_seconds(work, repeats)
+
+    limit = rate(lambda: [swath.points_t.copy() for swath in whole.swaths])
+    figures = [
+        Figure("planes found", rate(lambda: find_planes(whole)), 1e6, limit),
+        Figure("planes found again", rate(lambda: rematch(moved, found)), None, limit),
+    ]
+    roofs = sum(plane.kind == "roof" for plane in found.planes)
+    return figures, f"{returns / 1e6:.0f} M returns, {roofs} roofs, {len(found.planes) - roofs} pieces of ground"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3, help="measurements a figure, of which the median counts")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    arguments = parser.parse_args()
+    keep_freed_memory()  # as every command of ours does
+    figures, what = measure(arguments.repeats)
+    print(f"{'planes, one core: ' + what:<66} {'rate':>9} {'asked':>8} {'copy':>9}")
+    for one in figures:
+        asked = f"{one.target / 1e6:>4.0f} M/s" if one.target else ""
+        print(f"{one.name:<66} {one.rate / 1e6:>5.2f} M/s {asked:>8} {one.limit / 1e6:>5.0f} M/s")
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(figure) for figure in figures], indent=1))
+
+
+if __name__ == "__main__":
+    main()
