@@ -1,0 +1,1 @@
+"""Programs of others beside ours: gpsd, and the reader that Foxglove's viewer is built on. ``make test-peers``."""

@@ -1,0 +1,87 @@
+"""``live.mcap`` in the reader that Foxglove's viewer is built on (@mcap/core), with Foxglove's published schemas."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import subprocess
+import sys
+from base64 import b64decode
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+pytestmark = [pytest.mark.peers, pytest.mark.xdist_group("kernels")]
+
+HERE = Path(__file__).parent
+SCHEMAS = {
+    "/points/left": "foxglove.PointCloud",
+    "/position": "foxglove.LocationFix",
+    "/pose": "foxglove.PoseInFrame",
+    "/tf": "foxglove.FrameTransform",
+}
+
+
+def swath(*arguments: str | Path) -> str:
+    """Run a command that must succeed; what it printed."""
+    command = [sys.executable, "-m", "daemon.cli.main", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=HERE.parents[1])
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a live run over the beginning of a virtual flight."""
+    folder = tmp_path_factory.mktemp("foxglove")
+    swath("sim", "fly", "small", "--seconds", "14", "-o", folder / "flight")
+    swath("live", "--replay", folder / "flight", "-o", folder / "live", "--json")
+    return folder / "live"
+
+
+@pytest.fixture(scope="module")
+def read(live: Path) -> dict[str, Any]:
+    """What Foxglove's libraries make of the file."""
+    node = shutil.which("node")
+    assert node, "there is no node: apt-get install nodejs npm"
+    assert (HERE / "node_modules/@mcap/core").is_dir(), f"no @mcap/core: npm install --prefix {HERE}"
+    command = [node, str(HERE / "read_with_foxglove.mjs"), str(live / "live.mcap")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def test_every_topic_has_foxgloves_schema_as_it_is_published(read: dict[str, Any]) -> None:
+    assert {topic: found["schema"] for topic, found in read["topics"].items()} == SCHEMAS
+    for topic, found in read["topics"].items():
+        assert found["encoding"] == "protobuf"
+        assert found["fields"], topic
+        assert found["fields"] == found["published"], topic
+
+
+def test_all_messages_and_points_are_there(live: Path, read: dict[str, Any]) -> None:
+    with (live / "live.mcap").open("rb") as file:
+        written = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert {topic: found["messages"] for topic, found in read["topics"].items()} == written
+    status = json.loads((live / "live.json").read_text())
+    assert read["topics"]["/points/left"]["points"] == status["live_mcap"]["points_written"] > 0
+
+
+def test_a_cloud_is_where_the_aircraft_is(read: dict[str, Any]) -> None:
+    """All in the frame ``local``; points below the body, position as the pose, in degrees."""
+    topics, metadata = read["topics"], read["metadata"]["swath.live"]
+    cloud, pose, fix = (topics[name]["first"] for name in ("/points/left", "/pose", "/position"))
+    assert cloud["frame_id"] == pose["frame_id"] == topics["/tf"]["first"]["parent_frame_id"] == "local"
+    assert [field["name"] for field in cloud["fields"]] == ["x", "y", "z", "intensity"]
+    x, y, z, _ = struct.unpack("<4f", b64decode(cloud["data"])[:16])
+    at = pose["pose"]["position"]
+    assert z < at["z"]
+    assert abs(x - at["x"]) + abs(y - at["y"]) < 2000.0
+    assert -90.0 < fix["latitude"] < 90.0
+    assert fix["latitude"] != 0.0
+    assert metadata["origin"]

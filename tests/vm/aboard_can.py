@@ -1,0 +1,196 @@
+"""In the machine: an IMU on CAN, a sender by raw AF_CAN sockets, and what can befall an interface."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import struct
+import time
+from array import array
+
+from tests.vm.aboard import SHARED, TREE, Recorder, keep, main, recording, say, session, sh, wait_until
+
+FRAME = struct.Struct("<IB3x8s")
+FD_FRAME = struct.Struct("<IBBxx64s")
+CAN_RAW_FD_FRAMES = 5
+SOL_CAN_RAW = 101
+ERROR, BUS_OFF, RESTARTED, CONTROLLER = 0x2000_0000, 0x40, 0x100, 0x04
+IMU = """
+[imu.{name}]
+transport = "can:socketcan:{channel}{options}"
+protocol = "dbc"
+dbc = "{dbc}"
+rate_hz = {rate_hz}
+tick_hz = 1_000_000
+
+[imu.{name}.signals]
+specific_force = ["ACC.acc_x", "ACC.acc_y", "ACC.acc_z"]
+angular_rate = ["GYR.gyr_x", "GYR.gyr_y", "GYR.gyr_z"]
+sample_ticks = "SAMPLE.ticks"
+temperature = "SAMPLE.temperature"
+status = "SAMPLE.status"
+packet_counter = "SAMPLE.packet_counter"
+"""
+
+
+def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
+    """[imu.<name>] on an interface."""
+    dbc = TREE / "fixtures/config/imu.dbc"
+    return IMU.format(name=name, channel=channel, rate_hz=rate_hz, dbc=dbc, options=options)
+
+
+class Bus:
+    """The sending end of an interface."""
+
+    def __init__(self, channel: str, *, fd: bool = False) -> None:
+        os.sched_setaffinity(0, {0})  # vcan keeps the order of one processor's frames only
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self._socket.setsockopt(SOL_CAN_RAW, CAN_RAW_FD_FRAMES, int(fd))
+        self._socket.bind((channel,))
+
+    def send(self, identifier: int, data: bytes) -> bytes:
+        """One classic frame; the frame, when the driver has taken it."""
+        frame = FRAME.pack(identifier, len(data), data)
+        self.send_frame(frame)
+        return frame
+
+    def send_frame(self, frame: bytes) -> None:
+        """A frame of 16 or 72 bytes; waits while a controller's queue is full."""
+        while True:
+            try:
+                self._socket.send(frame)
+                return
+            except OSError as error:
+                if error.errno != 105:  # ENOBUFS
+                    raise
+                time.sleep(0.001)
+
+
+def sample_frames(number: int, period_us: int) -> list[bytes]:
+    """Sample ``number`` of the unit of fixtures/config/imu.dbc; its axes say the number again."""
+    low, high = number & 0x7FFF, number >> 15
+    contents = [
+        (257, struct.pack("<hhh", low, high, 1962)),
+        (258, struct.pack("<hhh", high, low, -low)),
+        (256, struct.pack("<IhBB", number * period_us & 0xFFFFFFFF, 3800, 0x5A, number & 0xFF)),
+    ]
+    return [FRAME.pack(identifier, len(data), data) for identifier, data in contents]
+
+
+def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0) -> array[int]:
+    """Samples in real time; times (CLOCK_MONOTONIC, ns) before and after each frame of the first bus, by turns."""
+    frames = [sample_frames(number, 1_000_000 // rate_hz) for number in range(first, first + count)]
+    times = array("q")
+    begin_ns = time.monotonic_ns()
+    for number, sample in enumerate(frames):
+        due_ns = begin_ns + number * 1_000_000_000 // rate_hz
+        left_ns = due_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns * 1e-9)
+        for frame in sample:
+            times.append(time.monotonic_ns())
+            buses[0].send_frame(frame)
+            times.append(time.monotonic_ns())
+            for bus in buses[1:]:
+                bus.send_frame(frame)
+    return times
+
+
+def listening(recorder: Recorder, times: int = 1) -> None:
+    """Until the recorder has opened interfaces so many times."""
+    recorder.wait_said("device_opened", times)
+
+
+def make_vcan(mtu: int = 16) -> None:
+    """vcan0, up."""
+    sh(f"modprobe -a vcan can_raw; ip link add vcan0 type vcan; ip link set vcan0 mtu {mtu} up")
+
+
+def rate(seconds: str) -> None:
+    """1 kHz, three frames a sample, in real time."""
+    make_vcan()
+    with recording(session() + imu("main", "vcan0", 1000)) as recorder:
+        listening(recorder)
+        say("sending")
+        times = send_samples([Bus("vcan0")], 1000, 1000 * int(seconds))
+        say(f"sent in {(times[-1] - times[0]) * 1e-9:.2f} s")
+    (SHARED / "sent").write_bytes(times.tobytes())
+
+
+def overrun(count: str) -> None:
+    """The recorder stands still while frames come faster than its buffer is deep; then it goes on."""
+    make_vcan()
+    with recording(session() + imu("main", "vcan0", 1000, "?buffer_mb=1")) as recorder:
+        listening(recorder)
+        bus = Bus("vcan0")
+        recorder.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.2)
+        for number in range(int(count)):
+            bus.send(0x700, struct.pack("<Q", number))
+        recorder.process.send_signal(signal.SIGCONT)
+        time.sleep(1.5)
+        for number in range(100):
+            bus.send(0x701, struct.pack("<Q", number))
+        time.sleep(1.5)
+
+
+def trouble() -> None:
+    """FD frames, error frames, bus-off and restart as a controller tells them; the interface goes down and comes up."""
+    make_vcan(mtu=72)
+    with recording(session() + imu("main", "vcan0", 1000)) as recorder:
+        listening(recorder)
+        bus = Bus("vcan0", fd=True)
+        frames = [FD_FRAME.pack(0x123, length, 0x05, os.urandom(length)) for length in (1, 8, 12, 16, 32, 48, 64)]
+        frames += [
+            FRAME.pack(ERROR | CONTROLLER, 8, bytes([0, 0x10, 0, 0, 0, 0, 130, 0])),
+            FRAME.pack(ERROR | BUS_OFF, 8, bytes(8)),
+            FRAME.pack(ERROR | RESTARTED, 8, bytes(8)),
+            FRAME.pack(0x8000_0000 | 0x1ABCDEF0, 8, b"extended"),
+        ]
+        for frame in frames:
+            bus.send_frame(frame)
+        time.sleep(1.5)
+        sh("ip link set vcan0 down")
+        recorder.wait_said("vcan0 is down")
+        time.sleep(1.0)
+        sh("ip link set vcan0 up")
+        listening(recorder, 2)
+        bus = Bus("vcan0")
+        for number in range(100):
+            frames.append(bus.send(0x300, struct.pack("<Q", number)))
+        time.sleep(0.5)
+        sh("ip link delete vcan0")
+        recorder.wait_said("no network interface vcan0")
+        make_vcan(mtu=72)
+        listening(recorder, 3)
+        bus = Bus("vcan0")
+        for number in range(100):
+            frames.append(bus.send(0x301, struct.pack("<Q", number)))
+        time.sleep(1.5)
+    keep("sent", {"frames": [frame.hex() for frame in frames]})
+
+
+def controllers(seconds: str) -> None:
+    """Two emulated controllers on one bus, 200 Hz; each sends what the other receives."""
+    sh("modprobe -a kvaser_pci can_raw")
+    wait_until(lambda: "can1" in os.listdir("/sys/class/net"), "two controllers")
+    for number in range(2):
+        sh(f"ip link set can{number} up type can bitrate 1000000 restart-ms 100")
+    config = imu("left", "can0", 200, "?bitrate=1000000") + imu("right", "can1", 200, "?bitrate=1000000")
+    with recording(session() + config) as recorder:
+        listening(recorder, 2)
+        count = 200 * int(seconds)
+        send_samples([Bus("can0")], 200, count)
+        send_samples([Bus("can1")], 200, count, first=count)
+        time.sleep(0.5)
+        sh("ip link set can0 down")
+        recorder.wait_said("can0 is down")
+        sh("ip link set can0 up")
+        listening(recorder, 3)
+        send_samples([Bus("can1")], 200, 200, first=2 * count)
+        time.sleep(0.5)
+
+
+if __name__ == "__main__":
+    main({"rate": rate, "overrun": overrun, "trouble": trouble, "controllers": controllers})

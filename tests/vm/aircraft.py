@@ -1,0 +1,118 @@
+"""The aircraft computer of these proofs: its configuration, and what its sensors sent against what its logs hold."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.log.reader import open_logs
+from sim.companions import companion_files, config_text, default_wires
+from sim.fly import VirtualFlight
+from sim.plan import parse_plan
+from tests.vm import installed
+from tests.vm.machine import GUEST, MODULES
+
+LOGS = "/var/lib/swath"
+SENSORS = "/usr/local/lib/sensors.py"
+_PLAN = """
+[flight]
+name = "flight"
+seed = 8
+[[line]]
+name = "1"
+from_m = [-150, 0]
+to_m = [150, 0]
+height_m = 520
+[gnss.rover]
+ins = true
+[scanner.left]
+prf_hz = 5000
+"""
+_WIRES = {
+    "gnss/rover": "serial:/dev/ttyS1?baud=115200",
+    "imu/main": "can:socketcan:vcan0",
+    "scanner/left": "udp:127.0.0.1:2368?buffer_mb=8",
+    "pps/main": "/dev/pps0",
+}
+# the log on a disk of its own; devices that need no udev come before systemd asks for them
+_FSTAB = "/dev/vda /var/lib/swath ext4 defaults 0 0\n"
+_DEVICES = """\
+[Unit]
+DefaultDependencies=no
+Before=sysinit.target
+[Service]
+Type=oneshot
+RemainAfterExit=yes
+ExecStart=/bin/sh -c 'modprobe vcan; ip link add vcan0 type vcan; ip link set vcan0 up; insmod %s'
+[Install]
+WantedBy=sysinit.target
+"""
+
+# qemu: the wire from ttyS1 to a second port of the same machine, which the driver of PCI ports finds
+SENDING_PORT = "/dev/$(basename /sys/bus/pci/drivers/serial/0000*/tty/ttyS*)"
+
+
+def null_modem(folder: Path) -> list[str]:
+    """qemu's words for ttyS1 and `SENDING_PORT`, joined."""
+    place = folder / "wire"
+    return [
+        *("-chardev", f"socket,id=here,path={place},server=on,wait=off", "-chardev", f"socket,id=there,path={place}"),
+        *("-device", "isa-serial,chardev=here,index=1", "-device", "pci-serial,chardev=there"),
+    ]
+
+
+def aboard(folder: Path, *, session: str = "", enabled: tuple[str, ...] = ("swathd.service",)) -> Path:
+    """An overlay: all sensors configured and there, the log on the first disk, the recorder enabled."""
+    plan = parse_plan(_PLAN, Path())
+    flight = VirtualFlight(plan, None, 1.0)
+    text = config_text(plan, default_wires(plan) | _WIRES, LOGS)
+    text = text.replace("[session]\n", f"[session]\nreserve_mb = 16\n{session}", 1)
+    installed.overlay(folder, text, enabled=enabled)
+    for name, data in companion_files(plan, flight.site, flight.scene).items():
+        (folder / "etc/swath" / name).write_bytes(data)
+    (folder / "etc/fstab").write_text(_FSTAB)
+    units = folder / "etc/systemd/system"
+    (units / "sensors.service").write_text(_DEVICES % (MODULES / "pps_sim.ko"))
+    (units / "sysinit.target.wants").mkdir(parents=True)
+    (units / "sysinit.target.wants/sensors.service").symlink_to("/etc/systemd/system/sensors.service")
+    place = folder / SENSORS[1:]
+    place.parent.mkdir(parents=True)
+    place.write_bytes((GUEST / "sensors.py").read_bytes())
+    return folder
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What had been sent by a moment of the machine's CLOCK_MONOTONIC."""
+
+    monotonic_ns: int
+    udp: int
+    serial: int
+    can: int
+
+
+def sent(folder: Path) -> list[Turn]:
+    """What the sensors wrote down, the last line possibly cut short by the power."""
+    lines = (folder / "sent").read_text().split("\n")[:-1]
+    return [Turn(*(int(word) for word in line.split())) for line in lines]
+
+
+def numbers(paths: list[Path]) -> dict[str, list[int]]:
+    """The numbers of the units in logs, in file order, by kind of sensor."""
+    found: dict[str, list[int]] = defaultdict(list)
+    text = b""
+    for session in open_logs(paths):
+        for batch in session.batches():
+            topic = batch.channel.topic
+            for row in batch.units:
+                data = row.tobytes()
+                if topic == "/scanner/left/raw":
+                    found["udp"].append(int.from_bytes(data[:8], "little"))
+                elif topic == "/imu/main/raw":
+                    found["can"].append(int.from_bytes(data[-8:], "little"))
+                elif topic == "/gnss/rover/raw":
+                    text += data
+    found["serial"] = [int(number) for number in re.findall(rb"\$P,(\d{10})\r\n", text)]
+    return dict(found)

@@ -1,0 +1,69 @@
+"""What the kernel has said is on the disk: after each fdatasync of the writer, how much of the log stands there.
+
+    witness.py LOGS FILE
+
+A line of FILE is ``<CLOCK_MONOTONIC in ns at the sync's begin> <at its end> <bytes> <log>``: bytes that the log had
+before the sync began, so that its end makes them durable. The kernel's tracing is the witness, not the recorder.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from pathlib import Path
+
+TRACING = Path("/sys/kernel/tracing")
+_LINE = re.compile(r"(?P<task>\S.*)-\d+\s+\[\d+\].*? (?P<time>\d+\.\d+): sys_fdatasync(?P<end> ->)?")
+
+
+def begin() -> int:
+    """Trace fdatasync of threads called writer; returns the pipe."""
+    if not (TRACING / "trace_pipe").exists():
+        os.system(f"mount -t tracefs nodev {TRACING}")
+    (TRACING / "trace_clock").write_text("mono")
+    for event in ("sys_enter_fdatasync", "sys_exit_fdatasync"):
+        (TRACING / f"events/syscalls/{event}/filter").write_text('comm == "writer"')
+        (TRACING / f"events/syscalls/{event}/enable").write_text("1")
+    return os.open(TRACING / "trace_pipe", os.O_RDONLY | os.O_NONBLOCK)
+
+
+def newest(logs: Path) -> Path | None:
+    """The log that was made last."""
+    made = [path for path in logs.glob("*.mcap") if not path.name.endswith(".recovered.mcap")]
+    return max(made, key=lambda path: path.stat().st_mtime_ns, default=None)
+
+
+def main() -> None:
+    """Watch until the power goes."""
+    logs, told = Path(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    pipe = begin()
+    sizes: list[tuple[int, int, str]] = []
+    began_ns, rest = 0, ""
+    while True:
+        log = newest(logs)
+        if log is not None:
+            size = log.stat().st_size
+            sizes.append((time.monotonic_ns(), size, log.name))
+        del sizes[:-600]
+        try:
+            rest += os.read(pipe, 65536).decode(errors="replace")
+        except BlockingIOError:
+            time.sleep(0.02)
+        *lines, rest = rest.split("\n")
+        for line in lines:
+            found = _LINE.search(line)
+            if found is None:
+                continue
+            at_ns = round(float(found["time"]) * 1e9)
+            if not found["end"]:
+                began_ns = at_ns
+                continue
+            known = [(size, name) for stat_ns, size, name in sizes if stat_ns < began_ns]
+            if known:
+                os.write(told, f"{began_ns} {at_ns} {known[-1][0]} {known[-1][1]}\n".encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""The program as `make install` installs it, in a folder to lay over the machine's root: made once, kept in .cache."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+from tests.vm.machine import CACHE, TREE, UDEV
+
+INSTALLED = CACHE / "installed"
+_SOURCES = ("pyproject.toml", "calib", "daemon", "drivers", "georef", "sim", "systemd")
+_ACCOUNTS = ("passwd", "group", "shadow", "gshadow")
+
+
+def installed() -> Path:
+    """The layer that `make install DESTDIR=…` makes, with systemd's user of it; made anew when the program has changed.
+
+    ``SWATH_VM_KEEP=1`` in the environment takes the one that is there, whatever has changed.
+    """
+    CACHE.mkdir(exist_ok=True)
+    with (CACHE / "installed.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        state = _state()
+        mark = CACHE / "installed.state"
+        if mark.exists() and (os.environ.get("SWATH_VM_KEEP") or mark.read_text() == state):
+            return INSTALLED
+        mark.unlink(missing_ok=True)
+        _install(INSTALLED)
+        mark.write_text(state)
+    return INSTALLED
+
+
+def overlay(folder: Path, config: str, *, enabled: Iterable[str] = ("swathd.service",)) -> Path:
+    """A folder for `machine.start`'s ``overlay``: the configuration, and units as `systemctl enable` leaves them."""
+    (folder / "etc/swath").mkdir(parents=True, exist_ok=True)
+    (folder / "etc/swath/swath.toml").write_text(config)
+    units = installed() / "usr/lib/systemd/system"
+    for name in enabled:
+        for line in (units / name).read_text().splitlines():
+            if line.startswith("WantedBy="):
+                wants = folder / f"etc/systemd/system/{line.partition('=')[2]}.wants"
+                wants.mkdir(parents=True, exist_ok=True)
+                (wants / name).symlink_to(f"/usr/lib/systemd/system/{name}")
+    return folder
+
+
+def with_udev() -> list[Path]:
+    """The layers of a machine that names its devices."""
+    return [installed(), UDEV]
+
+
+def _install(layer: Path) -> None:
+    shutil.rmtree(layer, ignore_errors=True)
+    (layer / "etc").mkdir(parents=True)
+    environment = {**os.environ, "DESTDIR": str(layer), "PREFIX": "/opt/swath", "PYTHON": "/usr/bin/python3"}
+    for name in ("PYTHONPATH", "VIRTUAL_ENV"):
+        environment.pop(name, None)
+    _run(["sh", str(TREE / "systemd/install.sh"), "install"], environment)
+    for name in _ACCOUNTS:
+        if Path("/etc", name).exists():
+            shutil.copy(Path("/etc", name), layer / "etc" / name)
+    _run(["systemd-sysusers", f"--root={layer}"], environment)  # a package's script would, or the next start
+    for path in (layer, *(one for one in layer.rglob("*") if one.is_dir() and not one.is_symlink())):
+        path.chmod(0o755)
+
+
+def _run(command: list[str], environment: dict[str, str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900, check=False)
+    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}{done.stderr}"
+
+
+def _state() -> str:
+    """A digest of everything that is installed, the documentation aside."""
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        root = TREE / name
+        for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
+            if path.is_file() and "__pycache__" not in path.parts:
+                digest.update(str(path.relative_to(TREE)).encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()

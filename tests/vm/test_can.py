@@ -1,0 +1,118 @@
+"""SocketCAN: real vcan and two emulated controllers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.log.reader import open_logs
+from daemon.log_parsers import stored_parsers
+from georef.records import ChunkBatch, ImuSamples
+from tests.daemon.log_check import LogContent, read_log
+from tests.vm.aboard_can import BUS_OFF, ERROR, sample_frames
+from tests.vm.crew import aboard, facts
+
+CLOCKS_NS = 50_000  # REALTIME and MONOTONIC are read one after the other, and only a change beyond this is a step
+KVASER = ["-object", "can-bus,id=bus", *["-device", "kvaser_pci,canbus=bus"] * 2]
+
+
+def last_status(content: LogContent, source: str) -> dict[str, int]:
+    """The last account of a source."""
+    status: dict[str, int] = content.messages[f"/status/{source}"][-1][1]
+    return status
+
+
+def units(content: LogContent, source: str) -> list[bytes]:
+    return [data for _, data in content.units[source]]
+
+
+def frames_of(samples: range, period_us: int) -> list[bytes]:
+    return [frame for number in samples for frame in sample_frames(number, period_us)]
+
+
+def assert_nothing_lost(content: LogContent, source: str) -> None:
+    status = last_status(content, source)
+    assert [status[key] for key in ("lost_kernel", "lost_queue", "lost_write")] == [0, 0, 0], status
+
+
+def decoded(logs: Path, source: str) -> int:
+    """Samples that the log's own parser finds, each of the number that its axes say."""
+    (session,) = open_logs([logs])
+    parsers, troubles = stored_parsers(session.attachments())
+    assert troubles == []
+    rows = []
+    for batch in session.batches(lambda topic: topic == f"/{source}/raw"):
+        found = parsers[source].feed_batch(ChunkBatch(source, batch.log_time_ns, batch.units))
+        rows += [record.rows for record in found if isinstance(record, ImuSamples)]
+    forces = np.concatenate(rows)["specific_force_b"]
+    number = np.rint(forces[:, 0] / 0.005) + np.rint(forces[:, 1] / 0.005) * 32768
+    assert np.array_equal(number, np.arange(len(number)))
+    return len(number)
+
+
+@pytest.mark.parametrize("seconds", [60])
+def test_can_1_khz_without_loss_and_with_kernel_stamps(tmp_path: Path, seconds: int) -> None:
+    finished = aboard(tmp_path, "aboard_can", "rate", seconds, seconds=seconds + 20)
+    content = read_log(tmp_path / "logs")
+    assert units(content, "imu/main") == frames_of(range(1000 * seconds), 1000), finished.output
+    assert_nothing_lost(content, "imu/main")
+    assert decoded(tmp_path / "logs", "imu/main") == 1000 * seconds
+    (session,) = open_logs([tmp_path / "logs"])
+    stamps = np.array([time_ns for time_ns, _ in content.units["imu/main"]])
+    stamps -= session.info.realtime_ns - session.info.monotonic_ns
+    before, after = np.fromfile(tmp_path / "sent", np.int64).reshape(-1, 2).T
+    # the kernel stamps a frame within the very call that sends it; a read that collects frames for 16 ms does not
+    outside = (stamps < before - CLOCKS_NS) | (stamps > after + CLOCKS_NS)
+    assert not outside.any(), (np.count_nonzero(outside), (stamps - before)[outside][:9], (stamps - after)[outside][:9])
+    assert last_status(content, "imu/main").get("stamp_ambiguous", 0) == 0
+
+
+def test_can_overrun_is_counted_exactly(tmp_path: Path) -> None:
+    sent = 20_000  # into a buffer for about 2700
+    aboard(tmp_path, "aboard_can", "overrun", sent, seconds=25)
+    content = read_log(tmp_path / "logs")
+    numbers = [int.from_bytes(data[8:16], "little") for data in units(content, "imu/main") if data[:2] == b"\0\7"]
+    after = [data for data in units(content, "imu/main") if data[:2] == b"\1\7"]
+    status = last_status(content, "imu/main")
+    assert status["lost_kernel"] > sent // 2, status
+    assert numbers == list(range(len(numbers)))  # the buffer keeps the first
+    assert len(after) == 100
+    assert sent + 100 == status["written"] + status["lost_kernel"] == status["units"], status
+    assert len(numbers) + status["lost_kernel"] == sent
+    assert content.events("lost_kernel")
+
+
+def test_can_fd_error_frames_bus_off_restart_and_interface_down_and_up(tmp_path: Path) -> None:
+    aboard(tmp_path, "aboard_can", "trouble", seconds=35)
+    content = read_log(tmp_path / "logs")
+    sent = [bytes.fromhex(frame) for frame in facts(tmp_path, "sent")["frames"]]
+    recorded = units(content, "imu/main")
+    # the kernel marks an FD frame as one (CANFD_FDF), whatever its sender wrote there
+    assert [_without_flags(frame) for frame in recorded] == [_without_flags(frame) for frame in sent]
+    assert [len(frame) for frame in recorded] == [len(frame) for frame in sent]
+    assert sum(int.from_bytes(frame[:4], "little") == ERROR | BUS_OFF for frame in recorded) == 1
+    assert_nothing_lost(content, "imu/main")
+    assert len(content.events("can_bus_off")) == 1
+    assert content.events("can_errors")
+    assert len(content.events("device_opened")) == 3
+    assert len(content.events("device_lost")) == 2
+
+
+def _without_flags(frame: bytes) -> bytes:
+    return frame if len(frame) == 16 else frame[:5] + b"\0" + frame[6:]
+
+
+def test_can_two_controllers_200_hz(tmp_path: Path) -> None:
+    seconds = 10
+    aboard(tmp_path, "aboard_can", "controllers", seconds, qemu=KVASER, seconds=2 * seconds + 30)
+    content = read_log(tmp_path / "logs")
+    count = 200 * seconds
+    both = frames_of(range(2 * count), 5000)
+    later = frames_of(range(2 * count, 2 * count + 200), 5000)
+    for source in ("imu/left", "imu/right"):
+        data = [frame for frame in units(content, source) if not frame[3] & 0x20]  # a controller may tell of its state
+        assert data == both + later, (source, len(data))
+        assert_nothing_lost(content, source)
+    assert len(content.events("device_lost")) == 1

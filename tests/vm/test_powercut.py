@@ -1,0 +1,186 @@
+"""The power is cut while a full sensor set is recorded; what was durable is there, and little more than that is lost.
+
+The machine keeps time of its own: when what was sent, and when the kernel said what is on the disk, is written down
+in it, on the host, which the cut spares. The recording is that of the installed service, from its start at boot.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from daemon.log.reader import open_logs
+from daemon.log.recover import recover
+from tests.vm import aircraft, machine
+from tests.vm.installed import with_udev
+
+CUTS, CUTS_LONG = 10, 50
+FSYNC_S = 1.0
+CHUNK_OPEN_S = 0.25
+DISK_MB = 192
+LOGS_ON_DISK = "/"
+
+SENDERS = f"""\
+/usr/bin/python3 {machine.GUEST}/witness.py {aircraft.LOGS} /vm/durable &
+chrt -f 20 /usr/bin/python3 {aircraft.SENSORS} /vm \
+    --udp 2368:300 --serial {aircraft.SENDING_PORT} --can vcan0:200 &
+until [ -s /vm/durable ] && [ -s /vm/sent ]; do sleep 0.2; done
+echo FLYING; wait
+"""
+WITHOUT_SYNC = "[Service]\nEnvironment=LD_PRELOAD=/usr/local/lib/nosync.so\n"
+
+
+@dataclass(frozen=True)
+class Synced:
+    """A sync that the kernel has ended: this much of a log was there before it began."""
+
+    began_ns: int
+    ended_ns: int
+    size: int
+    log: str
+
+
+@dataclass
+class Cut:
+    """What is left of a flight that ended in the dark, its journal replayed."""
+
+    logs: Path
+    turns: list[aircraft.Turn]
+    syncs: list[Synced]
+
+    def log(self) -> Path:
+        """The log of the flight."""
+        logs = sorted(self.logs.glob("*.mcap"))
+        assert len(logs) == 1, f"{len(logs)} logs: the recorder was started again in flight, the machine is starved"
+        return logs[0]
+
+    def lost_s(self) -> float:
+        """From the first unit that is missing to the cut, as far as the machine lived to write down."""
+        found = aircraft.numbers([self.log()])
+        complete = dict.fromkeys(("udp", "serial", "can"), 0)
+        for kind in complete:
+            there = found.get(kind, [])
+            assert there == list(range(len(there))), f"{kind}: a gap within what is left"
+            complete[kind] = len(there)
+        kept = [turn for turn in self.turns if all(getattr(turn, kind) <= complete[kind] for kind in complete)]
+        begin_ns = kept[-1].monotonic_ns if kept else self.turns[0].monotonic_ns
+        return (self.turns[-1].monotonic_ns - begin_ns) * 1e-9
+
+    def bound_s(self) -> float:
+        """The sync period, 250 ms and the sync under way; the machine's own stalls, as its sender saw them."""
+        sync_s = max((sync.ended_ns - sync.began_ns) * 1e-9 for sync in self.syncs) if self.syncs else 0.0
+        pairs = zip(self.turns, self.turns[1:], strict=False)
+        stall_s = max((after.monotonic_ns - before.monotonic_ns) * 1e-9 for before, after in pairs)
+        return FSYNC_S + CHUNK_OPEN_S + sync_s + stall_s
+
+
+def fly_and_cut(folder: Path, disk: Path, after_s: float, *, syncs: bool = True) -> Cut:
+    """One flight into a fresh disk, cut some seconds after everything has begun."""
+    overlay = aircraft.aboard(folder / "overlay")
+    shared = folder / "vm"
+    if not syncs:
+        dropin = overlay / "etc/systemd/system/swathd.service.d/nosync.conf"
+        dropin.parent.mkdir(parents=True)
+        dropin.write_text(WITHOUT_SYNC)
+        library = overlay / "usr/local/lib/nosync.so"
+        library.write_bytes((machine.CACHE / "nosync.so").read_bytes())
+    senders = SENDERS if syncs else SENDERS.replace("-s /vm/durable ", "-e /var/lib/swath/recording.json ")
+    qemu = [*machine.disk(machine.make_disk(disk, DISK_MB)), *aircraft.null_modem(folder)]
+    with machine.start(
+        senders, shared=shared, systemd=True, overlay=overlay, layers=with_udev(), qemu=qemu, timeout_s=900
+    ) as flying:
+        flying.said("FLYING", 800)
+        time.sleep(after_s)
+        flying.kill()
+    machine.replay_journal(disk)
+    logs = folder / "logs"
+    machine.copy_from_disk(disk, LOGS_ON_DISK, logs)
+    return Cut(logs, aircraft.sent(shared), synced(shared / "durable"))
+
+
+def synced(path: Path) -> list[Synced]:
+    """What the witness wrote."""
+    lines = path.read_text().split("\n")[:-1] if path.exists() else []
+    return [Synced(int(a), int(b), int(c), d) for a, b, c, d in (line.split() for line in lines)]
+
+
+def check(cut: Cut) -> dict[str, float]:
+    """Everything that was durable is there and whole; the rest is lost within bounds; the log opens after recover."""
+    path = cut.log()
+    last = cut.syncs[-1]
+    assert last.log == path.name
+    assert path.stat().st_size >= last.size > 0
+    report = recover(path)
+    assert report is not None
+    assert all(damage.offset >= last.size for damage in report.damage), (report.damage, last)
+    recovered = path.with_suffix(".recovered.mcap")
+    assert [len(session.damage) for session in open_logs([recovered])] == [0]
+    assert aircraft.numbers([recovered]) == aircraft.numbers([path])
+    path.with_suffix(".recovered.mcap").unlink()
+    lost_s = cut.lost_s()
+    assert lost_s <= cut.bound_s()
+    return {"synced_bytes": last.size, "file_bytes": path.stat().st_size, "lost_s": lost_s, "bound_s": cut.bound_s()}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cuts")
+
+
+@pytest.mark.parametrize(
+    "number",
+    [*range(CUTS), *(pytest.param(number, marks=pytest.mark.long) for number in range(CUTS, CUTS_LONG))],
+)
+def test_what_was_durable_is_there(place: Path, number: int, record_property: Callable[[str, object], None]) -> None:
+    moments = random.Random(number)
+    figures = check(fly_and_cut(place / str(number), place / "disk", moments.uniform(1.0, 5.0)))
+    for name, value in figures.items():
+        record_property(name, value)
+
+
+def test_without_sync_more_is_lost(place: Path) -> None:
+    """The control: were it the same without, the machine would not lose what a computer loses."""
+    cut = fly_and_cut(place / "control", place / "disk", 6.0, syncs=False)
+    logs = list(cut.logs.glob("*.mcap"))
+    assert not logs or logs[0].stat().st_size == 0 or cut.lost_s() > FSYNC_S + CHUNK_OPEN_S + 1.0
+
+
+def test_recording_begins_by_itself_and_the_repair_follows(place: Path) -> None:
+    disk, folder = place / "disk", place / "again"
+    cut = fly_and_cut(folder, disk, 3.0)
+    old = cut.log()
+    overlay, qemu = folder / "overlay", [*machine.disk(disk), *aircraft.null_modem(folder)]
+    with machine.start(
+        machine.SERVE,
+        shared=folder / "vm2",
+        systemd=True,
+        overlay=overlay,
+        layers=with_udev(),
+        qemu=qemu,
+        timeout_s=900,
+    ) as second:
+        second.until(f"ls {aircraft.LOGS}/{old.stem}.recovered.mcap", 400)
+        second.told("systemctl is-active swathd")
+        assert second.told("systemctl show -P NRestarts swathd") == "0"
+        second.told("systemctl stop swathd; sync", 200)
+        second.kill()
+    machine.replay_journal(disk)
+    machine.copy_from_disk(disk, LOGS_ON_DISK, folder / "after")
+    after = folder / "after"
+    assert (after / old.name).read_bytes()[: old.stat().st_size] == old.read_bytes()
+    assert aircraft.numbers([after / f"{old.stem}.recovered.mcap"]) == aircraft.numbers([old])
+    (new,) = (path for path in after.glob("*.mcap") if not path.name.startswith(old.stem))
+    codes = re.findall(rb'"code":"(\w+)"', b"".join(raw_events(new)))
+    assert codes.index(b"session_started") < codes.index(b"log_repaired")
+
+
+def raw_events(path: Path) -> list[bytes]:
+    """The events of a log, as they stand in it."""
+    batches = (batch for session in open_logs([path]) for batch in session.batches())
+    return [row.tobytes() for batch in batches if batch.channel.topic == "/events" for row in batch.units]

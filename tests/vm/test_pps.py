@@ -1,0 +1,90 @@
+"""PPS of the kernel: simulated edges that go wrong, and a receiver at a real 16550 with its pulse on DCD."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.log_check import LogContent, read_log
+from tests.vm.aboard_time import second_told
+from tests.vm.crew import GnssReceiver, aboard, embark, facts
+from tests.vm.machine import DCD_SHIM, MODULES
+from tests.vm.seconds import labelled, states_between, wrong_seconds
+
+SECOND_NS = 1_000_000_000
+
+
+def test_pps_seconds_are_never_wrong_whatever_befalls_the_edges(tmp_path: Path) -> None:
+    aboard(tmp_path, "aboard_time", "edges", MODULES / "pps_sim.ko", seconds=90)
+    told = facts(tmp_path, "told")
+    content = read_log(tmp_path / "logs")
+    logs = tmp_path / "logs"
+    moments = labelled(logs)
+    assert sum(moment.state == "LOCKED" for moment in moments) > 200
+    assert wrong_seconds(moments, lambda moment: moment.monotonic_ns + told["utc_minus_monotonic_ns"]) == []
+    # what the recorder itself said
+    assert "HOLDOVER" in states_between(logs, told["lost"] + 6 * SECOND_NS, told["back"])
+    assert "LOCKED" in states_between(logs, told["back"] + 2 * SECOND_NS, told["gone"])
+    assert "HOLDOVER" in states_between(logs, told["gone"] + 6 * SECOND_NS, told["returned"])
+    assert "LOCKED" in states_between(logs, told["returned"] + 2 * SECOND_NS, told["end"])
+    assert [event["source"] for event in content.events("device_lost")] == ["pps/main"]
+    assert len([event for event in content.events("device_opened") if event["source"] == "pps/main"]) == 2
+    # the kernel stamped: an edge is never where a sleeping reader would have put it
+    edges = [value for _, value in content.messages["/pps/main"]]
+    offsets = sorted(min(edge["realtime_ns"] % SECOND_NS, -edge["realtime_ns"] % SECOND_NS) for edge in edges)
+    assert offsets[len(offsets) // 2] < 5_000_000
+
+
+@contextmanager
+def at_serial_port(folder: Path, kind: str, seconds: float) -> Iterator[GnssReceiver]:
+    """A machine whose second serial line a receiver is wired to, to its good end."""
+    folder.mkdir(exist_ok=True)
+    with GnssReceiver(folder / "dcd") as receiver:
+        wired = ["-chardev", f"serial,id=gnss,path={receiver.port}", "-device", "isa-serial,chardev=gnss,index=1"]
+        environment = {"LD_PRELOAD": str(DCD_SHIM), "DCD_FILE": str(folder / "dcd")}
+        machine = embark(
+            folder, "aboard_time", "serial", kind, seconds, qemu=wired, environment=environment, seconds=seconds + 20
+        )
+        with machine:
+            yield receiver
+            machine.wait().check()
+
+
+def assert_pulses_are_named(logs: Path, pulses_utc_s: list[int]) -> None:
+    """Every pulse while recording is an edge, and the second told is that of the world outside.
+
+    The emulated port looks at DCD every 10 ms only: too uneven for LOCKED, so the second counts in COARSE too. The
+    machine's wall clock is the outside's to some 0.1 s, and is told to nobody: the recorder has it from NMEA.
+    """
+    content = read_log(logs)
+    edges = [value for _, value in content.messages["/pps/main"] if value["edge"] == "assert"]
+    seconds = [round(edge["realtime_ns"] / SECOND_NS) for edge in edges]
+    assert len(seconds) >= 15
+    assert seconds == list(range(seconds[0], seconds[0] + len(seconds)))
+    assert set(seconds) <= set(pulses_utc_s)
+    assert [edge["sequence"] - edges[0]["sequence"] for edge in edges] == list(range(len(edges)))
+    assert last_losses(content, "pps/main") == last_losses(content, "gnss/rover") == [0, 0, 0]
+    told = [line for line in content.data("gnss/rover").splitlines() if line.startswith(b"$GPZDA")]
+    expected = [line for second in pulses_utc_s for line in second_told(second).splitlines() if b"ZDA" in line]
+    assert expected.index(told[1]) + len(told) - 1 <= len(expected)
+    assert told[1:] == expected[expected.index(told[1]) :][: len(told) - 1]  # the first may be cut
+    clock = content.messages["/clock"][0][1]
+    moments = labelled(logs)
+    assert len(moments) > 100
+    errors = [moment.utc_ns - moment.monotonic_ns - clock["realtime_ns"] + clock["monotonic_ns"] for moment in moments]
+    assert max(abs(error) for error in errors) < 0.5 * SECOND_NS
+
+
+def last_losses(content: LogContent, source: str) -> list[int]:
+    status = content.messages[f"/status/{source}"][-1][1]
+    return [status[key] for key in ("lost_kernel", "lost_queue", "lost_write")]
+
+
+@pytest.mark.parametrize("kind", ["ldisc", "dcd"])
+def test_pps_on_dcd_of_a_16550_with_nmea_on_the_same_port(tmp_path: Path, kind: str) -> None:
+    with at_serial_port(tmp_path, kind, 25.0) as receiver:
+        pass
+    assert_pulses_are_named(tmp_path / "logs", receiver.pulses_utc_s)

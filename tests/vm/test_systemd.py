@@ -1,0 +1,218 @@
+"""The installed service under a real systemd: one machine from start to shutdown, each promise on the way."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.log_check import official_counts, read_log
+from tests.vm import aircraft, machine
+from tests.vm.installed import installed, with_udev
+from tests.vm.machine import Machine
+
+SERVICES = ("swathd.service", "swath-live.service")
+LOGS = aircraft.LOGS
+DISK_MB = 256
+COMES_BACK_S = 400.0  # measures nothing
+KILLS = 20
+SESSION = "split_minutes = 1440\n"
+RULES = 'SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"\n'
+USB = ["-device", "qemu-xhci", "-chardev", "null,id=ftdi", "-device", "usb-serial,chardev=ftdi,serial=FT4XYZ12"]
+
+# the sandbox of a unit around another program, which must not be taken for the service
+_OTHERWISE = {
+    "Type": "oneshot",
+    "Restart": "no",
+    "WatchdogSec": "0",
+    "RuntimeDirectory": "probe",
+    "ExecStart": "/usr/bin/python3 /usr/local/lib/probe.py",
+}
+
+
+def probing_unit(unit: str) -> str:
+    """A unit as it is installed, its sandbox around the probe."""
+    lines = (installed() / f"usr/lib/systemd/system/{unit}").read_text().splitlines()
+    gone = ("ExecStartPre", "ExecReload", "BindsTo", "PartOf", "After", "Wants", "NotifyAccess", "RestartPrevent")
+    kept = [line for line in lines if not line.startswith(gone)]
+    changed = [next((f"{k}={v}" for k, v in _OTHERWISE.items() if line.startswith(f"{k}=")), line) for line in kept]
+    return "\n".join(changed) + "\n"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("service")
+
+
+@pytest.fixture(scope="module")
+def service(place: Path) -> Iterator[Machine]:
+    """The aircraft's computer; the receiver on its serial port is silent for as long as it runs."""
+    overlay = aircraft.aboard(place / "overlay", session=SESSION, enabled=SERVICES)
+    (overlay / "usr/local/lib/probe.py").write_bytes((machine.GUEST / "probe.py").read_bytes())
+    for unit in SERVICES:
+        (overlay / f"etc/systemd/system/probe-{unit}").write_text(probing_unit(unit))
+    rules = overlay / "etc/udev/rules.d/91-aircraft.rules"
+    rules.parent.mkdir(parents=True)
+    rules.write_text(RULES)
+    disk = machine.make_disk(place / "disk", DISK_MB)
+    qemu = [*machine.disk(disk), *aircraft.null_modem(place), *USB]
+    running = machine.start(
+        machine.SERVE,
+        shared=place / "vm",
+        systemd=True,
+        overlay=overlay,
+        layers=with_udev(),
+        qemu=qemu,
+        memory_mb=1536,
+        timeout_s=3600,
+    )
+    with running:
+        running.until("systemctl is-active swathd", COMES_BACK_S)
+        sensors = f"chrt -f 20 /usr/bin/python3 {aircraft.SENSORS} /vm --udp 2368:300 --can vcan0:100"
+        running.told(f"systemd-run -q --unit=sensors-fly {sensors}")
+        yield running
+
+
+def shown(service: Machine, name: str, unit: str = "swathd") -> str:
+    """A property of a unit."""
+    return service.told(f"systemctl show --timestamp=us+utc -P {name} {unit}")
+
+
+def newest_log(service: Machine) -> str:
+    """The name of the log that grows."""
+    name: str = json.loads(service.told(f"cat {LOGS}/recording.json"))["path"]
+    return name
+
+
+def fetched(service: Machine, place: Path) -> Path:
+    """A copy of the logs as they are, on the host."""
+    service.told(f"rm -rf /vm/logs; mkdir /vm/logs; cp {LOGS}/*.mcap /vm/logs/")
+    return place / "vm/logs"
+
+
+def test_both_services_are_enabled_and_started_at_boot(service: Machine) -> None:
+    assert service.told("cat /proc/1/comm") == "systemd"
+    assert service.told("systemctl is-enabled swathd swath-live").split() == ["enabled", "enabled"]
+    assert shown(service, "ActiveState") == "active"
+    assert shown(service, "User") == "swath"
+    assert service.told("systemctl show -P ActiveState swath-live") in ("activating", "active")
+
+
+def test_ready_is_said_after_recording_has_begun(service: Machine) -> None:
+    _, day, time_of_day, _ = shown(service, "ActiveEnterTimestamp").split()
+    ready = dt.datetime.fromisoformat(f"{day}T{time_of_day}+00:00")
+    begun = service.told(f"stat -c %.6W {LOGS}/{newest_log(service)}")
+    assert shown(service, "NRestarts") == "0"
+    assert float(begun) < ready.timestamp()
+    assert shown(service, "StatusText").startswith("recording flight-")
+
+
+def test_devices_have_their_names_and_rights(service: Machine) -> None:
+    service.until("ls /dev/rover")
+    assert service.told("stat -Lc '%G %a' /dev/pps0 /dev/rover").splitlines() == ["dialout 660"] * 2
+    name = Path(service.told("readlink -f /dev/rover")).name
+    assert service.told(f"cat /sys/bus/usb-serial/devices/{name}/latency_timer") == "1"
+    command = "modprobe dummy_hcd && modprobe g_serial idVendor=0x1546 idProduct=0x01a9 iSerialNumber=UBX7"
+    service.told(command)
+    service.until("ls /dev/gnss/ublox-UBX7")
+    assert service.told("stat -Lc %G /dev/gnss/ublox-UBX7") == "dialout"
+
+
+@pytest.mark.parametrize("unit", SERVICES)
+def test_sandbox_denies_what_it_should(service: Machine, unit: str) -> None:
+    service.told(f"install -d -o swath -g swath {LOGS}/live; systemctl start probe-{unit}", COMES_BACK_S)
+    found = json.loads(service.told(f"journalctl --sync; journalctl -b -o cat -t python3 -u probe-{unit} | tail -1"))
+    recorder = unit == "swathd.service"
+    allowed = {"unix", "live", "the configuration"}
+    if recorder:
+        allowed |= {"udp", "udp ipv6", "can", "/dev/pps0", "/dev/ttyS1", "the log directory", "real time"}
+        allowed |= {"reading the clock's discipline"}
+    else:
+        allowed |= {"memory that is written and run"}
+    assert {name for name, told in found.items() if told is True} == allowed, found
+
+
+def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
+    service.until("systemctl show -P StatusText swathd | grep 'gnss/rover no data yet'")
+    pid = shown(service, "MainPID")
+    service.told("sleep 25")
+    assert shown(service, "MainPID") == pid
+    assert shown(service, "NRestarts") == "0"
+
+
+@pytest.mark.parametrize("thread", ["scanner/left", "writer"])
+def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place: Path, thread: str) -> None:
+    """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
+    old, pid = newest_log(service), shown(service, "MainPID")
+    stem, fired = Path(old).stem, "journalctl -b -u swathd | grep -c 'Watchdog timeout'"
+    before = int(service.shell(fired).output)
+    stop = f"/usr/bin/python3 {machine.GUEST}/stop_thread.py"
+    service.told(f"systemd-run -q --collect {stop} {pid} {thread}")
+    service.until(f"[ $(systemctl show -P MainPID swathd) != {pid} ] && systemctl is-active swathd", COMES_BACK_S)
+    assert int(service.told(fired)) == before + 1
+    assert newest_log(service) != old
+    service.until(f"ls {LOGS}/{stem}.recovered.mcap", COMES_BACK_S)
+    service.until("systemctl show -P StatusText swathd | grep ^recording", COMES_BACK_S)
+    logs = fetched(service, place)
+    content = read_log(logs / newest_log(service))
+    codes = [event["code"] for _, event in content.messages["/events"]]
+    assert codes.index("session_started") < codes.index("log_repaired")
+    assert official_counts(logs / f"{stem}.recovered.mcap")["/scanner/left/raw"] > 0
+
+
+def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
+    old = newest_log(service)
+    service.told("sleep 3; systemctl reload swathd")
+    service.until(f"! grep -q {old} {LOGS}/recording.json")
+    new = newest_log(service)
+    assert new.rpartition("_")[0] == old.rpartition("_")[0]
+    assert int(new.removesuffix(".mcap").rpartition("_")[2]) == int(old.removesuffix(".mcap").rpartition("_")[2]) + 1
+    service.told("sleep 3")
+    logs = fetched(service, place)
+    found = aircraft.numbers([logs / old, logs / new])
+    for kind in ("udp", "can"):
+        assert found[kind] == list(range(found[kind][0], found[kind][-1] + 1)), kind
+
+
+def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: Machine, place: Path) -> None:
+    pid, moments = shown(service, "MainPID"), random.Random(20)
+    first = newest_log(service)
+    for _ in range(KILLS):
+        running = "systemctl show -P ControlPID -P MainPID swath-live | grep -q '[1-9]'"
+        service.until(running, COMES_BACK_S)
+        service.told(f"sleep {moments.uniform(0, 3):.2f}; systemctl kill --kill-who=all -s KILL swath-live || true")
+    assert shown(service, "MainPID") == pid
+    assert newest_log(service) == first
+    service.told("sleep 2")
+    found = aircraft.numbers([fetched(service, place) / first])
+    for kind in ("udp", "can"):
+        assert found[kind] == list(range(found[kind][0], found[kind][-1] + 1)), kind
+
+
+def test_a_full_disk_ends_the_part_and_room_begins_another(service: Machine, place: Path) -> None:
+    old = newest_log(service)
+    free = f"$(( $(stat -fc '%a * %S' {LOGS}) ))"
+    service.told(f"fallocate -l $(( {free} - 15000000 )) {LOGS}/filler")
+    service.until("systemctl show -P StatusText swathd | grep '^NOT RECORDING'", COMES_BACK_S)
+    service.told("systemctl is-active swathd")
+    service.told(f"cp {LOGS}/{old} /vm/full.mcap; rm {LOGS}/filler")
+    assert official_counts(place / "vm/full.mcap")["/scanner/left/raw"] > 0  # it has its end
+    service.until("systemctl show -P StatusText swathd | grep ^recording", COMES_BACK_S)
+    assert newest_log(service) != old
+
+
+def test_shutdown_ends_the_log(service: Machine, place: Path) -> None:
+    last = newest_log(service)
+    restarts = int(shown(service, "NRestarts"))
+    service.shell("systemctl --no-block poweroff")
+    service.qemu.wait(COMES_BACK_S)
+    machine.copy_from_disk(place / "disk", "/", place / "after")
+    content = read_log(place / "after" / last)
+    assert content.damage == 0
+    assert content.events("session_ended")
+    assert official_counts(place / "after" / last)["/events"] == len(content.messages["/events"])
+    assert restarts == 2  # the two of the watchdog
