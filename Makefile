@@ -6,6 +6,7 @@ JOBS ?= 3
 SECONDS ?= 600
 MINUTES ?= 60
 RATE ?= 0.1
+SEEDS ?= 5
 PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
 
 DESTDIR ?=
@@ -16,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long soak-short fuzz lint ready bench install uninstall clean
+.PHONY: help demo test test-peers test-long soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -26,8 +27,14 @@ demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through rea
 
 test: $(VENV)/.tests $(VENV)/.tools ## install and run everything: style, types, import rules, tests
 	@$(MAKE) --no-print-directory -j 2 --output-sync=target lint ready
-	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone"
+	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone and not peers"
 	$(PYTEST) -n 0 -m "alone and not long"
+
+test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it installs (root, apt, npm)
+	@command -v gpsd >/dev/null || apt-get install -qy --no-install-recommends gpsd
+	@command -v npm >/dev/null || apt-get install -qy --no-install-recommends nodejs npm
+	npm ci --silent --no-audit --no-fund --prefix tests/peers
+	$(PYTEST) -n 0 -m peers
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long
@@ -53,6 +60,9 @@ ready: $(VENV)/.tests
 
 bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit
 	$(BIN)/python -m benchmarks
+
+bench-calibration: $(VENV)/.tests ## five whole calibration flights from their logs alone, truth known, about 40 min (SEEDS=)
+	$(BIN)/python -m benchmarks.calibration_accuracy --seeds $(SEEDS)
 
 install: ## install the service (root; DESTDIR= and PREFIX= are honoured)
 	@DESTDIR="$(DESTDIR)" PREFIX="$(PREFIX)" sh systemd/install.sh install
