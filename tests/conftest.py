@@ -43,8 +43,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One worker for tests that share what is made once: a fixture of their file, or loops that are to be compiled.
 
-    `make test` compiles most loops beforehand. What is left is compiled once for georef and once for sim; tests of
-    whole commands find it there, or compile the same beside them.
+    `make test` compiles most loops beforehand, those of calib all. What is left is compiled once for georef and once
+    for sim; tests of whole commands find it there, or compile the same beside them.
     """
     for item in items:
         marker = item.get_closest_marker("xdist_group")
@@ -52,7 +52,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
         elif marker is not None and marker.args == ("kernels",):
             folder = item.path.parent.name
-            group = item.path.stem if folder == "daemon" else f"kernels of {folder}"
+            group = item.path.stem if folder in ("daemon", "calib") else f"kernels of {folder}"
             item.add_marker(pytest.mark.xdist_group(group))
 
 

@@ -93,11 +93,11 @@ def test_bare_install_imports_all_packages_and_nothing_of_processing(installed: 
 
 
 def wants_an_extra(name: str) -> bool:
-    """Whether a module imports what only an extra brings: compiled loops, the virtual aircraft, and processing."""
+    """Whether a module imports what only an extra brings: compiled loops, the virtual aircraft, processing."""
     package, _, module = name.partition(".")
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    return name == "drivers.compiled.rows" or name.startswith(("sim.", "daemon.processing."))
+    return name == "drivers.compiled.rows" or name.startswith(("sim.", "calib.", "daemon.processing."))
 
 
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:

@@ -225,7 +225,7 @@ def test_commands_named_in_the_pages_exist() -> None:
 
 def test_make_help_lists_every_target() -> None:
     listed = {line.split()[1] for line in run("make", "help").stdout.splitlines()}
-    tests = {"test", "test-long", "soak-short", "fuzz", "lint", "bench"}
+    tests = {"test", "test-peers", "test-long", "soak-short", "fuzz", "lint", "bench", "bench-calibration"}
     assert listed == {"help", "demo", "install", "uninstall", "clean"} | tests
 
 
