@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,20 +34,27 @@ class ClockPair:
         return self.realtime_ns - self.monotonic_ns
 
 
-def read_clock_pair() -> ClockPair:
-    """The tightest of a few bracketed readings, so that a preempted one does not look like a step."""
-    best: ClockPair | None = None
+def _bracketed(read: Callable[[], int]) -> tuple[int, int, int]:
+    """Another clock's time, MONOTONIC at that instant and how far apart the reads around it were, in nanoseconds.
+
+    The tightest of a few readings, so that a preempted one does not look like a step.
+    """
+    best: tuple[int, int, int] | None = None
     for _ in range(_BRACKET_TRIES):
         before = time.monotonic_ns()
-        realtime = time.time_ns()
+        value = read()
         after = time.monotonic_ns()
-        pair = ClockPair(realtime, (before + after) // 2, after - before)
-        if best is None or pair.width_ns < best.width_ns:
-            best = pair
-        if best.width_ns <= _BRACKET_NS:
+        if best is None or after - before < best[2]:
+            best = value, (before + after) // 2, after - before
+        if best[2] <= _BRACKET_NS:
             break
     assert best is not None
     return best
+
+
+def read_clock_pair() -> ClockPair:
+    """REALTIME beside MONOTONIC, by the tightest of a few readings."""
+    return ClockPair(*_bracketed(time.time_ns))
 
 
 class HostClock:
@@ -177,13 +185,15 @@ def read_clock_discipline() -> ClockDiscipline:
     return ClockDiscipline(timex.freq / _FREQ_PPM_SCALE, int(timex.status), timex.maxerror * 1e-6)
 
 
+def _read_raw_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+
+
 def read_clock_sample(discipline: ClockDiscipline) -> dict[str, int | float]:
     """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status."""
     pair = read_clock_pair()
-    before = time.monotonic_ns()
-    raw = time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
-    after = time.monotonic_ns()
-    shift = (before + after) // 2 - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
+    raw, at_ns, _ = _bracketed(_read_raw_ns)
+    shift = at_ns - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
     return {
         "realtime_ns": pair.realtime_ns,
         "monotonic_ns": pair.monotonic_ns,

@@ -12,13 +12,10 @@ from rich.console import Console
 from daemon.wire_player import Output, PlayReport
 from demo.proof import Hashed, prove
 from tests.daemon.log_check import LogContent, read_log
+from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).resolve().parent.parent
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.timeout(400),
-    pytest.mark.xdist_group("demo"),
-]  # it is played once, by one worker
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("demo")]  # it is played once, by one worker
 SOURCES = {
     "recordings": ("gnss/rover", "imu/main", "scanner/top", "scanner/top/aux"),
     "flight": ("gnss/rover", "imu/main", "scanner/left"),
@@ -40,7 +37,7 @@ class Nowhere(Output):
 def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     folder = tmp_path_factory.mktemp("demo")
     command = [sys.executable, "-m", "demo", "--seconds", "20", "--flight-seconds", "20", "--keep", str(folder)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout, folder
 

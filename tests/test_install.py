@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.daemon.rig import HANGS_S
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
 PROCESSING_ONLY = ("numba", "scipy", "pyproj", "laspy", "matplotlib")
@@ -25,14 +27,14 @@ PLACED = {
     "usr/local/bin/swath",
 }
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 
 
 def make(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run make in the project's folder."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "DESTDIR", "PREFIX"))}
     command = ["make", "-s", *arguments]
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280, check=False)
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=False)
 
 
 def files_below(folder: Path) -> set[str]:
@@ -67,7 +69,7 @@ def python_for_services() -> list[str]:
 def run_installed(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the installed program's Python, away from the source tree."""
     command = [str(root / "opt/swath/bin/python"), "-I", *arguments]
-    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=200, check=False)
+    return subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=HANGS_S, check=False)
 
 
 def test_every_file_is_in_its_place_and_no_other(installed: Path) -> None:
@@ -169,7 +171,7 @@ def install_files(root: Path, prefix: str) -> str:
     """Everything but the program, which takes longest; returns what the installer said."""
     environment = os.environ | {"DESTDIR": str(root), "PREFIX": prefix}
     command = ["sh", str(ROOT / "systemd/install.sh"), "files"]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200, check=True).stdout
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=True).stdout
 
 
 def test_another_prefix_reaches_the_unit(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from daemon.processing.warm_calibration import warm_calibration
 from georef.calibration import read_calibration
 from tests.calib.village import Made, village
 
-pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
 ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
 

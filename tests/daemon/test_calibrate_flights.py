@@ -10,7 +10,7 @@ from daemon.cli.main import run_app
 from georef.calibration import INDEX, PARAMETERS, Calibration, read_calibration
 from tests.calib.village import TRUE, Made, village
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(3000)]
 
 MORE = {"scan_angle_scale_ppm": 300.0, "time_offset_us": 1500.0, "encoder_latency_us": 2.0}
 NAMES = ("scan_angle_scale", "time_offset_s", "encoder_latency_s")

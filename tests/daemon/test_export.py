@@ -30,7 +30,7 @@ from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
 from tests.daemon.exchange import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
-from tests.daemon.rig import Recorder, free_udp_port, one_processor, session_table
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_log import doctor
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
@@ -388,6 +388,6 @@ def peak_kib(*arguments: object) -> int:
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     words = [sys.executable, "-c", code, *map(str, arguments)]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 0, done.stderr
     return int(done.stdout.splitlines()[-1])

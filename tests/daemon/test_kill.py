@@ -207,7 +207,6 @@ def numbers_in(path: Path) -> dict[str, list[int]]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.timeout(400)
 def test_killed_at_a_hundred_random_moments(server: ForkServer, bystander: Bystander, tmp_path: Path) -> None:
     rng = random.Random(20261121)
     moments = [rng.uniform(0.05, 2.0) for _ in range(KILLS)]

@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 from daemon.log.format import LogError
 from daemon.log.reader import open_logs
 from daemon.log.recover import examine, recover
-from tests.daemon.rig import free_udp_port, session_table
+from tests.daemon.rig import HANGS_S, free_udp_port, session_table
 from tests.daemon.test_log import INFO, START_NS, official
 from tests.fuzz import mcap_parts as mcap
 
@@ -245,7 +245,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=HANGS_S,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -267,7 +267,6 @@ def _files(folder: Path) -> set[Path]:
     return {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("name", FILES)
 def test_it_is_read_or_refused_in_few_words_and_little_memory(

@@ -18,7 +18,7 @@ from daemon.processing.log_index import index_log, read_chunks
 from georef.strips import Segment
 from tests.daemon.one_line import Flown, fly
 
-pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import numba
 import pytest
 
 from daemon.processing.warm_up import WarmUp, cache_folder, compilations
+from tests.daemon.rig import HANGS_S
 from tests.daemon.test_cli import ROOT, swath
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -67,11 +68,10 @@ print(cache_folder(), grid.points, fill(made, returns_table(made.content.size)) 
 def run_python(text: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", text, *(str(argument) for argument in arguments)]
     return subprocess.run(
-        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False
+        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=HANGS_S, check=False
     )
 
 
-@pytest.mark.timeout(400)
 def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path) -> None:
     """The first pulse costs what the thousandth does: neither compiling nor reading what was compiled before."""
     done = run_python(FLY, tmp_path)
