@@ -34,7 +34,9 @@ def make(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run make in the project's folder."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "DESTDIR", "PREFIX"))}
     command = ["make", "-s", *arguments]
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=False)
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=False
+    )
 
 
 def files_below(folder: Path) -> set[str]:
