@@ -2,7 +2,8 @@
 
 The wait cannot be ended from outside, neither by closing the port nor by a time limit. It is therefore made in a
 thread of its own, which owns its descriptor and ends with the next edge or with the device; `close` lets it go and
-returns at once. Stamps are 40 to 60 µs late and more on a busy machine: a kernel PPS (``ldattach PPS``) is better.
+returns at once. Who sets the line of such a port says so (`line_set`): the driver of a 16550 then no longer reports
+DCD to those who wait already, only to those who begin to. Stamps are 40 to 60 µs late and more on a busy machine: a kernel PPS (``ldattach PPS``) is better.
 """
 
 from __future__ import annotations
@@ -16,12 +17,23 @@ import sys
 import termios
 import threading
 import time
+from collections import Counter
 
 from drivers.transports.base import PpsSource, RawEdge, TransportError
 
 _TIOCMIWAIT = 0x545C  # <asm-generic/ioctls.h>
 _TIOCGICOUNT = 0x545D
 _ICOUNTER_DCD = struct.Struct("@12xi64x")  # field dcd of struct serial_icounter_struct, <linux/serial.h>
+_lines_set: Counter[int] = Counter()  # by device number: how often its line was set by this process
+
+
+def line_set(fd: int) -> None:
+    """Say that a port's line has just been set: whoever waits for its DCD begins anew.
+
+    tcsetattr(3) turns a 16550's modem status interrupt off (`serial8250_do_set_termios`), and only the beginning of a
+    TIOCMIWAIT turns it on (`uart_wait_modem_status`).
+    """
+    _lines_set[os.fstat(fd).st_rdev] += 1
 
 
 class SerialDcdPps(PpsSource):
@@ -50,6 +62,9 @@ class SerialDcdPps(PpsSource):
         except OSError as error:
             os.close(fd)
             raise TransportError(self._why(error)) from error
+        self._begin(fd, changes)
+
+    def _begin(self, fd: int, changes: int) -> None:
         self._watch = _Watch(fd, changes)
         threading.Thread(target=self._watch.run, name=f"dcd {self._path}", daemon=True).start()
 
@@ -68,6 +83,8 @@ class SerialDcdPps(PpsSource):
         watch = self._watch
         if watch is None:
             raise TransportError(f"serial-dcd:{self._path}: is closed")
+        if watch.is_deaf() and watch.edges.empty():
+            self._wait_anew(watch)
         try:
             item = watch.edges.get(timeout=max(timeout_s, 0.0)) if timeout_s > 0 else watch.edges.get_nowait()
         except queue.Empty:
@@ -75,6 +92,15 @@ class SerialDcdPps(PpsSource):
         if isinstance(item, OSError):
             raise TransportError(self._why(item)) from item
         return [item] if item is not None and item.edge == self._edge else []
+
+    def _wait_anew(self, watch: _Watch) -> None:
+        """Another thread waits instead; the old one ends with the next edge."""
+        try:
+            fd = os.dup(watch.fd)
+        except OSError:  # it has ended, with an error that comes next
+            return
+        watch.stopped.set()
+        self._begin(fd, watch.changes)
 
     def close(self) -> None:
         """Let the waiting thread go; a `receive` under way returns."""
@@ -88,24 +114,35 @@ class _Watch:
     """The thread that waits, and its descriptor."""
 
     def __init__(self, fd: int, changes: int) -> None:
-        self._fd = fd
-        self._changes = changes
+        self.fd = fd
+        self.changes = changes
+        self._device = os.fstat(fd).st_rdev
+        self._line = _lines_set[self._device]
+        self._ended = False
         self.stopped = threading.Event()
         self.edges: queue.SimpleQueue[RawEdge | OSError | None] = queue.SimpleQueue()
+
+    def is_deaf(self) -> bool:
+        """Whether the line was set since it began to wait."""
+        return not self._ended and _lines_set[self._device] != self._line
 
     def run(self) -> None:
         try:
             while not self.stopped.is_set():
-                fcntl.ioctl(self._fd, _TIOCMIWAIT, termios.TIOCM_CAR)
+                self._line = _lines_set[self._device]
+                fcntl.ioctl(self.fd, _TIOCMIWAIT, termios.TIOCM_CAR)
                 realtime_ns = time.clock_gettime_ns(time.CLOCK_REALTIME)
-                changes = _dcd_changes(self._fd)
-                edge, sequence = edge_at_wake_up(self._changes, changes, _carrier(self._fd))
-                self._changes = changes
+                if self.stopped.is_set():
+                    break
+                changes = _dcd_changes(self.fd)
+                edge, sequence = edge_at_wake_up(self.changes, changes, _carrier(self.fd))
+                self.changes = changes
                 self.edges.put(RawEdge(realtime_ns, sequence, edge, kernel_stamp=False))
         except OSError as error:
+            self._ended = True
             self.edges.put(error)
         finally:
-            os.close(self._fd)
+            os.close(self.fd)
 
 
 def edge_at_wake_up(changes_before: int, changes: int, carrier: bool) -> tuple[str, int]:

@@ -20,6 +20,7 @@ import serial
 from drivers.transports.base import TransportError, UnitBlock
 from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate, wait_writable
 from drivers.transports.holders import process_holding
+from drivers.transports.pps_dcd import line_set
 from drivers.transports.uri import TransportSpec
 
 DEFAULT_BAUD = 115200
@@ -88,6 +89,7 @@ class SerialTransport(DescriptorTransport):
         except termios.error as error:
             port.close()
             raise TransportError(f"{self.name}: cannot set the line: {error.args[-1]}") from error
+        line_set(self._fd)
         self._errors_at_open = self._line_errors()
 
     def _why_not_opened(self, error: BaseException) -> str:
