@@ -3,7 +3,8 @@
 The wait cannot be ended from outside, neither by closing the port nor by a time limit. It is therefore made in a
 thread of its own, which owns its descriptor and ends with the next edge or with the device; `close` lets it go and
 returns at once. Who sets the line of such a port says so (`line_set`): the driver of a 16550 then no longer reports
-DCD to those who wait already, only to those who begin to. Stamps are 40 to 60 µs late and more on a busy machine: a kernel PPS (``ldattach PPS``) is better.
+DCD to those who wait already, only to those who begin to. Stamps are 40 to 60 µs late and more on a busy machine: a
+kernel PPS (``ldattach PPS``) is better.
 """
 
 from __future__ import annotations
