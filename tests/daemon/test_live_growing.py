@@ -18,6 +18,7 @@ from daemon.config.tables import LiveConfig
 from daemon.log.reader import open_logs
 from daemon.processing.live import Told, replay
 from daemon.processing.setup import Options, Setup
+from daemon.processing.warm_up import warm_up
 from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_live import PLAN
@@ -51,6 +52,7 @@ def config_of(wires: Path, folder: Path) -> str:
 
 def test_points_made_while_it_is_recorded_are_those_of_the_replay(tmp_path: Path) -> None:
     """Over part changes, to the last byte; nothing is skipped, and it says how far it is behind."""
+    warm_up([])  # else the command compiles before it follows anything, and says so
     logs, points, said, plan = (tmp_path / name for name in ("logs", "points.npy", "said", "plan.toml"))
     logs.mkdir()
     plan.write_text(PLAN.replace("rate_hz = 1\n", "rate_hz = 20\n"))
