@@ -8,6 +8,7 @@ import socket
 import struct
 import time
 from array import array
+from pathlib import Path
 
 from tests.vm.aboard import SHARED, TREE, Recorder, keep, main, recording, say, session, sh, wait_until
 
@@ -78,16 +79,23 @@ def sample_frames(number: int, period_us: int) -> list[bytes]:
     return [FRAME.pack(identifier, len(data), data) for identifier, data in contents]
 
 
-def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0) -> array[int]:
-    """Samples in real time; times (CLOCK_MONOTONIC, ns) before and after each frame of the first bus, by turns."""
+def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0, to: str = "") -> array[int]:
+    """Samples in real time; times (CLOCK_MONOTONIC, ns) before and after each frame of the first bus, by turns.
+
+    A controller at the other end (``to``) holds five frames, whose interrupts an emulated processor serves late now
+    and then: the next sample waits until it has them all.
+    """
     frames = [sample_frames(number, 1_000_000 // rate_hz) for number in range(first, first + count)]
     times = array("q")
     begin_ns = time.monotonic_ns()
+    there = received(to) if to else 0
     for number, sample in enumerate(frames):
         due_ns = begin_ns + number * 1_000_000_000 // rate_hz
         left_ns = due_ns - time.monotonic_ns()
         if left_ns > 0:
             time.sleep(left_ns * 1e-9)
+        while to and received(to) < there + len(sample) * number:
+            time.sleep(0.001)
         for frame in sample:
             times.append(time.monotonic_ns())
             buses[0].send_frame(frame)
@@ -95,6 +103,11 @@ def send_samples(buses: list[Bus], rate_hz: int, count: int, first: int = 0) -> 
             for bus in buses[1:]:
                 bus.send_frame(frame)
     return times
+
+
+def received(channel: str) -> int:
+    """Frames that an interface has handed on."""
+    return int(Path(f"/sys/class/net/{channel}/statistics/rx_packets").read_text())
 
 
 def listening(recorder: Recorder, times: int = 1) -> None:
@@ -181,14 +194,14 @@ def controllers(seconds: str) -> None:
     with recording(session() + config) as recorder:
         listening(recorder, 2)
         count = 200 * int(seconds)
-        send_samples([Bus("can0")], 200, count)
-        send_samples([Bus("can1")], 200, count, first=count)
+        send_samples([Bus("can0")], 200, count, to="can1")
+        send_samples([Bus("can1")], 200, count, first=count, to="can0")
         time.sleep(0.5)
         sh("ip link set can0 down")
         recorder.wait_said("can0 is down")
         sh("ip link set can0 up")
         listening(recorder, 3)
-        send_samples([Bus("can1")], 200, 200, first=2 * count)
+        send_samples([Bus("can1")], 200, 200, first=2 * count, to="can0")
         time.sleep(0.5)
 
 
