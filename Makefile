@@ -17,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-peers test-long soak-short fuzz lint ready bench bench-calibration install uninstall clean
+.PHONY: help demo test test-peers test-vm test-vm-long test-long soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -35,6 +35,14 @@ test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it instal
 	@command -v npm >/dev/null || apt-get install -qy --no-install-recommends nodejs npm
 	npm ci --silent --no-audit --no-fund --prefix tests/peers
 	$(PYTEST) -n 0 -m peers
+
+test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtual machine that it installs (root, apt, alone)
+	@bash tests/vm/setup.sh
+	$(PYTEST) -n 0 -v -m "not long" tests/vm
+
+test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of flight
+	@bash tests/vm/setup.sh
+	$(PYTEST) -n 0 -v tests/vm
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long
