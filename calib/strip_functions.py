@@ -299,7 +299,9 @@ class _Choice:
     def notes(self) -> tuple[str, ...]:
         """For people."""
         name = "Schwarz's" if self._settings.criterion == "bic" else "Akaike's corrected"
-        notes = [f"models chosen by {name} information criterion; the calibration was held"]
+        models = self._settings.models
+        how = f"models chosen by {name} information criterion" if len(models) > 1 else f"all strips got {models[0]}"
+        notes = [f"{how}; the calibration was held"]
         if len(self._keys) > MOST_CHOSEN_SINGLY:
             notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}: all got the same model")
         return tuple(notes)

@@ -1,17 +1,21 @@
-"""``swath strips``: how far strips are from each other."""
+"""``swath strips``: how far strips are from each other; and their trajectory corrected, the calibration held."""
 
 from __future__ import annotations
 
 import json
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
+
+if TYPE_CHECKING:
+    from daemon.processing.flights import Wish
 
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
 
@@ -41,10 +45,22 @@ def command(
     ] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Of logs: instead of their own.")] = None,
     strips: Annotated[str, typer.Option(help="Of logs: auto, whole, or a CSV of times.")] = "auto",
+    adjust: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Correct each strip's trajectory, the calibration held.")
+    ] = None,
+    control: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="To adjust to: name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
+    ] = None,
+    strip_model: Annotated[
+        str, typer.Option("--strip-model", help="none, constant, linear, spline, or auto: chosen for each strip.")
+    ] = "auto",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an adjustment left there.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Compare strips: point to plane and gridded, what the differences look like, and what specifications say.
+
+    With --adjust: correct the trajectory of each strip instead, into files for swath georef --trajectory.
 
     Exit code 1 when the differences show an error of the calibration that matters, when the level asked for is not
     kept, or when nothing could be compared; 2 and 3 as ever.
@@ -54,9 +70,7 @@ def command(
     from daemon.config import load_config
     from daemon.processing.flights import Wish
     from daemon.processing.flown import TrajectoryWish
-    from daemon.processing.progress import progress_bar
     from daemon.processing.setup import Options
-    from daemon.processing.strips_run import StripsWish, compare_strips, most_cells
 
     if level is not None and level not in LEVELS:
         raise UserError(f'--level: got "{level}", want one of {", ".join(LEVELS)}', ExitCode.USAGE)
@@ -69,9 +83,44 @@ def command(
         strips=strips,
         workers=workers or os.cpu_count() or 1,
     )
-    wish = StripsWish(paths, logs, before or (), most_cells(cells), output, level)
+    if adjust is not None:
+        _refuse_besides(("--before", before), ("--output", output), ("--level", level))
+        _adjust(logs, adjust, control, strip_model, overwrite=overwrite, as_json=as_json)
+        return
+    if control or overwrite or strip_model != "auto":
+        named = "--control" if control else "--overwrite" if overwrite else "--strip-model"
+        raise UserError(f"{named}: is of an adjustment; want --adjust DIR too", ExitCode.USAGE)
+    _compare(logs, before or (), cells, output, level, as_json=as_json)
+
+
+def _compare(
+    logs: Wish, before: Sequence[Path], cells: int, output: Path | None, level: str | None, *, as_json: bool
+) -> None:
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.strips_run import StripsWish, compare_strips, most_cells
+
+    wish = StripsWish(logs.logs, logs, before, most_cells(cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = compare_strips(wish, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
     if done.problem:
         raise UserError(done.problem)
+
+
+def _adjust(
+    logs: Wish, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
+) -> None:
+    from daemon.processing.progress import progress_bar
+    from daemon.processing.strip_adjust_products import write_adjustment
+    from daemon.processing.strip_adjust_run import AdjustWish, correct_strips
+
+    wish = AdjustWish(logs, folder, control, strip_model, overwrite)
+    with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:
+        told = write_adjustment(wish, correct_strips(wish, Path(returns), tell), tell)
+    print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
+
+
+def _refuse_besides(*given: tuple[str, object]) -> None:
+    for option, value in given:
+        if value:
+            raise UserError(f"{option}: is of a comparison; want it without --adjust", ExitCode.USAGE)

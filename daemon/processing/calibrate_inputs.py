@@ -1,6 +1,6 @@
-"""What a user gives `swath calibrate` to look at: points picked in the strips, and polygons that planes fill.
+"""What a user gives beside the logs: surveyed control, points picked in the strips, and polygons that planes fill.
 
-Both are in the flight's coordinate system, ``output.crs``, as the strips' own points are.
+The last two are in the flight's coordinate system, ``output.crs``, as the strips' own points are.
 """
 
 from __future__ import annotations
@@ -9,13 +9,17 @@ import csv
 import io
 import math
 import re
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features
+from calib.control import in_t, read_control
+from calib.control_doubts import doubts
+from calib.features import ControlPoint, Features
+from calib.flight import Flight
 from calib.picked_points import picked_ties, read_picked
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibration_flight import KeptFlight
@@ -38,6 +42,25 @@ def text_of(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or "no text; want CSV"
         raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
+
+
+def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[tuple[ControlPoint, ...], list[str]]:
+    """Surveyed points in the flight's frame, and what is doubtful of them, a line each.
+
+    Args:
+        path: CSV as of `calib.control.read_control`.
+        flight: with its points placed as well as is known.
+        suffered: kinds of doubts about the whole (`calib.control_doubts.Doubt`) that are told only.
+
+    Raises:
+        UserError: it cannot be read, or is doubtful as a whole; ControlError: it is no such file.
+    """
+    points = in_t(read_control(text_of(path), str(path)), flight.frame)
+    found = doubts(flight, points)
+    refusing = [f"{path}: {one.text}" for one in found if one.refuses and one.kind not in suffered]
+    if refusing:
+        raise UserError(refusing[0])
+    return points, [f"{path}: {one.text}" for one in found]
 
 
 def ties_of(path: Path, kept: KeptFlight) -> Features:

@@ -65,10 +65,14 @@ class TrajectoryFiles:
             return cls(output, _smrmsg_of(output), text, output.with_suffix(".json"), output.with_suffix(".html"))
         if suffix and not output.is_dir():
             raise UserError(f"-o {output}: want a name that ends in .sbet, .out or .csv, or a folder", ExitCode.USAGE)
-        stem = output / f"{session}_trajectory"
+        return cls.in_folder(output, session, csv=csv)
+
+    @classmethod
+    def in_folder(cls, folder: Path, session: str, *, csv: bool) -> TrajectoryFiles:
+        """Files with the session's name."""
 
         def ending(suffix: str) -> Path:
-            return stem.with_name(stem.name + suffix)
+            return folder / f"{session}_trajectory{suffix}"
 
         text = ending(".csv") if csv else None
         return cls(ending(".sbet"), ending(".smrmsg"), text, ending(".json"), ending(".html"))

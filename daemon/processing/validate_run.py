@@ -8,16 +8,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib.control import ControlError, in_t, read_control
-from calib.control_doubts import doubts
-from calib.features import ControlPoint
-from calib.flight import Flight, FlightError
+from calib.control import ControlError
+from calib.flight import FlightError
 from calib.history import History, HistoryError, history
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError
 from calib.validation import Method, Validation, same_logs, validate
 from daemon.errors import ExitCode, UserError
 from daemon.log.format import LogError
+from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight
 from daemon.processing.flights import Wish
 from daemon.processing.sidecar import sha256_of
@@ -127,7 +126,7 @@ def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -
     refuse_installations(kept.logged)
     _refuse_others(wish, found, kept)
     flight = kept.flight
-    points, notes = _control(wish, flight)
+    points, notes = ((), []) if wish.control is None else control_of(wish.control, flight, ["shift"])
     told("planes", 0, 1)
     planes = find_planes(flight)
     if not planes.planes:
@@ -158,22 +157,6 @@ def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
         found.notes.append(f"{log}: {name}: no calibration named; validated along with {head.start.id}")
     if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
         raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
-
-
-def _control(wish: ValidateWish, flight: Flight) -> tuple[tuple[ControlPoint, ...], list[str]]:
-    if wish.control is None:
-        return (), []
-    try:
-        text = wish.control.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want CSV"
-        raise UserError(f"{wish.control}: cannot be read: {why}", ExitCode.IO) from error
-    points = in_t(read_control(text, str(wish.control)), flight.frame)
-    found = doubts(flight, points)
-    refusing = [f"{wish.control}: {one.text}" for one in found if one.refuses and one.kind != "shift"]
-    if refusing:
-        raise UserError(refusing[0])
-    return points, [f"{wish.control}: {one.text}" for one in found]
 
 
 def _anew(wish: ValidateWish, found: _Found, kept: KeptFlight, told: Told) -> Mapping[str, Calibration]:

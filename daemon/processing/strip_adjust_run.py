@@ -1,0 +1,237 @@
+"""`swath strips --adjust`: corrections of the trajectory, strip by strip, while the calibration is held.
+
+returns of the strips, placed with the calibration               calibration_flight
+planes, control                                                  calib.plane_search, calib.control
+corrections; planes found anew with them; corrections again      calib.strip_functions
+height differences of strips, before and after                   calib.strips
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from calib.control import ControlError, control_planes
+from calib.effects import SeenFrom
+from calib.features import ControlPoint, Features
+from calib.flight import Flight, FlightError
+from calib.normals import NormalError
+from calib.plane_search import find_planes
+from calib.plane_settings import PlaneError
+from calib.signatures import signatures
+from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
+from calib.strips import StripReport, differences
+from daemon.errors import ExitCode, UserError
+from daemon.log.format import LogError
+from daemon.processing.calibrate_inputs import control_of
+from daemon.processing.calibrate_run import PLANES, refuse_no_planes
+from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from daemon.processing.flights import Flight as LoggedFlight
+from daemon.processing.flights import Wish
+from daemon.processing.strips_run import is_of_logs, refuse_installations
+from daemon.processing.trajectory_files import TrajectoryFiles
+from georef.mapping import MappingError
+from georef.strips import StripError as StripTimesError
+from georef.trajectory import TrajectoryError
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+RECORD = "strip-adjustment.json"
+AUTO = "auto"
+CHOICES = (*MODELS, AUTO)
+REFUSED = (
+    ControlError,
+    FlightError,
+    MappingError,
+    NormalError,
+    PlaneError,
+    StripError,
+    StripTimesError,
+    TrajectoryError,
+)
+
+
+@dataclass(frozen=True)
+class AdjustWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs: what is read and how; what it says of products does not count.
+        output: folder for the corrected trajectories and the record.
+        control: CSV of surveyed points; None: none.
+        model: that all strips get, of `calib.strip_functions.MODELS`; ``auto``: each what its returns ask for.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Wish
+    output: Path
+    control: Path | None = None
+    model: str = AUTO
+    overwrite: bool = False
+
+    @property
+    def settings(self) -> Settings:
+        """Of the adjustment."""
+        return DEFAULTS if self.model == AUTO else replace(DEFAULTS, models=(self.model,))
+
+
+@dataclass(frozen=True, eq=False)
+class StripsCorrected:
+    """What came of it.
+
+    Attributes:
+        kept: the flight as read, placed with the calibration that is held.
+        features: by which it was corrected.
+        control: surveyed points; none: there are none.
+        adjusted: corrections and trajectories.
+        before, after: differences of strips.
+        notes: for people, a line each.
+    """
+
+    kept: KeptFlight
+    features: Features
+    control: tuple[ControlPoint, ...]
+    adjusted: StripAdjusted
+    before: StripReport
+    after: StripReport
+    notes: tuple[str, ...]
+
+
+def _refuse_output(wish: AdjustWish) -> None:
+    """UserError where no folder can be there, or it holds an adjustment already; before anything lasts long."""
+    there = next(path for path in (wish.output, *wish.output.resolve().parents) if path.exists())
+    if not there.is_dir():
+        raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"--adjust {wish.output}: {there} cannot be written to", ExitCode.IO)
+    if (wish.output / RECORD).exists() and not wish.overwrite:
+        raise UserError(
+            f"{wish.output / RECORD}: is there already; want another folder, or --overwrite", ExitCode.USAGE
+        )
+
+
+def files_of(wish: AdjustWish, flight: LoggedFlight) -> TrajectoryFiles:
+    """Names of a session's files; UserError where they are there, or are what the trajectory was read from."""
+    files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
+    paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
+    read = wish.logs.trajectory.file
+    for path in paths:
+        if path.exists() and read is not None and path.samefile(read):
+            raise UserError(f"--adjust: {path} is what is corrected; want another folder", ExitCode.USAGE)
+        if path.exists() and not wish.overwrite:
+            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+    return files
+
+
+def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+    """Adjust strips; nothing is written.
+
+    Args:
+        wish: what is asked for.
+        folder: for the returns, some 150 bytes each, while it goes on.
+        tell: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    if wish.model not in CHOICES:
+        raise UserError(f'--strip-model: got "{wish.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
+    if not is_of_logs(wish.logs.logs):
+        raise UserError(
+            f"--adjust: corrects the trajectory of logs, {wish.logs.logs[0]} holds points; want the logs they are of",
+            ExitCode.USAGE,
+        )
+    _refuse_output(wish)
+    try:
+        return _corrected(wish, folder, tell)
+    except REFUSED as error:
+        raise UserError(str(error)) from error
+    except LogError as error:
+        raise UserError(str(error), ExitCode.IO) from error
+    except OSError as error:
+        raise UserError(f"{error.filename or folder}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+    kept = read_flight(wish.logs, folder, tell)
+    _refuse(wish, kept)
+    for logged in kept.logged:
+        files_of(wish, logged)
+    flight, calibrations, workers = kept.flight, kept.flight.starts(), wish.logs.workers
+    points, notes = ((), []) if wish.control is None else control_of(wish.control, flight, ())
+
+    def features_of(placed: Flight) -> Features:
+        with ThreadPoolExecutor(workers) as pool:
+            planes = find_planes(placed, PLANES, pool.map)
+        refuse_no_planes(str(kept.logged[0].log), planes)
+        return Features.joined([planes, *([control_planes(placed, points)] if points else [])])
+
+    def moved(adjusted: StripAdjusted, name: str) -> Flight:
+        return replaced(replace(flight, trajectories=adjusted.trajectories), calibrations, folder, name, workers)
+
+    tell("planes", 0, 1)
+    features = features_of(flight)
+    tell("adjustment", 0, 1)
+    first = adjust_strips(flight, features, calibrations, wish.settings)
+    tell("planes again", 0, 1)  # what errors of the trajectory had left apart lies on each other now
+    features = features_of(moved(first, "matched"))
+    _refuse_lost_control(wish, features)
+    tell("adjustment", 0, 1)
+    adjusted = adjust_strips(flight, features, calibrations, wish.settings)
+    tell("strips before and after", 0, 1)
+    before, after = differences(flight), differences(moved(adjusted, "adjusted"))
+    notes += [*_notes(wish, flight, features, before), *adjusted.notes]
+    return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
+
+
+def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
+    log = kept.logged[0].log
+    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    if len(strips) < 2:
+        raise UserError(
+            f"{log}: {len(strips) or 'no'} strip with returns; an adjustment compares strips: want at least two that "
+            "overlap"
+        )
+    refuse_installations(kept.logged)
+    for head in kept.flight.heads:
+        if head.start.method == "nominal" and head.name not in wish.logs.options.calibrations:
+            raise UserError(
+                f"{log}: {head.name}: has the nominal calibration only, whose errors would go into the trajectory; "
+                "want --calibration FILE of swath calibrate",
+                ExitCode.USAGE,
+            )
+
+
+def _refuse_lost_control(wish: AdjustWish, features: Features) -> None:
+    if wish.control is None or any(plane.control for plane in features.planes):
+        return
+    why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
+    raise UserError(f"{wish.control}: no point lies on ground that a strip shows as a plane ({why or 'no returns'})")
+
+
+def _notes(wish: AdjustWish, flight: Flight, features: Features, before: StripReport) -> list[str]:
+    notes = []
+    if not wish.control:
+        settings = wish.settings
+        notes.append(
+            "no control: what all strips have in common, a shift or a tilt, is held by its prior of "
+            f"{100 * settings.position_m:.0f} cm and {_mdeg(settings.turn_rad):.0f} mdeg; the datum is not determined"
+        )
+    seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
+    for strip in sorted({swath.strip for swath in flight.swaths} - seen):
+        notes.append(f"strip {strip:02d}: no plane of it is seen by another: not corrected")
+    found = signatures(before.checks, SeenFrom.of(flight)).found
+    notes += [
+        f"before, strips differed as by an error of the calibration, which is for swath calibrate: {one.words}"
+        for one in found
+        if one.level == "significant"
+    ]
+    return notes
+
+
+def _mdeg(turn_rad: float) -> float:
+    return 1e3 * math.degrees(turn_rad)

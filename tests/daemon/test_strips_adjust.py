@@ -1,0 +1,280 @@
+"""``swath strips --adjust`` from a log to corrected trajectories: what one strip lacks is found."""
+
+from __future__ import annotations
+
+import errno
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.cli.main import run_app
+from daemon.errors import ExitCode, UserError
+from daemon.processing import strip_adjust_products
+from daemon.processing.flights import Wish
+from daemon.processing.flown import TrajectoryWish
+from daemon.processing.setup import Options
+from daemon.processing.strip_adjust_products import write_adjustment
+from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, correct_strips
+from georef.earth import rot_e_from_l
+from georef.formats.trajectory_csv import csv_text
+from georef.formats.trajectory_file import read_trajectory
+from georef.trajectory import Trajectory
+from tests.calib.village import Made, village
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
+
+UP_M = 0.12
+LIFTED = 1  # index of the swath whose trajectory is put too high
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return village(tmp_path_factory.mktemp("village"), lines=(0, 1, 2))
+
+
+def raised(made: Made, up_m: float, swaths: tuple[int, ...]) -> Trajectory:
+    """The true trajectory, too high along some strips."""
+    trajectory, margin_ns = made.trajectory, 2_000_000_000
+    lat, lon, _ = trajectory.geodetic()
+    up_e = -rot_e_from_l(lat, lon)[:, :, 2]
+    position_e = trajectory.position_e.copy()
+    for number in swaths:
+        times = made.flight.swaths[number].time_ns
+        along = (trajectory.time_ns > times[0] - margin_ns) & (trajectory.time_ns < times[-1] + margin_ns)
+        position_e[along] += up_m * up_e[along]
+    return replace(trajectory, position_e=position_e)
+
+
+@pytest.fixture(scope="module")
+def lifted(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trajectory's file, 12 cm too high along one strip."""
+    path = tmp_path_factory.mktemp("lifted") / "lifted.csv"
+    path.write_text(csv_text(raised(made, UP_M, (LIFTED,))))
+    return path
+
+
+def arguments(made: Made, trajectory: Path, output: Path, *more: str) -> list[str]:
+    given = ("--trajectory", str(trajectory), "--trajectory-datum", "same", "--workers", "1")
+    calibration = ("--calibration", str(made.flown.folder / "left.true.toml"))
+    return ["strips", str(made.flown.log), *given, *calibration, "--adjust", str(output), *more]
+
+
+@pytest.fixture(scope="module")
+def adjusted(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the command leaves."""
+    folder = tmp_path_factory.mktemp("adjusted") / "new" / "folder"
+    assert run_app(arguments(made, lifted, folder)) == 0
+    return folder
+
+
+def record_of(folder: Path) -> Any:
+    return json.loads((folder / RECORD).read_text())
+
+
+def trajectory_of(folder: Path, suffix: str) -> Path:
+    (path,) = folder.glob(f"*_trajectory{suffix}")
+    return path
+
+
+def test_what_a_strip_lacks_is_found_within_its_sigma(made: Made, adjusted: Path) -> None:
+    strips = record_of(adjusted)["strips"]
+    numbers = [swath.strip for swath in made.flight.swaths]
+    assert [strip["strip"] for strip in strips] == numbers
+    assert [strip["model"] for strip in strips] == ["none", "constant", "none"]
+    assert strips[0]["mean"] is None
+    found = strips[LIFTED]
+    assert all(gain > 10.0 for model, gain in found["criterion_gains"].items() if model != "constant")
+    for knot in found["knots"]:
+        assert 0.0 < knot["sigma_down_m"] < 0.02
+        assert abs(knot["down_m"] - UP_M) < 3.0 * knot["sigma_down_m"]
+        assert abs(knot["north_m"]) < 3.0 * knot["sigma_north_m"] <= 3.0 * knot["prior_sigma_north_m"]
+    times = made.flight.swaths[LIFTED].time_ns
+    assert found["knots"][0]["gps_ns"] <= times[0] < times[-1] <= found["knots"][-1]["gps_ns"]
+
+
+def test_strips_agree_afterwards(adjusted: Path) -> None:
+    record = record_of(adjusted)
+    before, after = (record["differences"][when]["all"]["rms_m"] for when in ("before", "after"))
+    assert before > 0.08
+    assert after < 0.035  # two returns of 2 cm
+    lifted = record["strips"][LIFTED]["rms_dz_m"]
+    assert lifted["before"] == pytest.approx(UP_M, abs=0.02)
+    assert lifted["after"] < 0.035
+    assert record["variance"]["after"] < 1.0 < 2.0 < record["variance"]["before"]
+
+
+def test_nothing_is_a_calibration(made: Made, adjusted: Path) -> None:
+    record = record_of(adjusted)
+    assert record["what"].startswith("Correction of the trajectory by strips")
+    assert "No calibration" in record["what"]
+    assert record["calibrations_held"] == {"left": made.truth.id}
+    assert {path.suffix for path in adjusted.iterdir()} == {".json", ".csv", ".sbet", ".smrmsg"}
+    hashes = {entry["name"]: entry["sha256"] for entry in [*record["inputs"], *record["trajectories"]]}
+    assert {made.flown.log.name, "lifted.csv", "left.true.toml", trajectory_of(adjusted, ".csv").name} <= set(hashes)
+    assert any("the datum is not determined" in note for note in record["notes"])
+
+
+def test_the_calibration_file_stays_and_the_table_says_what_was_done(
+    made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = made.flown.folder / "left.true.toml"
+    was = file.read_bytes(), file.stat().st_mtime_ns
+    assert run_app(arguments(made, lifted, tmp_path / "out", "--strip-model", "constant")) == 0
+    assert (file.read_bytes(), file.stat().st_mtime_ns) == was
+    told = capsys.readouterr().out
+    assert f"no calibration: left {made.truth.id} is held" in told
+    assert "all strips got constant; the calibration was held" in told
+    row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
+    assert "constant" in row
+    assert "not told" in row  # its place in plan, over hardly anything but level ground
+    assert "→" in row
+    assert str(tmp_path / "out" / RECORD) in told
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".sbet"])
+def test_the_corrected_trajectory_reads_as_one_and_wants_no_correction(
+    made: Made, adjusted: Path, tmp_path: Path, suffix: str
+) -> None:
+    path = trajectory_of(adjusted, suffix)
+    first = int(made.trajectory.time_ns[0])
+    read = read_trajectory(path.read_bytes(), path.name, span_ns=(first, first + 1))
+    times = made.flight.swaths[LIFTED].time_ns
+    along = (read.time_ns > times[0]) & (read.time_ns < times[-1])
+    heights_m, true_m = (one.geodetic()[2][along] for one in (read, made.trajectory))
+    np.testing.assert_allclose(heights_m, true_m, rtol=0.0, atol=0.015)
+    assert run_app(arguments(made, path, tmp_path / "again")) == 0
+    assert {strip["model"] for strip in record_of(tmp_path / "again")["strips"]} == {"none"}
+
+
+def test_a_common_shift_is_found_with_control(made: Made, tmp_path: Path) -> None:
+    path = tmp_path / "high.csv"
+    path.write_text(csv_text(raised(made, UP_M, (0, 1, 2))))
+    control = ("--control", str(made.flown.folder / "control.csv"), "--strip-model", "constant")
+    assert run_app(arguments(made, path, tmp_path / "out", *control)) == 0
+    record = record_of(tmp_path / "out")
+    assert record["control"] > 0
+    assert not any("datum is not determined" in note for note in record["notes"])
+    for strip in record["strips"]:
+        mean = strip["mean"]
+        assert abs(mean["down_m"] - UP_M) < 3.0 * mean["sigma_down_m"] < 0.5 * UP_M
+
+
+# ---------------------------------------------------------------------- what cannot be
+
+
+def spans(folder: Path, *times: tuple[int, int]) -> tuple[str, str]:
+    """The option for strips at these times."""
+    path = folder / "strips.csv"
+    path.write_text("\n".join(["start_gps_ns,end_gps_ns", *(f"{start},{end}" for start, end in times)]) + "\n")
+    return "--strips", str(path)
+
+
+def refused(capsys: pytest.CaptureFixture[str], given: list[str]) -> tuple[int, str]:
+    """Exit code and the one line of a command that made nothing."""
+    capsys.readouterr()
+    code = run_app(given)
+    line = capsys.readouterr().err
+    assert line.startswith("swath: ")
+    assert line.count("\n") == 1, line
+    assert "internal error" not in line
+    return code, line
+
+
+def test_mistakes_are_one_line_and_leave_nothing(
+    made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    times = [(int(swath.time_ns[0]), int(swath.time_ns[-1])) for swath in made.flight.swaths]
+    beginnings = [(start, start + 2_500_000_000) for start, _ in times[:2]]  # of opposite lines: their far ends
+    far = tmp_path / "far.csv"
+    far.write_text("name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m\na,47.5,9.5,450,0.02\n")
+    (tmp_path / "points").mkdir()
+    (tmp_path / "points" / "a.laz").touch()
+    full = arguments(made, lifted, output)
+    nominal = [word for word in full if word not in ("--calibration", str(made.flown.folder / "left.true.toml"))]
+    points = [full[0], str(tmp_path / "points"), *full[2:]]
+    for given, code, words in (
+        ([*full, "--strip-model", "cubic"], 2, 'got "cubic", want one of none, constant, linear, spline, auto'),
+        ([*full, "--level", "QL1"], 2, "--level: is of a comparison"),
+        (points, 2, "holds points; want the logs they are of"),
+        (nominal, 2, "left: has the nominal calibration only"),
+        ([*full, "--control", str(tmp_path / "no.csv")], 3, "no.csv: cannot be read"),
+        ([*full, "--control", str(far)], 1, "no control point lies in the flight"),
+        ([*full, *spans(tmp_path, times[0])], 1, "1 strip with returns; an adjustment compares strips"),
+    ):
+        found, line = refused(capsys, given)
+        assert found == code, line
+        assert words in line
+        assert not output.exists()
+    assert "no plane is seen by two strips" in refused(capsys, [*full, *spans(tmp_path, *beginnings)])[1]
+    assert not output.exists()
+
+
+def test_files_that_are_there_stay(
+    made: Made, lifted: Path, adjusted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    was = {path: path.read_bytes() for path in adjusted.iterdir()}
+    code, line = refused(capsys, arguments(made, lifted, adjusted))
+    assert code == 2
+    assert f"{RECORD}: is there already; want another folder, or --overwrite" in line
+    own = arguments(made, trajectory_of(adjusted, ".sbet"), adjusted, "--overwrite")
+    assert "is what is corrected; want another folder" in refused(capsys, own)[1]
+    assert "is a file; want a folder" in refused(capsys, arguments(made, lifted, lifted))[1]
+    assert {path: path.read_bytes() for path in adjusted.iterdir()} == was
+    code, line = refused(capsys, ["strips", str(made.flown.log), "--strip-model", "linear"])
+    assert code == 2
+    assert "want --adjust DIR too" in line
+
+
+@pytest.fixture(scope="module")
+def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[AdjustWish, StripsCorrected]:
+    """The outcome before it is written."""
+    folder = tmp_path_factory.mktemp("returns")
+    text = (made.flown.folder / "left.true.toml").read_text()
+    options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
+    logs = Wish([made.flown.log], folder, TrajectoryWish(lifted), replace(options, uncertainty=False))
+    wish = AdjustWish(logs, folder / "none")
+    return wish, correct_strips(wish, folder, lambda what, done, total: None)
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
+def test_a_full_disk_leaves_nothing_behind(
+    done: tuple[AdjustWish, StripsCorrected], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool
+) -> None:
+    def full(record: Any, stream: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(strip_adjust_products, "write_json", full)
+    output = tmp_path / "out"
+    if there:
+        output.mkdir()
+    with pytest.raises(UserError, match="No space left on device") as caught:
+        write_adjustment(replace(done[0], output=output), done[1], lambda what, done, total: None)
+    assert caught.value.exit_code == ExitCode.IO
+    assert "\n" not in caught.value.message
+    assert output.exists() == there
+    assert list(tmp_path.rglob("*")) == [output] * there
+
+
+def test_a_trajectory_is_given_back_by_the_plumb_line_it_was_read_by(
+    made: Made, done: tuple[AdjustWish, StripsCorrected], tmp_path: Path
+) -> None:
+    """Otherwise the deflection of the vertical would be taken off twice."""
+    xi_eta_rad = tuple(np.radians([12.0 / 3600.0, -7.0 / 3600.0]))
+    wish, outcome = replace(done[0], output=tmp_path / "out"), done[1]
+    (logged,) = outcome.kept.logged
+    plumbed: Any = SimpleNamespace(
+        log=logged.log, session=logged.session, setup=SimpleNamespace(deflection_rad=xi_eta_rad)
+    )
+    kept = replace(outcome.kept, logged=[plumbed])
+    write_adjustment(wish, replace(outcome, kept=kept), lambda what, done, total: None)
+    path = trajectory_of(tmp_path / "out", ".csv")
+    read = read_trajectory(path.read_bytes(), path.name)
+    for turned, same in ((read, False), (read.with_deflection(*xi_eta_rad), True)):
+        attitudes = np.array(turned.attitude()), np.array(outcome.adjusted.trajectories[0].attitude())
+        assert np.allclose(*attitudes, rtol=0.0, atol=1e-8) == same  # there and back but for the product of ξ and η
