@@ -23,6 +23,8 @@ from calib.record_content import content_of
 from calib.record_tables import BY_KEY, CALIBRATION_TYPES, CLASSES, ROWS, VALIDATION_METHODS, Class, Row
 from calib.record_values import Matrix, Plain, Value
 
+Document = dict[str, Any]  # what a record's JSON holds
+
 VERSION = 1
 NAMESPACE = f"urn:swath:calibration-record:{VERSION}"
 NOTE = (
@@ -100,7 +102,7 @@ def record_of(given: RecordInput) -> Record:
     return Record(given.header.id, values, missing, given.attachment)
 
 
-def _told(key: str, value: Plain) -> Value:
+def _told(key: str, value: Plain, note: str = "as told") -> Value:
     row = BY_KEY.get(key)
     if row is None:
         near = get_close_matches(key, BY_KEY, 1, 0.0)
@@ -113,7 +115,7 @@ def _told(key: str, value: Plain) -> Value:
     if row.type == "Length" and (isinstance(value, bool | str) or not np.isfinite(value).all()):
         raise RecordError(f"{key}: got {value!r}, want metres")
     unit = {"Length": "m", "Angle": "rad", "DirectPosition": "m"}.get(row.type, "")
-    return Value(value, unit if not isinstance(value, str) else "", "as told")
+    return Value(value, unit if not isinstance(value, str) else "", note)
 
 
 def _summary(matrix: Matrix, name: str, attachment: str) -> dict[str, Any]:
@@ -128,10 +130,15 @@ def _summary(matrix: Matrix, name: str, attachment: str) -> dict[str, Any]:
 
 def record_json(record: Record) -> str:
     """The record as JSON; the same text for the same record."""
-    return json.dumps(_document(record), ensure_ascii=False, indent=1, allow_nan=False) + "\n"
+    return document_json(_document(record))
 
 
-def _document(record: Record) -> dict[str, Any]:
+def document_json(document: Document) -> str:
+    """A record's JSON again, as `with_told` gives it."""
+    return json.dumps(document, ensure_ascii=False, indent=1, allow_nan=False) + "\n"
+
+
+def _document(record: Record) -> Document:
     classes = []
     for owner in CLASSES:
         rows = [row for row in ROWS if row.owner == owner.name and row.key in record.values]
@@ -165,10 +172,15 @@ def _attribute(row: Row, value: Value, attachment: str) -> dict[str, Any]:
 
 def record_xml(record: Record) -> str:
     """The same as XML: an element a class, an attribute, a value; numbers with all their digits."""
+    return document_xml(_document(record))
+
+
+def document_xml(document: Document) -> str:
+    """Likewise of a record's JSON."""
     ET.register_namespace("cr", NAMESPACE)
-    document = _document(record)
-    root = ET.Element(_tag("calibrationRecord"), {"version": str(VERSION), "id": _clean(record.id)})
-    ET.SubElement(root, _tag("note")).text = NOTE
+    head = {"version": str(document["version"]), "id": _clean(document["id"])}
+    root = ET.Element(_tag("calibrationRecord"), head)
+    ET.SubElement(root, _tag("note")).text = document["note"]
     for owner in document["classes"]:
         element = ET.SubElement(root, _tag("class"), _words(owner, ("attributes",)))
         for attribute in owner["attributes"]:
@@ -209,3 +221,52 @@ def _word(value: object) -> str:
 def _clean(text: str) -> str:
     """Without the control characters that XML cannot hold."""
     return "".join(one if one >= " " or one in "\t\n" else "\ufffd" for one in text)
+
+
+# ---------------------------------------------------------------------- a record that is told more
+
+
+def read_document(text: str, name: str) -> Document:
+    """A record as `record_json` wrote it.
+
+    Args:
+        text: of the file.
+        name: of the file, for messages.
+
+    Raises:
+        RecordError: it is no such record.
+    """
+    try:
+        document = json.loads(text)
+        known = document["version"] == VERSION and all(isinstance(document[key], str) for key in ("id", "note"))
+        named = [(owner["name"], one["name"]) for owner in document["classes"] for one in owner["attributes"]]
+        lost = [(one["class"], one["name"]) for one in document["missing"]]
+    except (ValueError, KeyError, TypeError):
+        known, named, lost = False, [], []
+    if not known or any(f"{owner}.{one}" not in BY_KEY for owner, one in (*named, *lost)):
+        raise RecordError(f"{name}: no record of a calibration; want NAME.record.json of swath calibrate --report")
+    told: Document = document
+    return told
+
+
+def with_told(document: Document, told: Mapping[str, tuple[Plain, str]]) -> Document:
+    """The same record with more told, as what came after the calibration.
+
+    Args:
+        document: of `read_document`.
+        told: values and their notes by ``CLASS.attribute``, as `RecordInput.told`; what was told before is replaced.
+
+    Raises:
+        RecordError: something told is no attribute, or not what the attribute takes.
+    """
+    found = {f"{owner['name']}.{one['name']}": one for owner in document["classes"] for one in owner["attributes"]}
+    for key, (value, note) in told.items():
+        content = _told(key, value, note)
+        found[key] = _attribute(BY_KEY[key], content, "")
+    classes = []
+    for owner in CLASSES:
+        attributes = [found[row.key] for row in ROWS if row.owner == owner.name and row.key in found]
+        if attributes:
+            classes.append(_of_class(owner) | {"attributes": attributes})
+    missing = [one for one in document["missing"] if f"{one['class']}.{one['name']}" not in told]
+    return document | {"classes": classes, "missing": missing}

@@ -51,9 +51,10 @@ WANTS = {
     "crossStripFlight": "want strips that cross",
     "secondFlight": "want the log of a second flight",
     "secondAltitude": f"want strips at heights above ground that differ by {100 * (HEIGHTS_RATIO - 1):.0f} % or more",
-    "measurementActualParameters": "want the parameters measured anew",
+    "measurementActualParameters": "want the parameters measured anew (--anew)",
     "other": "want strips that share planes",
 }
+NOT_BOTH = "no parameter was estimated in both; want a calibration file with sigmas, as swath calibrate writes it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +288,7 @@ def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibratio
         told.append(compare(calibrations[scanner], anew[scanner]))
     told = [one for one in told if one.freedom]
     if not told:
-        return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {WANTS[name]}")
+        return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {NOT_BOTH if anew else WANTS[name]}")
     squares, freedom = sum(one.chi2 for one in told), sum(one.freedom for one in told)
     test = Test("chi2", squares, float(freedom), float(stats.chi2.sf(squares, freedom)))
     largest = max((row for one in told for row in one.rows), key=lambda row: abs(row.difference) / row.sigma)

@@ -42,7 +42,11 @@ def command(
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
     strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="validation.json, history.png.")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="validation.json, history.png, records anew.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR|FILE", help="The calibration's record, which -o shall have with this validation."),
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
@@ -62,6 +66,8 @@ def command(
 
     if not logs and not past:
         raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)
+    if record is not None and not (logs and output):
+        raise UserError("--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE)
     files = [calibration, *(also or [])]
     given = {read_file(path).scanner: (path.read_text(encoding="utf-8"), str(path)) for path in files}
     if len(given) < len(files):
@@ -81,6 +87,7 @@ def command(
         histories=past or (),
         anew=anew,
         output=output,
+        record=record,
     )
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = run_validation(wish, Path(folder), tell)

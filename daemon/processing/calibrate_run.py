@@ -171,7 +171,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     planes, searched = search(), 1
     refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)
     features = Features.joined([_features(wish, flight, planes, points), *picked])
-    prior = _prior(kept)
+    prior = prior_of(kept)
 
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
         nonlocal flight, planes, features, searched
@@ -261,7 +261,7 @@ def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Seq
     return Features.joined(found)
 
 
-def _prior(kept: KeptFlight) -> TrajectoryPrior:
+def prior_of(kept: KeptFlight) -> TrajectoryPrior:
     """The trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
     chains: list[ErrorChain] = []
     knots = knots_of(kept.flight, KNOT_S)

@@ -5,22 +5,27 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from calib.control import ControlError
-from calib.flight import FlightError
+from calib.features import ControlPoint
+from calib.flight import Flight, FlightError
 from calib.history import History, HistoryError, history
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError
+from calib.record import Document
 from calib.validation import Method, Validation, same_logs, validate
 from daemon.errors import ExitCode, UserError
 from daemon.log.format import LogError
 from daemon.processing.calibrate_inputs import control_of
-from daemon.processing.calibration_flight import KeptFlight, read_flight
+from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strips_run import finite, refuse_installations
+from daemon.processing.trajectory_files import put_in_place, remove, write_aside
+from daemon.processing.validate_record import record_files, records_of
 from georef.calibration import Calibration, CalibrationError, read_calibration
 from georef.mapping import MappingError
 from georef.strips import StripError
@@ -40,7 +45,8 @@ class ValidateWish:
         control: CSV of surveyed points; None: none.
         histories: calibration files, or folders of them.
         anew: parameters are estimated anew from the logs, and compared.
-        output: folder for record and picture; None: none.
+        output: folder for what was found, the picture, and records anew; None: none.
+        record: record of a calibration, or a folder of them, that shall tell of this; None: beside the files.
     """
 
     calibrations: Sequence[Path]
@@ -49,6 +55,7 @@ class ValidateWish:
     histories: Sequence[Path] = ()
     anew: bool = False
     output: Path | None = None
+    record: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,8 @@ class _Found:
     calibrations: dict[str, Calibration]
     validation: Validation | None = None
     histories: tuple[History, ...] = ()
+    logs: list[tuple[str, str]] = field(default_factory=list)
+    documents: Mapping[str, Document] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -85,6 +94,9 @@ def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
         if wish.histories:
             found.histories = _histories(wish.histories, calibrations)
         if wish.logs.logs:
+            if wish.output is not None:
+                recorded = records_of(list(zip(wish.calibrations, calibrations, strict=True)), wish.record)
+                found.documents, found.notes = recorded.documents, list(recorded.notes)
             _against_logs(wish, found, folder, told)
     except REFUSED as error:
         raise UserError(str(error)) from error
@@ -131,12 +143,12 @@ def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -
     planes = find_planes(flight)
     if not planes.planes:
         raise UserError(f"{wish.logs.logs[0]}: no planes that two strips see; a validation wants strips that overlap")
-    anew = _anew(wish, found, kept, told) if wish.anew else None
+    anew = _anew(wish, found, kept, points, folder, told) if wish.anew else None
     told("tests", 0, 1)
     validation = validate(flight, planes, found.calibrations, points, anew)
     paths = [part.path for logged in kept.logged for part in logged.session.parts]
-    logs = [(path.name, sha256_of(path)) for path in paths]
-    dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, logs))
+    found.logs = [(path.name, sha256_of(path)) for path in paths]
+    dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
     found.validation = replace(validation, dependent=dependent)
     found.notes += notes
 
@@ -159,15 +171,35 @@ def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
         raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
 
 
-def _anew(wish: ValidateWish, found: _Found, kept: KeptFlight, told: Told) -> Mapping[str, Calibration]:
-    """Parameters from these logs alone."""
+def _anew(
+    wish: ValidateWish, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
+) -> Mapping[str, Calibration]:
+    """Parameters from these logs and control alone, as `swath calibrate` finds them; none, and why is noted."""
     from calib.adjust import adjust
+    from calib.control import control_planes
+    from calib.features import Features
+    from calib.normals import NormalError
     from calib.parameters import Wish as Model
-    from calib.trajectory_errors import gauss_markov
+    from daemon.processing.calibrate_run import PLANES, prior_of
 
-    told("parameters anew", 0, 1)
-    model = Model("scanner")
-    adjusted = adjust(kept.flight, find_planes(kept.flight), model, gauss_markov(kept.flight), start=found.calibrations)
+    def features(flight: Flight) -> Features:
+        told("parameters anew", 0, 1)
+        return Features.joined([find_planes(flight, PLANES), control_planes(flight, points)])
+
+    def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
+        return features(replaced(kept.flight, calibrations, folder, "anew", wish.logs.workers))
+
+    log, start = kept.logged[0].log, found.calibrations
+    try:
+        adjusted = adjust(
+            kept.flight, features(kept.flight), Model("scanner"), prior_of(kept), start=start, rematch=found_anew
+        )
+    except NormalError as error:
+        found.notes.append(f"{log}: parameters anew: {error}")
+        return {}
+    if not adjusted.converged:
+        found.notes.append(f"{log}: parameters anew: the adjustment does not converge")
+        return {}
     return adjusted.calibrations
 
 
@@ -191,7 +223,7 @@ def _written(wish: ValidateWish, found: _Found) -> Validated:
     record["notes"] = found.notes
     record = finite(record)
     if wish.output is not None:
-        lines += _write(wish.output, record, found.histories)
+        lines += _write(wish.output, record, found)
     return Validated(record, [*lines, *found.notes], "; ".join(wrong))
 
 
@@ -232,16 +264,25 @@ def _table(one: History) -> list[str]:
     return lines
 
 
-def _write(output: Path, record: dict[str, Any], histories: Sequence[History]) -> list[str]:
-    files = {output / RECORD: (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()}
-    if histories:
+def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
+    files: dict[Path, bytes] = {}
+    if found.validation is not None and found.validation.passed is not None:
+        files |= record_files(output, found.documents, found.validation, found.logs)
+    if found.histories:
         from calib.history_plots import history_png
 
-        files[output / PICTURE] = history_png(histories)
+        files[output / PICTURE] = history_png(found.histories)
+    files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
+    written: list[tuple[Path, Path]] = []
     try:
-        output.mkdir(parents=True, exist_ok=True)
         for path, data in files.items():
-            path.write_bytes(data)
+            written.append((write_aside(path, partial(_put, data)), path))
+        put_in_place(written)
     except OSError as error:
+        remove(written)
         raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
     return [str(path) for path in files]
+
+
+def _put(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)

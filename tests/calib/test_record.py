@@ -10,9 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.record import NAMESPACE, RecordError, RecordInput, record_json, record_of, record_xml
+from calib.record import (
+    NAMESPACE,
+    RecordError,
+    RecordInput,
+    document_json,
+    document_xml,
+    read_document,
+    record_json,
+    record_of,
+    record_xml,
+    with_told,
+)
 from calib.record_tables import CLASSES, ROWS
-from calib.record_values import utc_text
+from calib.record_values import Plain, utc_text
 from georef.beams import LineGeometry
 from georef.calibration import INDEX
 from georef.sensor_model import SensorModel
@@ -246,3 +257,40 @@ def test_validation_methods_may_be_several(outcome: Outcome) -> None:
     }
     record = record_of(given(outcome, told=told))
     assert "CA_GeometryValidation.validationMethod" not in record.missing
+
+
+VALIDATED: dict[str, Plain] = {
+    "CA_GeometryValidation.validationMethod": "testfield, secondFlight",
+    "CA_GeometryValidation.validationTime": "2026-11-21T12:00:00Z",
+    "CA_TestRange.numberCheckPoints": 12,
+}
+
+
+def test_what_is_told_later_stands_where_it_would_have_stood(outcome: Outcome) -> None:
+    """A record read back and told more is that which would have been told at once, as JSON and as XML."""
+    at_once = record_of(given(outcome, told=VALIDATED))
+    written = read_document(record_json(record_of(given(outcome))), "left.record.json")
+    later = with_told(written, {key: (value, "as told") for key, value in VALIDATED.items()})
+    assert document_json(later) == record_json(at_once)
+    assert document_xml(later) == record_xml(at_once)
+    again = with_told(later, {"CA_TestRange.numberCheckPoints": (20, "of another flight")})
+    (points,) = [one for owner in again["classes"] for one in owner["attributes"] if one["name"] == "numberCheckPoints"]
+    assert (points["value"], points["note"]) == (20, "of another flight")
+    with pytest.raises(RecordError, match=r"CA_GNSS\.numberSatellites"):
+        with_told(written, {"CA_GNSS.satellites": (9, "")})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "no JSON",
+        "[]",
+        '{"version": 2, "id": "x", "note": "", "classes": [], "missing": []}',
+        '{"version": 1, "id": "x", "note": "", "classes": [{"name": "CA_GNSS"}], "missing": []}',
+        '{"version": 1, "id": "x", "note": "", "classes": [], "missing": [{"class": "CA_GNSS", "name": "unknown"}]}',
+    ],
+)
+def test_what_is_no_record_is_said_in_a_line(text: str) -> None:
+    with pytest.raises(RecordError, match=r"left\.record\.json: no record of a calibration") as caught:
+        read_document(text, "left.record.json")
+    assert "\n" not in str(caught.value)

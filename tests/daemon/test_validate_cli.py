@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,8 @@ import pytest
 import typer
 
 from calib.calibration_file import Header, calibration_text
+from calib.record import NAMESPACE, Record, record_json
+from calib.record_values import Value
 from daemon.cli import validate
 from daemon.errors import ExitCode, UserError
 from daemon.processing import validate_run
@@ -142,6 +145,85 @@ def test_the_calibrations_own_log_is_no_independent_proof(
     told = capsys.readouterr().out
     assert "the calibration holds (not independent)" in told
     assert "flight.mcap: calibration own was made of this log" in told
+
+
+def record_beside(path: Path, calibration_id: str) -> Path:
+    """A record as `swath calibrate` leaves it: of a validation it knows nothing."""
+    methods = ("CA_GeometryValidation.validationMethod", "CA_GeometryValidation.validationTime")
+    values = {"CA_CalibrationValidation.calibrationType": Value("inFlight")}
+    path.write_text(record_json(Record(calibration_id, values, (*methods, "CA_GNSS.numberSatellites"))))
+    return path
+
+
+def attributes_of(path: Path) -> dict[str, dict[str, Any]]:
+    classes = json.loads(path.read_text())["classes"]
+    return {f"{owner['name']}.{one['name']}": one for owner in classes for one in owner["attributes"]}
+
+
+@pytest.mark.parametrize("phi_deg", [0.0, 0.04], ids=["holds", "does not hold"])
+def test_the_record_beside_the_file_is_told_of_the_validation(log: Path, tmp_path: Path, phi_deg: float) -> None:
+    file = file_of(tmp_path / "c1.toml", boresight(phi_deg))
+    old = record_beside(tmp_path / "left.record.json", "c1").read_bytes()
+    try:
+        run(str(file), str(log), "-o", str(tmp_path / "out"))
+    except UserError:
+        assert phi_deg
+    told = attributes_of(tmp_path / "out" / "left.record.json")
+    method = told["CA_GeometryValidation.validationMethod"]
+    assert method["value"] == "crossStripFlight, other"
+    verdict = "does not hold" if phi_deg else "holds"
+    assert method["note"].startswith(f"the calibration {verdict}")
+    assert "crossStripFlight (002): planes seen by crossing strips" in method["note"]
+    time = told["CA_GeometryValidation.validationTime"]
+    assert dt.datetime.fromisoformat(time["value"]) <= dt.datetime.now(dt.UTC)
+    assert "flight.mcap (SHA-256 " in time["note"]
+    assert told["CA_CalibrationValidation.calibrationType"]["value"] == "inFlight"
+    (missing,) = json.loads((tmp_path / "out" / "left.record.json").read_text())["missing"]
+    assert missing["name"] == "numberSatellites"
+    root = ET.fromstring((tmp_path / "out" / "left.record.xml").read_text())
+    assert method["value"] in [one.text for one in root.iter(f"{{{NAMESPACE}}}value")]
+    assert (tmp_path / "left.record.json").read_bytes() == old
+
+
+def test_a_record_elsewhere_is_named_and_one_of_another_calibration_left_alone(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = file_of(tmp_path / "c1.toml", boresight(0.0))
+    record_beside(tmp_path / "left.record.json", "c0")
+    run(str(file), str(log), "-o", str(tmp_path / "out"))
+    assert "left.record.json: is the record of calibration c0" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["validation.json"]
+    (tmp_path / "report").mkdir()
+    record_beside(tmp_path / "report" / "left.record.json", "c1")
+    run(str(file), str(log), "-o", str(tmp_path / "out"), "--record", str(tmp_path / "report"))
+    assert "CA_GeometryValidation.validationMethod" in attributes_of(tmp_path / "out" / "left.record.json")
+
+
+@pytest.mark.parametrize(
+    ("what", "said", "code"),
+    [
+        ("other", "is the record of calibration c0, .*c1.toml is c1", ExitCode.USAGE),
+        ("none", r"x\.json: no record of a calibration; want NAME\.record\.json", ExitCode.USAGE),
+        ("absent", "no.json: cannot be read: No such file", ExitCode.IO),
+        ("no output", "--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE),
+    ],
+)
+def test_a_record_that_cannot_be_told_is_one_line(
+    log: Path, tmp_path: Path, what: str, said: str, code: ExitCode
+) -> None:
+    file = file_of(tmp_path / "c1.toml", boresight(0.0))
+    (tmp_path / "x.json").write_text("{}")
+    paths = {
+        "other": record_beside(tmp_path / "other.json", "c0"),
+        "none": tmp_path / "x.json",
+        "absent": tmp_path / "no.json",
+    }
+    output = () if what == "no output" else ("-o", str(tmp_path / "out"))
+    with pytest.raises(UserError, match=said) as caught:
+        run(str(file), str(log), "--record", str(paths.get(what, tmp_path)), *output)
+    assert caught.value.exit_code == code
+    assert "\n" not in caught.value.message
+    assert not (tmp_path / "out").exists()
 
 
 def test_control_above_the_geoid_is_refused(log: Path, made: Cast, tmp_path: Path) -> None:

@@ -1,0 +1,113 @@
+"""A validation in the calibration's record: what `swath calibrate --report` wrote, written anew with it."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.record import Document, RecordError, document_json, document_xml, read_document, with_told
+from calib.record_values import Plain
+from calib.validation import Validation
+from daemon.errors import ExitCode, UserError
+from georef.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Records of what is validated.
+
+    Attributes:
+        documents: by scanner.
+        notes: where there is none, a line each.
+    """
+
+    documents: Mapping[str, Document]
+    notes: tuple[str, ...] = ()
+
+
+def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) -> Recorded:
+    """The records of calibrations: beside their files, or where the user says.
+
+    Args:
+        files: of the calibrations.
+        where: a record, or a folder of them; None: beside the files, and none may be there.
+
+    Raises:
+        UserError: what the user names is no record, or of another calibration.
+    """
+    if where is not None and where.is_file() and len(files) > 1:
+        raise UserError(f"--record {where}: of several calibrations want the folder of their records", ExitCode.USAGE)
+    documents: dict[str, Document] = {}
+    notes: list[str] = []
+    for file, calibration in files:
+        name = f"{calibration.scanner}.record.json"
+        path = file.parent / name if where is None else where / name if where.is_dir() else where
+        if where is None and not path.exists():
+            notes.append(
+                f"{file}: no {name} beside it; --record says where it lies, if it shall tell of this validation"
+            )
+            continue
+        try:
+            documents[calibration.scanner] = _document(path, file, calibration)
+        except UserError as error:
+            if where is not None:
+                raise
+            notes.append(f"{error.message}; left alone")
+    return Recorded(documents, tuple(notes))
+
+
+def _document(path: Path, file: Path, calibration: Calibration) -> Document:
+    try:
+        document = read_document(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a record of swath calibrate"
+        raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
+    except RecordError as error:
+        raise UserError(str(error), ExitCode.USAGE) from error
+    if document["id"] != calibration.id:
+        what = f"is the record of calibration {document['id']}, {file} is {calibration.id}"
+        raise UserError(f"{path}: {what}", ExitCode.USAGE)
+    return document
+
+
+def record_files(
+    folder: Path, documents: Mapping[str, Document], validation: Validation, logs: Sequence[tuple[str, str]]
+) -> dict[Path, bytes]:
+    """Records with the validation in them, XML and JSON.
+
+    Args:
+        folder: where they go.
+        documents: by scanner.
+        validation: what was found; methods that could not be applied are not among those named.
+        logs: name and SHA-256 of what it was validated against.
+    """
+    told = told_of(validation, logs, dt.datetime.now(dt.UTC))
+    files: dict[Path, bytes] = {}
+    for scanner, document in documents.items():
+        validated = with_told(document, told)
+        files[folder / f"{scanner}.record.xml"] = document_xml(validated).encode()
+        files[folder / f"{scanner}.record.json"] = document_json(validated).encode()
+    return files
+
+
+def told_of(validation: Validation, logs: Sequence[tuple[str, str]], now: dt.datetime) -> dict[str, tuple[Plain, str]]:
+    """Values and notes by ``CLASS.attribute``: methods with what each found, when, against what, check points."""
+    applied = [method for method in validation.methods if method.passed is not None]
+    against = ", ".join(f"{name} (SHA-256 {sha256})" for name, sha256 in logs)
+    told: dict[str, tuple[Plain, str]] = {
+        "CA_GeometryValidation.validationMethod": (
+            ", ".join(method.name for method in applied),
+            ". ".join([validation.sentence, *(method.sentence for method in applied), *validation.dependent]),
+        ),
+        "CA_GeometryValidation.validationTime": (
+            now.replace(microsecond=0).isoformat().replace("+00:00", "Z"),
+            f"against {against}",
+        ),
+    }
+    for method in applied:
+        if method.name == "testfield":
+            note = "points given to the validation; that the calibration did not use them is the user's to see to"
+            told["CA_TestRange.numberCheckPoints"] = (int(method.more["points"]), note)
+    return told
