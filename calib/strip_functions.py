@@ -11,7 +11,8 @@ Eq. 12, as corrections of the trajectory; FORMULAS 7.3):
 of position (north, east, down) and of small turns about these axes. All have priors, as a common shift of all strips is
 seen by nobody without control. Which strip gets which is chosen by an information criterion (Schwarz 1978; AIC of
 Akaike 1974 as corrected by Hurvich and Tsai 1989), with the number of parameters that the returns determine, the trace
-of N (N + P)⁻¹. The equations are those of the adjustment (`calib.normals`) with states of the trajectory alone.
+of N (N + P)⁻¹ over those combinations of them that the returns know much better than the prior does; along all others
+nothing is corrected. The equations are those of the adjustment (`calib.normals`) with states of the trajectory alone.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ FloatArray = NDArray[np.float64]
 MODELS = ("none", "constant", "linear", "spline")
 MOST_CHOSEN_SINGLY = 30  # strips; with more, all get one model
 MOST_SWEEPS = 5
+LEAST_KNOWN = 15.0  # times what the prior knows: with less, a correction would be uncertain by a quarter of its prior
 
 
 class StripError(ValueError):
@@ -353,10 +355,17 @@ def _basis(model: str, knots: int, settings: Settings) -> tuple[FloatArray, Floa
 
 
 def _solution(quadratic: _Quadratic, basis: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Corrections (6k,), covariance of the parameters (u, u), and how many of them the returns determine."""
+    """Corrections (6k,), covariance of the parameters (u, u), and how many of them the returns determine.
+
+    What the returns know little of keeps its prior, zero: the best estimate would be mostly their noise.
+    """
     if not len(weight):
         return np.zeros(len(basis)), np.zeros((0, 0)), 0.0
-    data = basis.T @ quadratic.normal @ basis
-    scale = np.sqrt(np.diag(data) + weight)
-    inverse = np.linalg.inv((data + np.diag(weight)) / np.outer(scale, scale)) / np.outer(scale, scale)
-    return basis @ (inverse @ (basis.T @ quadratic.right)), inverse, float(np.sum(inverse * data))
+    prior = basis * weight**-0.5  # of parameters whose prior sigmas are 1
+    known, axes = np.linalg.eigh(prior.T @ quadratic.normal @ prior)
+    taken = known > LEAST_KNOWN
+    axes_x = prior @ axes[:, taken]
+    x = axes_x @ ((axes_x.T @ quadratic.right) / (1.0 + known[taken]))
+    left = axes * np.where(taken, 1.0 / (1.0 + np.maximum(known, 0.0)), 1.0) @ axes.T
+    covariance = left / np.sqrt(np.outer(weight, weight))
+    return x, covariance, float(np.sum(known[taken] / (1.0 + known[taken])))

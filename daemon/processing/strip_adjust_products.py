@@ -178,7 +178,7 @@ def _lines(done: StripsCorrected) -> list[str]:
     adjusted, strips = done.adjusted, list(_strips(done))
     held = ", ".join(f"{head.name} {head.start.id}" for head in done.kept.flight.heads)
     titles = [*(f"{axis} cm" for axis in AXES), *(f"turn {axis[0]} mdeg" for axis in AXES), "RMSDz cm"]
-    lines = [f"correction of the trajectory, no calibration: {held} is held"]
+    lines = [f"correction of the trajectory, no calibration; held: {held}"]
     lines.append(f"{'strip':<7}{'model':<10}" + "".join(f"{title:>14}" for title in titles))
     lines += [_row(strip) for strip in strips]
     control = sum(len(plane.control) for plane in done.features.planes)
@@ -190,7 +190,7 @@ def _lines(done: StripsCorrected) -> list[str]:
     rms = [100.0 * report.all.height.rms_m for report in (done.before, done.after)]
     lines.append(f"all strips: RMSDz {rms[0]:.1f} → {rms[1]:.1f} cm")
     if any(not strip.told.all() for strip in strips if strip.choice.model != UNCORRECTED):
-        lines.append("not told: the planes of the strip do not determine it; its prior holds it near 0")
+        lines.append("not told: the planes of the strip do not determine it, so it is left as it was")
     return [*lines, *(f"note: {note}" for note in (*done.notes, KEPT))]
 
 

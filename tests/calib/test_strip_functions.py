@@ -134,6 +134,28 @@ def test_a_common_shift_is_seen_by_control_alone(clean: tuple[Flight, Features])
     assert max(down) < 0.03 < off_planes(low, features, 1)
 
 
+def test_what_hardly_shows_is_not_corrected(clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Level ground, and three returns of a roof: their noise would move the strip in plan, where nothing is wrong."""
+    flight, features = clean
+    seen = [plane for plane in features.planes if 3 in [flight.swaths[patch.swath].strip for patch in plane.patches]]
+    roof = next(plane for plane in seen if plane.normal_t[2] < 0.99)
+    few = replace(roof, patches=tuple(replace(patch, at=patch.at[:3]) for patch in roof.patches))
+    level = tuple(plane for plane in features.planes if plane.normal_t[2] > 0.99)
+    poor = replace(features, planes=(*level, few))
+    bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.15, 0.0, 0.0, 0.0], (2, 1)))
+    result = adjusted(bad, poor)
+    assert [choice.model for choice in result.choices] == ["none", "none", "constant", "none", "none", "none"]
+    mine = result.fit.strip == 3
+    height_sigma = result.fit.position_sigma_l[mine, 2]
+    assert (np.abs(result.fit.position_l[mine, 2] - 0.15) < 3.5 * height_sigma).all()
+    assert (height_sigma < 0.02).all()
+    in_plan = np.abs(result.fit.position_l[mine, :2])
+    assert in_plan.max() < 0.01
+    assert (in_plan < 0.1 * result.fit.position_sigma_l[mine, :2]).all()
+    monkeypatch.setattr(strip_functions, "LEAST_KNOWN", 0.0)
+    assert np.abs(adjusted(bad, poor).fit.position_l[mine, :2]).max() > 0.02
+
+
 def test_many_strips_get_one_model(clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strip_functions, "MOST_CHOSEN_SINGLY", 3)
     flight, features = clean
