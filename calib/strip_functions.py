@@ -260,18 +260,28 @@ class _Choice:
         return int(np.flatnonzero((flown == key[0]) & (strip == key[1]))[0])
 
     def choose(self, quadratic: _Quadratic) -> None:
-        """By the criterion: all alike first, then strip by strip until no strip wants another."""
+        """By the criterion: all alike first, then strip by strip until no strip wants another.
+
+        Without control one strip can be left as it is for nothing, and the others are moved to it: those that the
+        whole moves least come first.
+        """
         alike = [[model] * len(self._keys) for model in self._settings.models]
         self.models = min([self.models, *alike], key=lambda models: self._criterion(quadratic, models))
         if len(self._keys) > MOST_CHOSEN_SINGLY:
             return
         for _ in range(MOST_SWEEPS):
             before = list(self.models)
-            for number in range(len(self._keys)):
+            for number in self._least_moved_first(quadratic):
                 found = self._tried(quadratic, number)
                 self.models[number] = min(found, key=lambda model: found[model])
             if self.models == before:
                 return
+
+    def _least_moved_first(self, quadratic: _Quadratic) -> list[int]:
+        moved = _solution(quadratic, *self._whole(self.models))[0].reshape(-1, ERRORS)
+        moved /= np.repeat([self._settings.position_m, self._settings.turn_rad], 3)
+        size = [float(np.mean(moved[at] ** 2)) for at in self._at]
+        return sorted(range(len(size)), key=lambda number: size[number])
 
     def solved(self, quadratic: _Quadratic) -> tuple[FloatArray, FloatArray, float]:
         """(k, 6) corrections, their sigmas, and the number of parameters determined."""

@@ -115,6 +115,22 @@ def test_a_bend_is_a_spline_and_only_with_knots_to_bend_at(clean: tuple[Flight, 
     assert adjusted(bad, features, knot_s=3.0, criterion="aicc").choices[1].model == "spline"
 
 
+@pytest.mark.parametrize("lifts", [{1: 0.15}, {6: 0.15}, {1: 0.15, 3: 0.1}, {1: -0.1, 2: 0.1}])
+def test_the_strips_that_are_moved_are_those_apart(clean: tuple[Flight, Features], lifts: dict[int, float]) -> None:
+    """Whichever they are: the others agree, and none of them goes where one that is wrong lies."""
+    flight, features = clean
+    bad = flight
+    for strip, lift in lifts.items():
+        bad = spoilt(bad, strip, np.tile([0.0, 0.0, lift, 0.0, 0.0, 0.0], (2, 1)))
+    result = adjusted(bad, features)
+    models = {choice.strip: choice.model for choice in result.choices}
+    assert models == {strip: "constant" if strip in lifts else "none" for strip in range(1, 7)}
+    for strip, lift in lifts.items():
+        mine = result.fit.strip == strip
+        off = np.abs(result.fit.position_l[mine, 2] - lift)
+        assert (off < 3.5 * result.fit.position_sigma_l[mine, 2]).all()
+
+
 def test_a_common_shift_is_seen_by_control_alone(clean: tuple[Flight, Features]) -> None:
     """All strips 12 cm too high: nothing without control; with it, within a centimetre."""
     flight, features = clean
