@@ -180,7 +180,7 @@ def _fit(free: TrajectoryPrior, along: FloatArray, sigma: FloatArray, prior: Flo
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l, all else eliminated."""
+    """χ²(x) = constant − 2 right · x + x · normal x, of corrections x (6k,) in l, or of their parameters."""
 
     normal: FloatArray
     right: FloatArray
@@ -190,6 +190,10 @@ class _Quadratic:
     def square(self, x: FloatArray) -> float:
         """χ²."""
         return float(self.constant - 2.0 * self.right @ x + x @ self.normal @ x)
+
+    def of(self, basis: FloatArray) -> _Quadratic:
+        """χ² of parameters (u,) with x = basis · parameters."""
+        return _Quadratic(basis.T @ self.normal @ basis, basis.T @ self.right, self.constant, self.observations)
 
 
 class _Equations:
@@ -240,24 +244,64 @@ def _reduced_square(found: Normals) -> float:
     return found.square - sum(float(one.right @ one.inverse @ one.right) for one in features)
 
 
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Parameters with prior sigmas of 1, where χ² and their prior are least together.
+
+    What the returns know little of keeps its prior, zero: the best estimate would be mostly their noise.
+
+    Attributes:
+        values: (u,).
+        parameters: how many of them the returns determine.
+        square: χ² with them.
+        known, axes: (u,) how much more than the prior the returns know along axes (u, u).
+    """
+
+    values: FloatArray
+    parameters: float
+    square: float
+    known: FloatArray
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, quadratic: _Quadratic, columns: Int64Array) -> _Solved:
+        """Of some parameters, the others held at zero."""
+        known, axes = np.linalg.eigh(quadratic.normal[np.ix_(columns, columns)])
+        taken = known > LEAST_KNOWN
+        right = axes[:, taken].T @ quadratic.right[columns]
+        best = right / (1.0 + known[taken])
+        square = quadratic.constant - 2.0 * float(right @ best) + float(known[taken] @ best**2)
+        return cls(axes[:, taken] @ best, float(np.sum(known[taken] / (1.0 + known[taken]))), square, known, axes)
+
+    def covariance(self) -> FloatArray:
+        """(u, u); 1 along axes that keep their prior."""
+        spread = np.where(self.known > LEAST_KNOWN, 1.0 / (1.0 + np.maximum(self.known, 0.0)), 1.0)
+        covariance: FloatArray = self.axes * spread @ self.axes.T
+        return covariance
+
+
 class _Choice:
-    """Which strip gets which model."""
+    """Which strip gets which model.
+
+    A model's parameters are the first ones of every richer model: those of the richest are worked out once.
+    """
 
     def __init__(self, flown: Int64Array, strip: Int64Array, settings: Settings) -> None:
         self._settings = settings
-        keys = sorted(
-            {(int(a), int(b)) for a, b in zip(flown, strip, strict=True)},
-            key=lambda key: self._first(flown, strip, key),
-        )
-        self._keys = keys
-        self._at = [np.flatnonzero((flown == key[0]) & (strip == key[1])) for key in keys]
-        self._bases = [{model: _basis(model, len(at), settings) for model in settings.models} for at in self._at]
-        self.models = [settings.models[0]] * len(keys)
-        self._size = ERRORS * len(flown)
-
-    @staticmethod
-    def _first(flown: Int64Array, strip: Int64Array, key: tuple[int, int]) -> int:
-        return int(np.flatnonzero((flown == key[0]) & (strip == key[1]))[0])
+        firsts = np.unique(np.stack([flown, strip], axis=1), axis=0, return_index=True)[1]
+        self._keys = [(int(flown[at]), int(strip[at])) for at in sorted(firsts.tolist())]
+        self._at = [np.flatnonzero((flown == key[0]) & (strip == key[1])) for key in self._keys]
+        self.models = [settings.models[0]] * len(self._keys)
+        self._columns: list[dict[str, Int64Array]] = []
+        bases, begin = [], 0
+        for at in self._at:
+            own = {model: _basis(model, len(at), settings) for model in settings.models}
+            self._columns.append({model: begin + np.arange(basis.shape[1]) for model, basis in own.items()})
+            richest = max(own.values(), key=lambda basis: basis.shape[1])
+            bases.append(np.zeros((ERRORS * len(flown), richest.shape[1])))
+            bases[-1][(ERRORS * at[:, np.newaxis] + np.arange(ERRORS)).ravel()] = richest
+            begin += richest.shape[1]
+        self._basis = np.concatenate(bases, axis=1)
 
     def choose(self, quadratic: _Quadratic) -> None:
         """By the criterion: all alike first, then strip by strip until no strip wants another.
@@ -265,44 +309,47 @@ class _Choice:
         Without control one strip can be left as it is for nothing, and the others are moved to it: those that the
         whole moves least come first.
         """
+        of_all = quadratic.of(self._basis)
         alike = [[model] * len(self._keys) for model in self._settings.models]
-        self.models = min([self.models, *alike], key=lambda models: self._criterion(quadratic, models))
+        self.models = min([self.models, *alike], key=lambda models: self._criterion(of_all, models))
         if len(self._keys) > MOST_CHOSEN_SINGLY:
             return
         for _ in range(MOST_SWEEPS):
             before = list(self.models)
-            for number in self._least_moved_first(quadratic):
-                found = self._tried(quadratic, number)
+            for number in self._least_moved_first(of_all):
+                found = self._tried(of_all, number)
                 self.models[number] = min(found, key=lambda model: found[model])
             if self.models == before:
                 return
 
-    def _least_moved_first(self, quadratic: _Quadratic) -> list[int]:
-        moved = _solution(quadratic, *self._whole(self.models))[0].reshape(-1, ERRORS)
+    def _least_moved_first(self, of_all: _Quadratic) -> list[int]:
+        columns = self._taken(self.models)
+        moved = (self._basis[:, columns] @ _Solved.of(of_all, columns).values).reshape(-1, ERRORS)
         moved /= np.repeat([self._settings.position_m, self._settings.turn_rad], 3)
         size = [float(np.mean(moved[at] ** 2)) for at in self._at]
         return sorted(range(len(size)), key=lambda number: size[number])
 
     def solved(self, quadratic: _Quadratic) -> tuple[FloatArray, FloatArray, float]:
         """(k, 6) corrections, their sigmas, and the number of parameters determined."""
-        basis, weight = self._whole(self.models)
-        x, covariance, parameters = _solution(quadratic, basis, weight)
-        spread = np.sqrt(np.maximum(np.einsum("ia,ab,ib->i", basis, covariance, basis), 0.0))
-        factor = np.sqrt(max(1.0, quadratic.square(x) / max(quadratic.observations - parameters, 1.0)))
-        return x.reshape(-1, ERRORS), factor * spread.reshape(-1, ERRORS), parameters
+        basis = self._basis[:, self._taken(self.models)]
+        found = _Solved.of(quadratic.of(basis), np.arange(basis.shape[1]))
+        spread = np.sqrt(np.maximum(np.einsum("ia,ia->i", basis @ found.covariance(), basis), 0.0))
+        factor = np.sqrt(max(1.0, found.square / max(quadratic.observations - found.parameters, 1.0)))
+        x, sigmas = basis @ found.values, factor * spread
+        return x.reshape(-1, ERRORS), sigmas.reshape(-1, ERRORS), found.parameters
 
     def prior_sigmas(self) -> FloatArray:
         """(k, 6) of the models chosen."""
-        basis, weight = self._whole(self.models)
-        sigmas: FloatArray = np.sqrt((basis**2) @ (1.0 / weight)) if len(weight) else np.zeros(self._size)
+        sigmas: FloatArray = np.sqrt(np.sum(self._basis[:, self._taken(self.models)] ** 2, axis=1))
         return sigmas.reshape(-1, ERRORS)
 
     def told(self, quadratic: _Quadratic) -> tuple[StripChoice, ...]:
         """A strip each."""
+        of_all = quadratic.of(self._basis)
         singly = len(self._keys) <= MOST_CHOSEN_SINGLY
         told = []
         for number, (flown, strip) in enumerate(self._keys):
-            found = self._tried(quadratic, number) if singly else {}
+            found = self._tried(of_all, number) if singly else {}
             chosen = found.get(self.models[number], 0.0)
             gains = {model: value - chosen for model, value in found.items()}
             told.append(StripChoice(flown, strip, self.models[number], gains))
@@ -318,64 +365,35 @@ class _Choice:
             notes.append(f"{len(self._keys)} strips, more than {MOST_CHOSEN_SINGLY}: all got the same model")
         return tuple(notes)
 
-    def _tried(self, quadratic: _Quadratic, number: int) -> dict[str, float]:
+    def _tried(self, of_all: _Quadratic, number: int) -> dict[str, float]:
         """Criterion by model of one strip, the others as they are."""
         found = {}
         for model in self._settings.models:
             models = [*self.models[:number], model, *self.models[number + 1 :]]
-            found[model] = self._criterion(quadratic, models)
+            found[model] = self._criterion(of_all, models)
         return found
 
-    def _criterion(self, quadratic: _Quadratic, models: Sequence[str]) -> float:
-        x, _, k = _solution(quadratic, *self._whole(models))
-        n = quadratic.observations
-        fit = n * np.log(max(quadratic.square(x), 1e-12 * n) / n)
+    def _criterion(self, of_all: _Quadratic, models: Sequence[str]) -> float:
+        found, n = _Solved.of(of_all, self._taken(models)), of_all.observations
+        k, fit = found.parameters, n * np.log(max(found.square, 1e-12 * n) / n)
         if self._settings.criterion == "bic":
             return float(fit + k * np.log(n))
         return float(fit + 2.0 * k + 2.0 * k * (k + 1.0) / max(n - k - 1.0, 1.0))
 
-    def _whole(self, models: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """(6k, u) what each parameter does; (u,) weights of their priors."""
-        bases, weights = [], []
-        for at, own, model in zip(self._at, self._bases, models, strict=True):
-            shape, weight = own[model]
-            rows = np.zeros((self._size, shape.shape[1]))
-            rows[(ERRORS * at[:, np.newaxis] + np.arange(ERRORS)).ravel()] = shape
-            bases.append(rows)
-            weights.append(weight)
-        return np.concatenate(bases, axis=1), np.concatenate(weights)
+    def _taken(self, models: Sequence[str]) -> Int64Array:
+        """(u,) columns of the basis that these models have."""
+        return np.concatenate([own[model] for own, model in zip(self._columns, models, strict=True)])
 
 
-def _basis(model: str, knots: int, settings: Settings) -> tuple[FloatArray, FloatArray]:
-    """Of one strip: (6 knots, u), and weights 1 / σ² (u,)."""
+def _basis(model: str, knots: int, settings: Settings) -> FloatArray:
+    """(6 knots, u) of one strip, each parameter in prior sigmas."""
     constant = np.repeat([settings.position_m, settings.turn_rad], 3)
     tau = np.linspace(-1.0, 1.0, knots)[:, np.newaxis]
-    shapes = {"none": [], "constant": [np.ones((knots, 1))], "linear": [np.ones((knots, 1)), tau]}
-    sigmas = [constant, 0.5 * constant]
-    if model == "spline":
-        bends = np.diff(np.eye(knots), n=2, axis=0)
-        along = [np.ones((knots, 1)), tau, *np.split(np.linalg.pinv(bends), max(knots - 2, 1), axis=1)][: max(knots, 2)]
-        sigmas += [np.repeat([settings.bend_m, settings.bend_rad], 3)] * (len(along) - 2)
-    else:
-        along = shapes[model]
-    basis = [np.kron(shape, np.eye(ERRORS)) for shape in along]
-    if not basis:
-        return np.zeros((ERRORS * knots, 0)), np.zeros(0)
-    return np.concatenate(basis, axis=1), np.concatenate([sigma**-2.0 for sigma in sigmas[: len(basis)]])
-
-
-def _solution(quadratic: _Quadratic, basis: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Corrections (6k,), covariance of the parameters (u, u), and how many of them the returns determine.
-
-    What the returns know little of keeps its prior, zero: the best estimate would be mostly their noise.
-    """
-    if not len(weight):
-        return np.zeros(len(basis)), np.zeros((0, 0)), 0.0
-    prior = basis * weight**-0.5  # of parameters whose prior sigmas are 1
-    known, axes = np.linalg.eigh(prior.T @ quadratic.normal @ prior)
-    taken = known > LEAST_KNOWN
-    axes_x = prior @ axes[:, taken]
-    x = axes_x @ ((axes_x.T @ quadratic.right) / (1.0 + known[taken]))
-    left = axes * np.where(taken, 1.0 / (1.0 + np.maximum(known, 0.0)), 1.0) @ axes.T
-    covariance = left / np.sqrt(np.outer(weight, weight))
-    return x, covariance, float(np.sum(known[taken] / (1.0 + known[taken])))
+    along, sigmas = [np.ones((knots, 1)), tau], [constant, 0.5 * constant]
+    if knots > 2:
+        bends = np.split(np.linalg.pinv(np.diff(np.eye(knots), n=2, axis=0)), knots - 2, axis=1)
+        along += bends
+        sigmas += [np.repeat([settings.bend_m, settings.bend_rad], 3)] * len(bends)
+    count = {"none": 0, "constant": 1, "linear": 2, "spline": len(along)}[model]
+    basis = [np.kron(shape, np.diag(sigma)) for shape, sigma in zip(along[:count], sigmas[:count], strict=True)]
+    return np.concatenate([np.zeros((ERRORS * knots, 0)), *basis], axis=1)

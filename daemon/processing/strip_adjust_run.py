@@ -176,7 +176,7 @@ def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     tell("planes", 0, 1)
     features = features_of(flight)
     tell("adjustment", 0, 1)
-    first = adjust_strips(flight, features, calibrations, wish.settings)
+    first = adjust_strips(flight, features, calibrations, replace(wish.settings, linearisations=1))
     tell("planes again", 0, 1)  # what errors of the trajectory had left apart lies on each other now
     features = features_of(moved(first, "matched"))
     _refuse_lost_control(wish, features)
