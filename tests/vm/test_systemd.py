@@ -99,7 +99,8 @@ def test_both_services_are_enabled_and_started_at_boot(service: Machine) -> None
     assert service.told("systemctl is-enabled swathd swath-live").split() == ["enabled", "enabled"]
     assert shown(service, "ActiveState") == "active"
     assert shown(service, "User") == "swath"
-    service.until("systemctl show -P ActiveState swath-live | grep -E '^(activating|active)$'")  # it comes after the other
+    # it comes after the other
+    service.until("systemctl show -P ActiveState swath-live | grep -E '^(activating|active)$'")
 
 
 def test_ready_is_said_after_recording_has_begun(service: Machine) -> None:
