@@ -22,7 +22,10 @@ COMES_BACK_S = 400.0  # measures nothing
 KILLS = 20
 SESSION = "split_minutes = 1440\n"
 RULES = 'SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"\n'
-USB = ["-device", "qemu-xhci", "-chardev", "null,id=ftdi", "-device", "usb-serial,chardev=ftdi,serial=FT4XYZ12"]
+USB = [
+    *("-device", "qemu-xhci", "-chardev", "null,id=ftdi"),
+    *("-device", "usb-serial,chardev=ftdi,serial=FT4XYZ12,always-plugged=on"),
+]
 
 # the sandbox of a unit around another program, which must not be taken for the service
 _OTHERWISE = {
@@ -209,7 +212,7 @@ def test_a_full_disk_ends_the_part_and_room_begins_another(service: Machine, pla
 def test_shutdown_ends_the_log(service: Machine, place: Path) -> None:
     last = newest_log(service)
     restarts = int(shown(service, "NRestarts"))
-    service.shell("systemctl --no-block poweroff")
+    service.told("systemd-run -q --on-active=3 systemctl poweroff")
     service.qemu.wait(COMES_BACK_S)
     machine.copy_from_disk(place / "disk", "/", place / "after")
     content = read_log(place / "after" / last)
