@@ -194,6 +194,7 @@ def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines
                 overlay=overlay,
                 layers=with_udev(),
                 qemu=qemu,
+                kernel=["net.ifnames=0"],
                 memory_mb=1536,
                 timeout_s=1200,
             ) as computer:
