@@ -456,7 +456,7 @@ def test_any_taxiway_leads_to_the_runway(taxi_m: float) -> None:
 # ---------------------------------------------------------------------------------------------- presets and mistakes
 
 
-@pytest.mark.parametrize(("name", "longest_s"), [("small", 150.0), ("calibration", 480.0), ("corridor", 300.0)])
+@pytest.mark.parametrize(("name", "longest_s"), [("small", 150.0), ("calibration", 680.0), ("corridor", 300.0)])
 def test_presets_can_be_flown(name: str, longest_s: float) -> None:
     plan = load_plan(name).changed({"flight": {"turbulence": "none"}})
     trajectory = fly(plan, Site.at(*plan.tables.flight.origin_deg), flat)
