@@ -43,7 +43,7 @@ GRADES = {
     "rtk": Grade(
         fix=FixType.RTK_FIXED,
         white_m=(0.008, 0.008, 0.015),
-        slow_m=(((0.004, 0.004, 0.008), 10.0), ((0.006, 0.006, 0.012), 100.0)),
+        slow_m=(((0.004, 0.004, 0.008), 10.0), ((0.006, 0.006, 0.012), 60.0)),
         velocity_mps=(0.010, 0.010, 0.020),
         satellites=20,
         float_s=10.0,
@@ -51,7 +51,7 @@ GRADES = {
     "ppk": Grade(
         fix=FixType.RTK_FIXED,
         white_m=(0.004, 0.004, 0.008),
-        slow_m=(((0.006, 0.006, 0.012), 100.0),),
+        slow_m=(((0.006, 0.006, 0.012), 60.0),),
         velocity_mps=(0.006, 0.006, 0.012),
         satellites=20,
         float_s=3.0,

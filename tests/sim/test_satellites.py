@@ -19,8 +19,8 @@ from tests.sim.circling import TO_E, Circling, FloatArray, Standing, geodetic, n
 LEVER_ARM = [0.8, -0.6, -1.9]
 # North, east, down; white part, then (correlated part, correlation time)
 ERRORS: dict[str, tuple[list[float], list[tuple[list[float], float]]]] = {
-    "rtk": ([0.008, 0.008, 0.015], [([0.004, 0.004, 0.008], 10.0), ([0.006, 0.006, 0.012], 100.0)]),
-    "ppk": ([0.004, 0.004, 0.008], [([0.006, 0.006, 0.012], 100.0)]),
+    "rtk": ([0.008, 0.008, 0.015], [([0.004, 0.004, 0.008], 10.0), ([0.006, 0.006, 0.012], 60.0)]),
+    "ppk": ([0.004, 0.004, 0.008], [([0.006, 0.006, 0.012], 60.0)]),
     "spp": ([0.2, 0.2, 0.2], [([1.2, 1.2, 2.0], 180.0)]),
 }
 LIMIT = 4.5  # sigmas of an estimate
