@@ -7,6 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
+from daemon.log.chunks import json_objects
 from daemon.log.reader import open_logs
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight
@@ -116,3 +117,15 @@ def numbers(paths: list[Path]) -> dict[str, list[int]]:
                     text += data
     found["serial"] = [int(number) for number in re.findall(rb"\$P,(\d{10})\r\n", text)]
     return dict(found)
+
+
+def event_codes(path: Path) -> list[str]:
+    """The codes of a log's events, in order; the log is whole."""
+    (session,) = open_logs([path])
+    found = [
+        str(event["code"])
+        for batch in session.batches(lambda topic: topic == "/events")
+        for _, event in json_objects(batch)
+    ]
+    assert not session.damage, session.damage
+    return found
