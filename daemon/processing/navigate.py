@@ -75,7 +75,12 @@ class NavigatedLeg:
         rows = self.solved.forward.innovations
         fixes = sorted(set(rows["fix_type"][rows["kind"] == Kind.POSITION].tolist()))
         scales = {fix: self.setup.gnss_sigma_scale[fix] for fix in fixes if fix in self.setup.gnss_sigma_scale}
-        return {f"positions, {FixType(fix).name.lower().replace('_', ' ')}": scale for fix, scale in scales.items()}
+        whiter = {fix: self.setup.gnss_white_scale[fix] for fix in fixes if fix in self.setup.gnss_white_scale}
+        names = {fix: FixType(fix).name.lower().replace("_", " ") for fix in fixes}
+        return {f"positions, {names[fix]}": scale for fix, scale in scales.items()} | {
+            f"positions, {names[fix]}, from epoch to epoch": scales.get(fix, 1.0) * scale
+            for fix, scale in whiter.items()
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -213,6 +213,7 @@ class Setup:
         node_s: longest time between nodes of the smoother.
         step_s: longest step of the covariance.
         gnss_sigma_scale: by fix type, factor on positions' sigmas (as found by an earlier pass).
+        gnss_white_scale: by fix type, a further factor on that part of them which is not time-correlated.
     """
 
     noise: ImuNoise
@@ -234,6 +235,7 @@ class Setup:
     node_s: float = 1.0
     step_s: float = 0.1
     gnss_sigma_scale: dict[int, float] = field(default_factory=dict)
+    gnss_white_scale: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,6 +77,7 @@ class Rules(NamedTuple):
         arms_b: (k, 3) lever arms; baseline_b: (3,), nan: none.
         share: of GNSS positions' variance that is slow.
         position_floor_m, position_scale: (fix types,).
+        white_scale: (fix types,) of the part that is not slow.
         velocity_floor_mps, attitude_floor_rad: the least sigmas.
         gate: (4,) χ² of the gate by number of components.
         reject: factor on it.
@@ -88,6 +89,7 @@ class Rules(NamedTuple):
     share: float
     position_floor_m: FloatArray
     position_scale: FloatArray
+    white_scale: FloatArray
     velocity_floor_mps: float
     attitude_floor_rad: float
     gate: FloatArray
@@ -106,6 +108,7 @@ def rules_of(setup: Setup) -> Rules:
         float(setup.gnss_correlated_share),
         np.array(floors),
         np.array([float(setup.gnss_sigma_scale.get(int(fix), 1.0)) for fix in FixType]),
+        np.array([float(setup.gnss_white_scale.get(int(fix), 1.0)) for fix in FixType]),
         float(setup.velocity_floor_mps),
         float(setup.attitude_floor_rad),
         gate,
@@ -189,11 +192,13 @@ def _position(
         if layout.time_offset >= 0:
             rows[i, layout.time_offset] = dot(a, plus(moving, offset_s, acceleration))
     if layout.slow >= 0:
-        _add_slow(x, rules, layout, nu, rows, noise)
+        _add_slow(x, rules, layout, fix, nu, rows, noise)
 
 
 @kernel
-def _add_slow(x: FloatArray, rules: Rules, layout: Layout, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
+def _add_slow(
+    x: FloatArray, rules: Rules, layout: Layout, fix: int, nu: FloatArray, rows: FloatArray, noise: FloatArray
+) -> None:
     """The time-correlated share of a position's error."""
     factor = noise.copy()
     if not factorise(factor, 3):
@@ -204,7 +209,7 @@ def _add_slow(x: FloatArray, rules: Rules, layout: Layout, nu: FloatArray, rows:
             rows[i, layout.slow + j] = root * factor[i, j]
             nu[i] -= root * factor[i, j] * x[SLOW + j]
         for j in range(3):
-            noise[i, j] *= 1.0 - rules.share
+            noise[i, j] *= (1.0 - rules.share) * rules.white_scale[fix] ** 2
 
 
 @kernel

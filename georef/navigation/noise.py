@@ -84,10 +84,11 @@ def log_likelihood(innovations: StructArray) -> float:
     return float(-0.5 * (told["log_det"] + weight * np.log1p(told["chi2"] / TAILS)).sum())
 
 
-def moment_scales(setup: Setup, innovations: StructArray) -> dict[int, float]:
-    """Factors on positions' sigmas, by fix type, with which innovations are as large as predicted; empty: they are.
+def by_moments(setup: Setup, innovations: StructArray) -> Setup:
+    """The setup, with positions' sigmas by fix type such that innovations are as large as predicted; itself: they are.
 
-    For a setup that says how much of the errors lasts: innovations hardly show that share, which stays.
+    For a setup that says how much of the errors lasts, which innovations hardly show. Where they are larger, all of it
+    is; where they are smaller, only the part that does not last: what lasts is as the receiver's sigmas have it.
     """
     moments, counts = second_moments(innovations)
     off = {
@@ -96,9 +97,11 @@ def moment_scales(setup: Setup, innovations: StructArray) -> dict[int, float]:
         if counts[fix] >= ENOUGH and not LET_BE[0] <= moment <= LET_BE[1]
     }
     known = setup.gnss_sigma_scale
-    return {
-        fix: min(max(known.get(fix, 1.0) * factor, MOMENT_SCALES[0]), MOMENT_SCALES[1]) for fix, factor in off.items()
-    }
+    larger = {fix: min(known.get(fix, 1.0) * factor, MOMENT_SCALES[1]) for fix, factor in off.items() if factor > 1.0}
+    whiter = {fix: max(factor, MOMENT_SCALES[0]) for fix, factor in off.items() if factor < 1.0}
+    if not off:
+        return setup
+    return replace(setup, gnss_sigma_scale=known | larger, gnss_white_scale=setup.gnss_white_scale | whiter)
 
 
 def find_noise(innovations: StructArray, stretch: Callable[[Setup], StructArray], setup: Setup) -> NoiseFound:

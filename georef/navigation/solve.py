@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.filter import FilterRun, run_filter
 from georef.navigation.inputs import Inertial, Kind, Setup, Solution, Start
-from georef.navigation.noise import NoiseFound, find_noise, moment_scales, scaled
+from georef.navigation.noise import NoiseFound, by_moments, find_noise, scaled
 from georef.navigation.smoother import SmoothedNodes, forward, smooth_nodes, solution_of
 from georef.navigation.stores import IN_MEMORY, Storage
 from georef.navigation.strapdown import ATTITUDE, TIME_OFFSET
@@ -111,8 +111,7 @@ def _by_the_flight(
 ) -> tuple[Setup, NoiseFound | None]:
     """The setup, or one that goes by the noise of GNSS positions that a run with it showed; and what was tried."""
     if setup.gnss_correlated_share > 0.0:
-        scales = moment_scales(setup, run.innovations)
-        return (replace(setup, gnss_sigma_scale=setup.gnss_sigma_scale | scales) if scales else setup), None
+        return by_moments(setup, run.innovations), None
     if setup.gnss_sigma_scale:
         return setup, None
     found = _noise(inertial, observations, setup, start, run)
