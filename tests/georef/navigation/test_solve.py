@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.navigation.inputs import GRADES, Inertial, Kind, Start
+from georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Inertial, Kind, Setup, Start
+from georef.navigation.noise import by_moments
 from georef.navigation.solve import solve
+from georef.records import FixType, StructArray
 from georef.rotations import attitude_of
-from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, setup_for, survey
+from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import flight_errors, of_maxima, off_fixes, rms, start_of, without
 from tests.georef.navigation.vehicles import NAVIGATION, car, ns, reference
 
@@ -104,3 +106,40 @@ def test_what_a_flight_says_nothing_of_is_told() -> None:
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 12)
     setup = replace(setup_for(GRADES["tactical"], ARM), estimate_lever_arm=0.05)
     assert "lever arm x" in solve(inertial, rows, setup, drawn_start(truth, 12)).report.weak
+
+
+def told(normalised_sigma: float) -> StructArray:
+    """Innovations of fixed positions, so many times as large as predicted."""
+    rows = np.zeros(900, INNOVATION_DTYPE)
+    rows["kind"], rows["fate"], rows["fix_type"] = Kind.POSITION, Fate.TAKEN, FixType.RTK_FIXED
+    rows["normalised"] = normalised_sigma * np.random.default_rng(4).standard_normal(rows["normalised"].shape)
+    return rows
+
+
+def test_innovations_that_are_smaller_say_nothing_of_what_lasts() -> None:
+    """Larger ones scale all of the error, smaller ones the white part only, others nothing."""
+    fixed = int(FixType.RTK_FIXED)
+    setup = Setup(GRADES["tactical"], gnss_correlated_share=0.5, gnss_sigma_scale={fixed: 1.4})
+    assert by_moments(setup, told(1.1)) == setup
+    larger, smaller = by_moments(setup, told(2.0)), by_moments(setup, told(0.7))
+    assert larger.gnss_sigma_scale[fixed] == pytest.approx(2.8, rel=0.05)
+    assert larger.gnss_white_scale == {}
+    assert smaller.gnss_sigma_scale == setup.gnss_sigma_scale
+    assert smaller.gnss_white_scale[fixed] == pytest.approx(0.7, rel=0.05)
+
+
+def test_an_error_that_lasts_and_is_larger_than_the_white_one_keeps_its_sigma() -> None:
+    """1.2 cm that last a minute beside 6 mm from epoch to epoch, told as 1.1 cm in all: 12 flights, smoothed."""
+    total_m, squared, truth = 0.0134, [], fly(survey(), FLIGHT_S, 50.0)
+    fixed = {int(FixType.RTK_FIXED): np.sqrt(2.0)}
+    for seed in range(12):
+        inertial, rows = noised(truth, GRADES["tactical"], Fixes((total_m,) * 3, share=0.8, rate_hz=5.0), ARM, seed)
+        rows["sigma"] *= 0.8
+        setup = replace(setup_for(GRADES["tactical"], ARM), gnss_correlated_share=0.5, gnss_sigma_scale=fixed)
+        solved = solve(inertial, rows, setup, drawn_start(truth, seed))
+        assert solved.report.setup.gnss_white_scale
+        found = solved.smoothed
+        t = truth.edges[np.searchsorted(ns(truth.edges), found.time_ns)]
+        off = errors(truth, t, found.position_e, found.velocity_e, found.q_e_from_b)[:, :3]
+        squared.append((off / found.position_sigma_l) ** 2)
+    assert 0.75 < np.mean(squared) < 1.75
