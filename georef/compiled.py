@@ -54,7 +54,7 @@ def kept(function: Compiled) -> Compiled:
         compiled = _njit(cache=True, **options)(function)
         index = compiled._cache._cache_file  # noqa: SLF001  (numba has no other way in)
         stamp = _digest(Path(function.__code__.co_filename).parent)
-        index._source_stamp = (index._source_stamp, stamp)  # noqa: SLF001
+        index._source_stamp = (index._source_stamp, stamp)  # noqa: SLF001  (nor for its stamp)
     except (RuntimeError, AttributeError):
         compiled = _njit(**options)(function)
     kept_one: Compiled = compiled

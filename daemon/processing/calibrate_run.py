@@ -35,12 +35,12 @@ from calib.plane_settings import PlaneError, PlaneSettings
 from calib.prealign import PrealignError, prealign
 from calib.profile_check import Check, check
 from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
-from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
+from daemon.errors import UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import refuse_installations
+from daemon.processing.user_errors import told_in_a_line
 from georef.calibration import Calibration
 from georef.mapping import MappingError
 from georef.navigation.cross_covariance import error_chain
@@ -135,14 +135,8 @@ def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     Raises:
         UserError: it cannot be, one line.
     """
-    try:
+    with told_in_a_line(folder, *REFUSED):
         return _calibrate(wish, folder, tell)
-    except REFUSED as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
-    except OSError as error:
-        raise UserError(f"{error.filename or folder}: {error.strerror or error}", ExitCode.IO) from error
 
 
 def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:

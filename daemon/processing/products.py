@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
 from daemon.processing import refusals
 from daemon.processing.flights import EIGHT_BIT, INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
 from daemon.processing.unread import unread_lines
+from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.workers import run_jobs
 from georef.formats.las import LasSettings
 from georef.formats.sbet import sbet_bytes, smrmsg_bytes
@@ -55,17 +55,11 @@ def georeference(wish: Wish, tell: Tell) -> Report:
     Raises:
         UserError: they cannot be made, one line; nothing that looks like a product is left then.
     """
-    try:
+    with told_in_a_line(wish.output, StripError, JobError, MappingError):
         flights = read_flights(wish, tell)
         names = [flight.session.session_id for flight in flights]
         with _out_of_sight(wish, names) as (partial, into_place):
             return _make(wish, flights, names[0], partial, into_place, tell)
-    except (StripError, JobError, MappingError) as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
-    except OSError as error:
-        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
 
 
 # ---------------------------------------------------------------------- jobs

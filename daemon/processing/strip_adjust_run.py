@@ -26,7 +26,6 @@ from calib.signatures import signatures
 from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
 from calib.strips import StripReport, differences
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, refuse_no_planes
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
@@ -34,6 +33,7 @@ from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import is_of_logs, refuse_installations
 from daemon.processing.trajectory_files import TrajectoryFiles
+from daemon.processing.user_errors import told_in_a_line
 from georef.mapping import MappingError
 from georef.strips import StripError as StripTimesError
 from georef.trajectory import TrajectoryError
@@ -146,14 +146,8 @@ def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrect
             ExitCode.USAGE,
         )
     _refuse_output(wish)
-    try:
+    with told_in_a_line(folder, *REFUSED):
         return _corrected(wish, folder, tell)
-    except REFUSED as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
-    except OSError as error:
-        raise UserError(f"{error.filename or folder}: {error.strerror or error}", ExitCode.IO) from error
 
 
 def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:

@@ -15,10 +15,10 @@ from calib.signatures import Signatures, record_of, signatures
 from calib.strip_cells import StripRules
 from calib.strips import Numbers, StripReport, report_of
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
 from daemon.processing.calibration_flight import read_flight
 from daemon.processing.flights import Wish
 from daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
+from daemon.processing.user_errors import told_in_a_line
 from georef.mapping import MappingError
 from georef.strips import StripError
 
@@ -77,13 +77,9 @@ def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
     Raises:
         UserError: it cannot be, one line.
     """
-    try:
+    with told_in_a_line(folder, FlightError, StripError, MappingError):
         now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
         then = _judged(_read(wish.before, wish, folder / "before", told), wish, told) if wish.before else None
-    except (FlightError, StripError, MappingError) as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
     pictures = _draw(wish, now, then)
     if wish.output is not None:

@@ -12,7 +12,6 @@ from typing import IO, Any
 import numpy as np
 
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
 from daemon.log.reader import Session, open_logs
 from daemon.processing.event_marks import EventTable, event_table
 from daemon.processing.ins_as_is import ins_as_is
@@ -26,6 +25,7 @@ from daemon.processing.trajectory_files import (
     write_trajectory,
 )
 from daemon.processing.trajectory_summary import pages_of, summary_head, summary_of_run, write_json
+from daemon.processing.user_errors import told_in_a_line
 from georef.trajectory import Trajectory, TrajectoryError, gps_text
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -70,7 +70,7 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
     Raises:
         UserError: there is no trajectory, a line each; no file is left then.
     """
-    try:
+    with told_in_a_line(wish.output, TrajectoryError):
         sessions = open_logs(wish.logs)
         files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
         if not wish.overwrite:
@@ -79,12 +79,6 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
             return _write_as_is(wish, files, _in_order(sessions))
         flights = [navigate_session(session, wish.navigate, tell) for session in _in_order(sessions)]
         return _write(wish, files, flights, tell)
-    except TrajectoryError as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
-    except OSError as error:
-        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
 
 
 def _in_order(sessions: Sequence[Session]) -> list[Session]:

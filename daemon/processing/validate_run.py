@@ -18,13 +18,13 @@ from calib.plane_settings import PlaneError
 from calib.record import Document
 from calib.validation import Method, Validation, same_logs, validate
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strips_run import finite, refuse_installations
 from daemon.processing.trajectory_files import put_in_place, remove, write_aside
+from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.validate_record import record_files, records_of
 from georef.calibration import Calibration, CalibrationError, read_calibration
 from georef.mapping import MappingError
@@ -88,7 +88,7 @@ def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
     Raises:
         UserError: it cannot be, one line.
     """
-    try:
+    with told_in_a_line(folder, *REFUSED):
         calibrations = [read_file(path) for path in wish.calibrations]
         found = _Found({one.scanner: one for one in calibrations})
         if wish.histories:
@@ -98,10 +98,6 @@ def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
                 recorded = records_of(list(zip(wish.calibrations, calibrations, strict=True)), wish.record)
                 found.documents, found.notes = recorded.documents, list(recorded.notes)
             _against_logs(wish, found, folder, told)
-    except REFUSED as error:
-        raise UserError(str(error)) from error
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
     return _written(wish, found)
 
 

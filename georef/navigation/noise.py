@@ -96,11 +96,11 @@ def by_moments(setup: Setup, innovations: StructArray) -> Setup:
         for fix, moment in moments.items()
         if counts[fix] >= ENOUGH and not LET_BE[0] <= moment <= LET_BE[1]
     }
+    if not off:
+        return setup
     known = setup.gnss_sigma_scale
     larger = {fix: min(known.get(fix, 1.0) * factor, MOMENT_SCALES[1]) for fix, factor in off.items() if factor > 1.0}
     whiter = {fix: max(factor, MOMENT_SCALES[0]) for fix, factor in off.items() if factor < 1.0}
-    if not off:
-        return setup
     return replace(setup, gnss_sigma_scale=known | larger, gnss_white_scale=setup.gnss_white_scale | whiter)
 
 

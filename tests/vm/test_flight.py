@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import can
@@ -22,8 +23,10 @@ import numpy as np
 import pytest
 
 from daemon.cli.main import run_app
+from daemon.config import load_config
 from daemon.processing.live_points import POINT_DTYPE
 from daemon.sim_wire import CAN_GROUP, free_ports
+from drivers.transports.uri import parse_transport
 from sim.companions import companion_files, config_text
 from sim.fly import VirtualFlight
 from sim.plan import parse_plan
@@ -158,12 +161,23 @@ def aboard(folder: Path, clock_port: int) -> Path:
     return overlay
 
 
-def ends_of(wires: Path) -> dict[str, str]:
-    """The flight's own ends of its wires, as its configuration has them."""
-    text = (wires / "swath.toml").read_text()
-    return {word: text.split(word)[1].split('"')[0].split("?")[0] for word in ("udp:127.0.0.1:", "serial:")} | {
-        "port=": text.split("port=")[1].split('"')[0]
-    }
+@dataclass(frozen=True)
+class Ends:
+    """Where the flight's own ends of its wires are."""
+
+    serial: str
+    udp_port: int
+    can_port: int
+
+    @classmethod
+    def of(cls, wires: Path) -> Ends:
+        """By the configuration beside them."""
+        config = load_config(wires / "swath.toml")
+        receiver, imu, scanner = (
+            parse_transport(one.transport) for one in (config.gnss["rover"], config.imu["main"], config.scanner["left"])
+        )
+        udp_port = int(scanner.address.rpartition(":")[2])
+        return cls(os.path.realpath(receiver.address), udp_port, int(imu.options["port"]))
 
 
 @contextmanager
@@ -175,13 +189,12 @@ def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines
     (stream_port,) = free_ports(1)
     with running(*fly) as flying:
         wait_until((wires / "pps-main").exists, "the last of the wires")
-        ends = ends_of(wires)
-        with Lines(wires, int(ends["port="]), stream_port) as lines:
-            port = os.path.realpath(ends["serial:"])
-            user = f"user,id=net,hostfwd=udp:127.0.0.1:{ends['udp:127.0.0.1:']}-:2368"
+        ends = Ends.of(wires)
+        with Lines(wires, ends.can_port, stream_port) as lines:
+            user = f"user,id=net,hostfwd=udp:127.0.0.1:{ends.udp_port}-:2368"
             qemu = [
                 *machine.disk(disk),
-                *("-chardev", f"serial,id=gnss,path={port}", "-device", "isa-serial,chardev=gnss,index=1"),
+                *("-chardev", f"serial,id=gnss,path={ends.serial}", "-device", "isa-serial,chardev=gnss,index=1"),
                 *("-netdev", f"{user},hostfwd=tcp:127.0.0.1:{stream_port}-:5005"),
                 *("-device", "virtio-net-pci,netdev=net"),
             ]
@@ -226,6 +239,7 @@ def test_flight_from_the_wires_to_points(
     las = laspy.read(next(out.glob("*.laz")))
     truth = np.load(again / "truth.npz")
     record_property("pulses_per_s", PRF_HZ)
+    # returns before the first or after the last sample of the IMU have no pose
     assert len(las) > 0.99 * len(truth["left.gps_ns"]) > PRF_HZ * seconds / 2
     time_ns = np.rint(np.asarray(las.gps_time) * 1e9).astype(np.int64) + 10**18
     sigma = np.stack([np.asarray(las[f"sigma_{name}"]) for name in ("easting", "northing", "height")], axis=1)
