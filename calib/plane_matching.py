@@ -18,7 +18,7 @@ from calib.features import Features, Plane
 from calib.flight import Flight
 from calib.plane_cells import cell_size, keys_of
 from calib.plane_fit import GATE, Sight, fit_sight, refusal
-from calib.plane_returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned
+from calib.plane_returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
 from calib.plane_settings import PlaneSettings
 from georef.records import Int64Array
 
@@ -116,9 +116,12 @@ def _candidates(
                 rows[label] = [*sight.normal_t, sight.normal_t @ sight.centre_t, WIDE_M]
         return returns_near(flight.swaths[index], keys, labels, rows, cell_m)
 
+    order = np.argsort(labels, kind="stable")
+    begin = np.searchsorted(labels[order], np.arange(len(known) + 1))
     for index, of_swath in enumerate(each(found, range(len(flight.swaths)))):
         for label, at in of_swath.items():
-            near[label][index] = at
+            face = keys[order[begin[label] : begin[label + 1]]]
+            near[label][index] = at[well_inside(np.asarray(flight.swaths[index].points_t[at]), face, cell_m)]
     return near
 
 

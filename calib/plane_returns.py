@@ -20,6 +20,7 @@ from georef.records import Int64Array
 FloatArray = NDArray[np.float64]
 
 WIDE_M = 0.5  # within which of a plane returns are looked at
+RIM_M = 0.5  # of a face, whose returns may be of another one
 PURE, PURE_BEFORE = 0.9, 0.75  # share of a cell's returns there that have to lie on the plane
 COMES = 0.9  # share of the gate for what was not of the plane before
 _SAG_SHARE, _SHORTEST = 0.7, 0.3  # of the sag allowed that the middle may have; of a tile that it must have
@@ -61,6 +62,20 @@ def cells_of(points_t: FloatArray, cell_m: float) -> Int64Array:
     columns, rows = columns - columns.min(initial=0), rows - rows.min(initial=0)
     numbers: Int64Array = np.unique(keys_of(columns, rows), return_inverse=True)[1]
     return numbers
+
+
+def well_inside(points_t: FloatArray, keys: Int64Array, cell_m: float) -> NDArray[np.bool_]:
+    """Which of points (n, 3) are at least `RIM_M` inside the cells (c,) of a face, half a cell where cells are small.
+
+    Beyond a ridge the other face stays within the gate for some decimetres, always below: returns from there would make
+    roofs lower, most of all in strips whose gate is wide, which looks like a range scale.
+    """
+    inside = np.ones(len(points_t), np.bool_)
+    rim_m = min(RIM_M, 0.5 * cell_m)
+    for corner_m in ((-rim_m, -rim_m), (-rim_m, rim_m), (rim_m, -rim_m), (rim_m, rim_m)):
+        columns, rows = np.floor((points_t[:, :2] + corner_m).T / cell_m).astype(np.int64)
+        inside &= np.isin(keys_of(columns, rows), keys)
+    return inside
 
 
 def pure(

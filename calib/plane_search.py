@@ -22,7 +22,7 @@ from calib.plane_faces import same_faces
 from calib.plane_fit import GATE, expected_sigma, sensor_t
 from calib.plane_given import given_planes
 from calib.plane_pieces import Pieces, choose, cut
-from calib.plane_returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of
+from calib.plane_returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
 from calib.plane_settings import PlaneError, PlaneSettings
 from georef.records import Int64Array
 
@@ -86,13 +86,17 @@ def _returns(
     normal, centre = segments.normal_t[pieces.segment], segments.moments[pieces.segment, 1:4]
     planes = np.column_stack([normal, (normal * centre).sum(axis=1), np.full(len(normal), WIDE_M)])
     gate_m = GATE * _coarse_sigma(flight, segments, settings)[pieces.segment]
+    by_segment = np.argsort(segments.cell_of, kind="stable")
+    begin = np.searchsorted(segments.cell_of[by_segment], np.arange(len(segments) + 1))
     found: dict[int, dict[int, Int64Array]] = {piece: {} for piece in chosen.tolist()}
     for index, swath in enumerate(flight.swaths):
         mine = cell[segments.swath[segments.cell_of[cell]] == index]
         near = returns_near(swath, segments.cell_key[mine], pieces.cell_sight[mine], planes, cell_m)
         for sight, at in near.items():
             points = np.asarray(swath.points_t[at])
-            at = at[pure(points, planes[sight], float(gate_m[sight]), cells_of(points, cell_m))]
+            face = by_segment[begin[pieces.segment[sight]] : begin[pieces.segment[sight] + 1]]
+            taken = pure(points, planes[sight], float(gate_m[sight]), cells_of(points, cell_m))
+            at = at[taken & well_inside(points, segments.cell_key[face], cell_m)]
             of_piece = found[int(pieces.piece[sight])]
             of_piece[index] = np.sort(np.concatenate([of_piece[index], at])) if index in of_piece else at
     return found

@@ -106,14 +106,15 @@ def test_a_roof_is_one_face_of_the_scene_and_has_its_direction(cast: Cast, found
     assert len(roofs) > 20
     angles, offsets = [], []
     for plane, face, share in roofs:
-        assert share > 0.85, plane.name
+        assert share > 0.99, plane.name  # nothing from beyond the ridge, which would make every roof lower
         assert made_of(cast, plane)[ROOF] > 0.97 * plane.points, plane.name
         true = cast.planes[face]
         angles.append(np.degrees(np.arccos(min(1.0, float(plane.normal_t @ true[:3])))))
-        offsets.append(float(true[:3] @ plane.centre_t - true[3]))
+        offsets.append(float(true[:3] @ plane.centre_t - true[3]) / (plane.rms_m / np.sqrt(plane.points)))
     assert np.median(angles) < 0.06
     assert max(angles) < 0.4
-    assert np.abs(offsets).max() < 0.006
+    assert np.abs(offsets).max() < 4.0
+    assert 0.7 < np.sqrt(np.mean(np.square(offsets))) < 1.3
 
 
 def test_normals_are_as_sure_as_they_say(cast: Cast, flight: Flight, found: Features) -> None:
@@ -162,17 +163,20 @@ def test_nothing_of_trees_water_walls_or_cars_is_a_plane(cast: Cast, found: Feat
         assert counts[[GROUND, ROAD, MARKING]].sum() == plane.points or counts[ROOF] == plane.points, plane.name
 
 
-def test_no_plane_is_curved(cast: Cast, found: Features) -> None:
-    """By the ground without noise, whose tiles are bent by some centimetres."""
-    bent = []
+def test_no_plane_is_curved(cast: Cast, flight: Flight, found: Features) -> None:
+    """By the ground without noise, whose tiles are bent by some centimetres: more than the surest swath could tell."""
+    settings = PlaneSettings()
+    bent, told = [], []
     for plane in of_kind(found, "ground"):
         points = np.concatenate([cast.true_t[patch.swath][patch.at] for patch in plane.patches]) - plane.centre_t
         x, y, z = points.T
         x, y = x / np.ptp(x), y / np.ptp(y)
         design = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
         bent.append(np.abs(np.linalg.lstsq(design, z, rcond=None)[0][3:]).max() / 4.0)
+        sights = [fit_sight(flight, flight.swaths[patch.swath], patch.at, settings) for patch in plane.patches]
+        told.append(max(settings.sag_m, 3.0 * min(sight.sag_sigma_m for sight in sights if sight is not None)))
     assert len(bent) > 10
-    assert max(bent) < 0.02
+    assert (np.array(bent) < told).all()
     assert np.mean(np.array(bent) < 0.011) > 0.9
     assert found.refused["curved"] > 0
 
