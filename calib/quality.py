@@ -22,6 +22,8 @@ from calib.tie_rows import Seen, Ties
 
 FloatArray = NDArray[np.float64]
 
+BLOCK = 1 << 20  # residuals summed up at a time
+
 
 @dataclass(frozen=True, eq=False)
 class Quality:
@@ -143,7 +145,9 @@ def _of_feature(covariance: FloatArray, feature: Feature) -> tuple[FloatArray, F
 
 def _cofactors(solution: Solution, batch: Batch) -> FloatArray:
     """(g, c, c) of the runs' columns."""
-    made = [_cofactor(solution, run) for run in batch.runs]
+    features = {plane: solution.normals.planes[plane] for plane in {run.plane for run in batch.runs}}
+    known = {plane: _of_feature(solution.covariance, feature) for plane, feature in features.items()}
+    made = [_cofactor(solution, run, known[run.plane]) for run in batch.runs]
     widest = max(len(one) for one in made)
     table = np.zeros((len(made), widest, widest))
     for place, one in enumerate(made):
@@ -151,13 +155,12 @@ def _cofactors(solution: Solution, batch: Batch) -> FloatArray:
     return table
 
 
-def _cofactor(solution: Solution, run: Run) -> FloatArray:
-    rows, feature = solution.rows, solution.normals.planes[run.plane]
+def _cofactor(solution: Solution, run: Run, known: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+    rows, (inner, mixed, own) = solution.rows, known
     unknowns, expanded = rows.expansion(run, solution.state.normal_e[run.plane])
     p = len(rows.unknowns)
     knots = [rows.places[run.plane, knot] for knot in (run.before, run.after) if knot >= 0]
     mine = np.concatenate([unknowns[unknowns < p], *(p + 6 * knot + np.arange(6) for knot in knots)])
-    inner, mixed, own = _of_feature(solution.covariance, feature)
     size = expanded.shape[1]
     whole = np.empty((size + OF_PLANE, size + OF_PLANE))
     whole[:size, :size] = expanded.T @ inner[np.ix_(mine, mine)] @ expanded
@@ -264,13 +267,16 @@ def _pseudo(solution: Solution) -> list[GroupFit]:
 
 
 def _fit(residuals: Residuals, square: float | None) -> GroupFit:
-    kept = residuals.weight > 0.0
-    error, sigma = (np.asarray(one[kept], dtype=np.float64) for one in (residuals.misclosure_m, residuals.sigma_m))
-    weight = np.asarray(residuals.weight[kept], dtype=np.float64)
-    redundancy = float(np.asarray(residuals.redundancy[kept], dtype=np.float64).sum())
-    square = float((weight * (error / sigma) ** 2).sum()) if square is None else square
-    rms = float(np.sqrt((error**2).mean())) if len(error) else 0.0
-    return _group(residuals.group, int(kept.sum()), redundancy, square, rms, int((~kept).sum()))
+    sums = np.zeros(5)  # observations, redundancy, Σ p (e / σ)², Σ e², rejected
+    for begin in range(0, len(residuals.weight), BLOCK):
+        mine = slice(begin, begin + BLOCK)
+        kept = residuals.weight[mine] > 0.0
+        columns = residuals.misclosure_m, residuals.sigma_m, residuals.redundancy, residuals.weight
+        error, sigma, free, weight = (column[mine][kept].astype(np.float64) for column in columns)
+        sums += kept.sum(), free.sum(), (weight * (error / sigma) ** 2).sum(), (error**2).sum(), (~kept).sum()
+    count, redundancy, squares, errors, rejected = sums.tolist()
+    rms = float(np.sqrt(errors / count)) if count else 0.0
+    return _group(residuals.group, int(count), redundancy, squares if square is None else square, rms, int(rejected))
 
 
 def _group(name: str, count: int, redundancy: float, square: float, rms: float, rejected: int = 0) -> GroupFit:

@@ -6,6 +6,8 @@ the variance factor is estimated too. A rejected observation comes back if a lat
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -42,6 +44,7 @@ def tau_critical(level: float, redundancy: float) -> float:
     return float(np.sqrt(redundancy) * t / np.sqrt(redundancy - 1.0 + t * t))
 
 
+@cache
 def least_shift(level: float = LEVEL, power: float = POWER) -> float:
     """δ0 of Baarda's internal reliability: an error of so many sigmas of w is found with this power."""
     return float(stats.norm.isf(level / 2.0) + stats.norm.isf(1.0 - power))
