@@ -24,7 +24,7 @@ from calib.normals import NormalError
 from calib.observability import spectrum
 from calib.outcome import Adjusted
 from calib.parameters import Unknowns, Wish, unknowns
-from calib.quality import trajectory_fit
+from calib.quality import Solution, trajectory_fit
 from calib.robust import global_test
 from calib.solve import Block, Settings, Solved, determined, settled
 from calib.trajectory_errors import TrajectoryPrior
@@ -146,4 +146,11 @@ def _adjusted(found: Solved, settings: Settings, matchings: int) -> Adjusted:
         spectrum=spectrum(solution.normals.of_parameters),
         scaled=scaled,
         notes=notes,
+        planes_e=_planes(solution),
     )
+
+
+def _planes(solution: Solution) -> FloatArray:
+    table = solution.rows.plane_table(solution.state)
+    distance = table.offset - np.einsum("ij,ij->i", table.normal_e, table.centre_e)
+    return np.column_stack([table.normal_e, distance])

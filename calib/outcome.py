@@ -135,6 +135,7 @@ class Adjusted:
         scaled: whether sigmas were multiplied by √variance_factor, because the global test rejected; else they are
             what the sigmas of the observations say.
         notes: for people: what was assumed, and what they should know.
+        planes_e: (q, 4) unit normals in e and s4 of the planes as adjusted: s · (x, 1) = 0.
     """
 
     calibrations: Mapping[str, Calibration]
@@ -159,3 +160,4 @@ class Adjusted:
     spectrum: FloatArray = field(default_factory=lambda: np.zeros(0))
     scaled: bool = False
     notes: tuple[str, ...] = ()
+    planes_e: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))

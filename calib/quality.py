@@ -6,7 +6,7 @@ of parameters, trajectory states and features together (Baarda 1968; Förstner 1
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,7 +103,8 @@ def _on_planes(solution: Solution) -> tuple[Residuals, dict[str, float]]:
     rows, count = solution.rows, solution.rows.count
     table = _room("planes", count)
     ranges = []
-    for batch, looks in rows.looks(solution.state, lambda batch: _cofactors(solution, batch)):
+    known = [_of_feature(solution.covariance, feature) for feature in solution.normals.planes]
+    for batch, looks in rows.looks(solution.state, lambda batch: _cofactors(solution, batch, known)):
         mine = slice(batch.begin, batch.begin + batch.size)
         weight = solution.row_weight[mine].astype(np.float64)
         with np.errstate(invalid="ignore"):
@@ -135,19 +136,16 @@ def _typical(errors: FloatArray) -> float:
     return float(np.median(found)) if len(found) else float("inf")
 
 
-def _of_feature(covariance: FloatArray, feature: Feature) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cofactors of a feature's unknowns (m, m), of these with its own (m, 3), of its own (3, 3)."""
-    inner = covariance[np.ix_(feature.unknowns, feature.unknowns)]
+def _of_feature(covariance: FloatArray, feature: Feature) -> tuple[FloatArray, FloatArray]:
+    """Cofactors of a feature's unknowns with its own (m, 3), of its own (3, 3)."""
     half = feature.mixed @ feature.inverse
-    mixed = -inner @ half
-    return inner, mixed, feature.inverse - half.T @ mixed
+    mixed = -covariance[np.ix_(feature.unknowns, feature.unknowns)] @ half
+    return mixed, feature.inverse - half.T @ mixed
 
 
-def _cofactors(solution: Solution, batch: Batch) -> FloatArray:
-    """(g, c, c) of the runs' columns."""
-    features = {plane: solution.normals.planes[plane] for plane in {run.plane for run in batch.runs}}
-    known = {plane: _of_feature(solution.covariance, feature) for plane, feature in features.items()}
-    made = [_cofactor(solution, run, known[run.plane]) for run in batch.runs]
+def _cofactors(solution: Solution, batch: Batch, known: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """(g, c, c) of the runs' columns; known: of all planes `_of_feature`."""
+    made = [_cofactor(solution, run, *known[run.plane]) for run in batch.runs]
     widest = max(len(one) for one in made)
     table = np.zeros((len(made), widest, widest))
     for place, one in enumerate(made):
@@ -155,15 +153,16 @@ def _cofactors(solution: Solution, batch: Batch) -> FloatArray:
     return table
 
 
-def _cofactor(solution: Solution, run: Run, known: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
-    rows, (inner, mixed, own) = solution.rows, known
+def _cofactor(solution: Solution, run: Run, mixed: FloatArray, own: FloatArray) -> FloatArray:
+    rows, feature = solution.rows, solution.normals.planes[run.plane]
     unknowns, expanded = rows.expansion(run, solution.state.normal_e[run.plane])
     p = len(rows.unknowns)
     knots = [rows.places[run.plane, knot] for knot in (run.before, run.after) if knot >= 0]
     mine = np.concatenate([unknowns[unknowns < p], *(p + 6 * knot + np.arange(6) for knot in knots)])
+    at = feature.unknowns[mine]
     size = expanded.shape[1]
     whole = np.empty((size + OF_PLANE, size + OF_PLANE))
-    whole[:size, :size] = expanded.T @ inner[np.ix_(mine, mine)] @ expanded
+    whole[:size, :size] = expanded.T @ solution.covariance[np.ix_(at, at)] @ expanded
     whole[:size, size:] = expanded.T @ mixed[mine]
     whole[size:, :size], whole[size:, size:] = whole[:size, size:].T, own
     return whole
@@ -195,10 +194,11 @@ def _on_ties(solution: Solution) -> tuple[Residuals, float]:
 def _tie_spread(solution: Solution, seen: Seen) -> FloatArray:
     """(3, 3) A Q Aᵀ of a sighting."""
     feature = solution.normals.ties[seen.tie]
-    inner, mixed, own = _of_feature(solution.covariance, feature)
+    mixed, own = _of_feature(solution.covariance, feature)
+    inner = solution.covariance[np.ix_(seen.unknowns, seen.unknowns)]
     at = np.searchsorted(feature.unknowns, seen.unknowns)
     crossed = seen.design @ mixed[at]
-    spread: FloatArray = seen.design @ inner[np.ix_(at, at)] @ seen.design.T - crossed - crossed.T + own
+    spread: FloatArray = seen.design @ inner @ seen.design.T - crossed - crossed.T + own
     return spread
 
 
@@ -213,7 +213,7 @@ def _controls(solution: Solution) -> _Controls:
     columns, where, fits = [], [], []
     for extra in extras(solution.rows, solution.state):
         feature = solution.normals.planes[extra.plane]
-        _, mixed, own = _of_feature(solution.covariance, feature)
+        mixed, own = _of_feature(solution.covariance, feature)
         free = 1.0 - float(extra.design @ own @ extra.design)
         test = -extra.misclosure / np.sqrt(max(free, 1e-9))
         columns.append((-extra.misclosure * extra.sigma, extra.sigma, free, test, 1.0))
@@ -223,7 +223,7 @@ def _controls(solution: Solution) -> _Controls:
     for tie, given in ((tie, solution.ties.control(tie)) for tie in range(len(solution.ties.ties))):
         if given is None:
             continue
-        own = _of_feature(solution.covariance, solution.normals.ties[tie])[2]
+        own = _of_feature(solution.covariance, solution.normals.ties[tie])[1]
         rot = solution.rows.flight.frame.rot_t_from_e
         away, spread, sigma = rot @ (given[0] - solution.state.ties_e[tie]), rot @ own @ rot.T, rot @ given[1] @ rot.T
         for axis in range(3):

@@ -50,7 +50,7 @@ class RecordInput:
             ``CA_GNSS.numberSatellites``; numbers in SI units.
         settings: of the run, in words.
         attachment: name of the NPZ file that holds the matrices whole; empty: there is none.
-        corrections2: (planes, 4) of the planes' parameters, where they were kept.
+        known: what else is known, by ``CLASS.attribute``: of the instruments, whose configuration is not `calib`'s.
     """
 
     flight: Flight
@@ -61,7 +61,7 @@ class RecordInput:
     told: Mapping[str, Plain] = field(default_factory=dict)
     settings: Mapping[str, str] = field(default_factory=dict)
     attachment: str = ""
-    corrections2: np.ndarray[Any, np.dtype[np.float64]] | None = None
+    known: Mapping[str, Value] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +92,20 @@ def record_of(given: RecordInput) -> Record:
     Raises:
         RecordError: something told is no attribute, or not what the attribute takes.
     """
-    told = {key: _told(key, value) for key, value in given.told.items()}
+    told = {key: told_value(key, value) for key, value in given.told.items()}
     found = content_of(given.flight, given.features, given.adjusted, given.scanner, given.header, given.settings)
-    if given.corrections2 is not None:
-        found["CA_LidarCalComputation.corrections2"] = Value(Matrix.of(given.corrections2), "", "δ2, a row a plane")
-    found |= told
+    found |= {**given.known, **told}
     values = {row.key: found[row.key] for row in ROWS if row.key in found}
     missing = tuple(row.key for row in ROWS if row.obligation == "M" and row.key not in values)
     return Record(given.header.id, values, missing, given.attachment)
 
 
-def _told(key: str, value: Plain, note: str = "as told") -> Value:
+def told_value(key: str, value: Plain, note: str = "as told") -> Value:
+    """Something told of an attribute, as the record holds it.
+
+    Raises:
+        RecordError: there is no such attribute, or it takes something else.
+    """
     row = BY_KEY.get(key)
     if row is None:
         near = get_close_matches(key, BY_KEY, 1, 0.0)
@@ -261,7 +264,7 @@ def with_told(document: Document, told: Mapping[str, tuple[Plain, str]]) -> Docu
     """
     found = {f"{owner['name']}.{one['name']}": one for owner in document["classes"] for one in owner["attributes"]}
     for key, (value, note) in told.items():
-        content = _told(key, value, note)
+        content = told_value(key, value, note)
         found[key] = _attribute(BY_KEY[key], content, "")
     classes = []
     for owner in CLASSES:

@@ -91,6 +91,10 @@ def _computation(flight: Flight, features: Features, adjusted: Adjusted, scanner
     field = "CA_LidarCalibrationTestfield"
     found[f"{field}.lidarNObjectPoints"] = Value(points)
     found[f"{field}.lidarJPlane"] = Value(len(features.planes))
+    if len(adjusted.planes_e) and "lidarPlaneParameters" in matrices:
+        change = Matrix.of(adjusted.planes_e - matrices["lidarPlaneParameters"].array)
+        note = "δ2 of s1 … s4, a row a plane: as adjusted less before"
+        found["CA_LidarCalComputation.corrections2"] = Value(change, "", note)
     at = [i for i, name in enumerate(adjusted.names) if unknown(name).scanner == scanner]
     if at:
         names = ", ".join(unknown(adjusted.names[i]).name for i in at)

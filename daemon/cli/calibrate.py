@@ -48,6 +48,9 @@ def command(
     report: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Report as page and PDF, record by ISO 19159, pictures.")
     ] = None,
+    facts: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="What only people know, for the record: CLASS.attribute = …")
+    ] = None,
     start: Annotated[
         list[str] | None,
         typer.Option("--calibration", metavar="[SCANNER=]FILE", help="To begin with, instead of the log's own."),
@@ -74,6 +77,7 @@ def command(
     from daemon.config import load_config
     from daemon.processing.calibrate_model import model_of
     from daemon.processing.calibrate_products import write_products
+    from daemon.processing.calibrate_record import facts_of
     from daemon.processing.calibrate_run import CalibrateWish, calibrate
     from daemon.processing.flights import Wish
     from daemon.processing.flown import TrajectoryWish
@@ -81,6 +85,8 @@ def command(
     from daemon.processing.setup import Options
 
     _refuse(output, observe, overwrite=overwrite)
+    if facts is not None and report is None:
+        raise UserError("--facts: they stand in the record; want --report DIR, too", ExitCode.USAGE)
     wish = CalibrateWish(
         logs=Wish(
             logs=logs,
@@ -104,6 +110,7 @@ def command(
         polygons=polygons,
         observe=tuple(observe.split(",")),
         report=report,
+        facts={} if facts is None else facts_of(facts),
         limit_deg=limit_deg,
         limit_m=limit_m,
         overwrite=overwrite,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import importlib.metadata
+import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -12,18 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.calibration_file import CalibrationFileError, Header, calibration_text
 from calib.outcome import Adjusted
 from calib.profile_check import Check
+from calib.record_values import Plain
 from calib.report_input import DifferenceMap, ReportInput
 from calib.report_verdict import Verdict, judge
 from calib.strips import Numbers, StripReport, differences
 from daemon.errors import ExitCode, UserError
+from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import Calibrated, CalibrateWish
 from daemon.processing.sidecar import sha256_of
 from georef.calibration import PARAMETERS
 
+FloatArray = NDArray[np.float64]
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 OUTCOME = "calibration.json"
 MAP_CELLS = 400  # across a map of differences
@@ -57,7 +62,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     record = _record(done, headers, before, after, inputs) | {"verdict": _verdict_entry(verdict)}
     if wish.report is not None:
         tell("report", 0, 1)
-        files |= _report_files(wish.report, done, report)
+        files |= _report_files(wish.report, done, report, wish.facts)
         files[wish.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
     _write(files)
     written = [str(path) for path in files]
@@ -232,8 +237,8 @@ def _report(
     )
 
 
-def _report_files(folder: Path, done: Calibrated, report: ReportInput) -> dict[Path, bytes]:
-    """The page, the same on paper, and a record a scanner as XML and JSON."""
+def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
+    """The page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
     from calib.record import RecordInput, record_json, record_of, record_xml
     from calib.report import html, pdf
     from calib.report_profiles import pictures
@@ -241,11 +246,21 @@ def _report_files(folder: Path, done: Calibrated, report: ReportInput) -> dict[P
     report = replace(report, profiles=pictures(done.check, done.kept.flight))
     files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
     for name, header in report.headers.items():
-        one = RecordInput(done.flight, done.features, done.adjusted, name, header, settings=report.settings)
+        matrices, known = f"{name}.record.npz", instruments_of(done.kept)
+        one = RecordInput(
+            done.flight, done.features, done.adjusted, name, header, facts, report.settings, matrices, known
+        )
         record = record_of(one)
         files[folder / f"{name}.record.xml"] = record_xml(record).encode()
         files[folder / f"{name}.record.json"] = record_json(record).encode()
+        files[folder / matrices] = _npz(record.arrays())
     return files
+
+
+def _npz(arrays: Mapping[str, FloatArray]) -> bytes:
+    room = io.BytesIO()
+    np.savez_compressed(room, **arrays)  # type: ignore[arg-type]
+    return room.getvalue()
 
 
 def _pairs(report: StripReport) -> dict[tuple[str, str], Numbers]:

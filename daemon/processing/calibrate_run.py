@@ -34,6 +34,7 @@ from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError, PlaneSettings
 from calib.prealign import PrealignError, prealign
 from calib.profile_check import Check, check
+from calib.record_values import Plain
 from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
 from daemon.errors import UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
@@ -84,6 +85,7 @@ class CalibrateWish:
         polygons: CSV of polygons that planes fill; instead of those that would be found.
         observe: planes or ties, and markings: what is looked for.
         report: folder for the report, the record and the pictures; None: none.
+        facts: of the record what only people know, by ``CLASS.attribute``.
         limit_deg, limit_m: how far boresight and range offset may lead from where they began.
         overwrite: files of an earlier run are replaced.
     """
@@ -96,6 +98,7 @@ class CalibrateWish:
     polygons: Path | None = None
     observe: tuple[str, ...] = ("planes",)
     report: Path | None = None
+    facts: Mapping[str, Plain] = field(default_factory=dict)
     limit_deg: float = 5.0
     limit_m: float = 10.0
     overwrite: bool = False

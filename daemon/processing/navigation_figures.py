@@ -85,7 +85,7 @@ def _bridged(solution: Solution) -> Figures:
 
 
 def _positions(flight: Flight) -> Figures:
-    used, outages = used_positions(flight), outages_of(flight)
+    used, outages = used_positions(flight.forward), outages_of(flight)
     lengths_s = (outages[:, 1] - outages[:, 0]) / SECOND_NS
     types, counts = np.unique(used["fix_type"], return_counts=True)
     told = used["satellites"][used["satellites"] > 0]

@@ -257,9 +257,9 @@ def _of_difference(forward: FloatArray, smoothed: FloatArray) -> FloatArray:
     return np.sqrt(np.where(variance > (SHORT * forward) ** 2, variance, np.nan))
 
 
-def used_positions(flight: Flight) -> StructArray:
+def used_positions(solution: Solution) -> StructArray:
     """(k,) innovations of the positions that the filter used, one a time."""
-    rows = flight.forward.innovations
+    rows = solution.innovations
     rows = rows[(rows["kind"] == Kind.POSITION) & np.isin(rows["fate"], USED)]
     chosen: StructArray = rows[np.unique(rows["time_ns"], return_index=True)[1]]
     return chosen
@@ -267,7 +267,7 @@ def used_positions(flight: Flight) -> StructArray:
 
 def outages_of(flight: Flight) -> Int64Array:
     """(k, 2) GPS times from which and until which no position was used, the flight's ends counting as positions."""
-    used_ns = used_positions(flight)["time_ns"]
+    used_ns = used_positions(flight.forward)["time_ns"]
     usual_ns = float(np.median(np.diff(used_ns))) if len(used_ns) > 2 else 0.0
     ends_ns = flight.best.time_ns[[0, -1]]
     times_ns = np.concatenate([ends_ns[:1], used_ns[(used_ns > ends_ns[0]) & (used_ns < ends_ns[1])], ends_ns[1:]])
@@ -277,7 +277,7 @@ def outages_of(flight: Flight) -> Int64Array:
 
 def fix_types_at(flight: Flight, time_ns: Int64Array) -> NDArray[np.int16]:
     """(n,) fix type of the position before each time, of the first before that; −1 in outages."""
-    used = used_positions(flight)
+    used = used_positions(flight.forward)
     last = np.searchsorted(used["time_ns"], time_ns, side="right") - 1
     types = np.full(len(time_ns), -1, np.int16)
     if len(used):

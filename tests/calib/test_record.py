@@ -77,7 +77,6 @@ def test_what_is_mandatory_is_there_or_said_to_be_missing(outcome: Outcome) -> N
         "CA_GNSS.numberSatellites",
         "SD_Calibration.calibrationAgency",
         "CA_GeometryValidation.validationMethod",
-        "CA_LidarCalComputation.corrections2",
         "CA_PositionalError.errorX",
         "CA_TestRange.numberCheckPoints",
     } <= set(record.missing)

@@ -50,7 +50,9 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of one run, and in ``new_loops`` what it needed that a warm-up does not make."""
     folder = tmp_path_factory.mktemp("products")
     control = made.flown.folder / "control.csv"
-    report = ("--report", str(folder / "report"), "--control", str(control))
+    facts = folder / "facts.toml"
+    facts.write_text('[SD_Calibration]\ncalibrationAgency = "Geo & Sons"\n[CA_GNSS]\nnumberSatellites = 14\n')
+    report = ("--report", str(folder / "report"), "--control", str(control), "--facts", str(facts))
     warm_calibration()
     warm = loops()
     assert len(warm) > 5
@@ -102,8 +104,21 @@ def test_report_and_record_stand_beside(products: Path) -> None:
     assert "src='http" not in page
     assert 'src="http' not in page
     assert (products / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_record_has_what_was_told_and_its_matrices_beside_it(products: Path) -> None:
     record = json.loads((products / "report" / "left.record.json").read_text())
-    assert record
+    attributes = {f"{owner['name']}.{one['name']}": one for owner in record["classes"] for one in owner["attributes"]}
+    assert attributes["SD_Calibration.calibrationAgency"]["value"] == "Geo & Sons"
+    assert attributes["CA_GNSS.numberSatellites"]["value"] == 14
+    matrices = np.load(products / "report" / "left.record.npz")
+    planes = attributes["CA_LidarCalComputation.corrections2"]["matrix"]
+    assert planes["attachment"] == "left.record.npz"
+    found = matrices[planes["array"]]
+    assert found.shape == (planes["rows"], 4)
+    normals = matrices["lidarPlaneParameters"][:, :3] + found[:, :3]
+    assert np.abs(np.linalg.norm(normals, axis=1) - 1.0).max() < 1e-12  # the unit-length condition, exactly
+    assert 0.0 < np.abs(found[:, :3]).max() < np.radians(1.0)
 
 
 def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:
@@ -152,6 +167,25 @@ def test_wrong_use(
 ) -> None:
     output = tmp_path / "left.toml"
     assert said in refused(capsys, output, arguments(made, output, *more))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[CA_GNSS]\nnumberSatelites = 14\n", "facts.toml: CA_GNSS.numberSatelites is no attribute of the record; did"),
+        ("[CA_GNSS]\nnumberSatellites = 1.5\n", "facts.toml: CA_GNSS.numberSatellites: got 1.5, want a whole number"),
+        ("CA_GNSS = 3\n", "facts.toml: CA_GNSS: want a table a class"),
+        ("[CA_GNSS\n", "facts.toml: is no TOML"),
+    ],
+)
+def test_facts_that_no_record_holds_are_told_before_the_work(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    output, facts = tmp_path / "left.toml", tmp_path / "facts.toml"
+    facts.write_text(text)
+    more = ("--report", str(tmp_path / "report"), "--facts", str(facts))
+    assert said in refused(capsys, output, arguments(made, output, *more))
+    assert "--report" in refused(capsys, output, arguments(made, output, "--facts", str(facts)))
 
 
 def test_a_line_of_control_that_is_none_is_named(
