@@ -213,5 +213,6 @@ def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
         "daemon.sim_plans -> sim.*",
         "daemon.processing.calibration_plan -> sim.*",
         "daemon.processing.calibration_plan_page -> sim.*",
+        "daemon.processing.planned_navigation -> sim.*",
         *(f"daemon.processing.** -> {name}" for name in processing),
     ]

@@ -19,8 +19,10 @@ from calib.parameters import ParameterError, Wish
 from calib.plan import Line, Predicted, Scan, Surface, planned, predict
 from calib.trajectory_errors import gauss_markov
 from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.planned_navigation import navigated
 from georef.beams import LineGeometry
 from georef.calibration import PARAMETERS, read_calibration
+from georef.navigation.inputs import NavigationError
 from georef.rotations import quaternion_from_rot
 from georef.timescales import SECOND_NS
 from georef.trajectory import Trajectory
@@ -45,7 +47,8 @@ BASIC = {
     "kappa_deg": "heading (κ)",
     "range_offset_m": "range offset",
 }
-# Smoothed with carrier-phase GNSS: position (m, each coordinate), roll and pitch, heading (degrees)
+# Smoothed with carrier-phase GNSS, of a plan that cannot be navigated for want of an IMU or a receiver: position (m,
+# each coordinate), roll and pitch, heading (degrees)
 EXPECTED = {
     "perfect": (0.001, 0.0001, 0.0002),
     "navigation": (0.02, 0.0025, 0.005),
@@ -60,7 +63,8 @@ class PlanWish:
 
     Attributes:
         model: key of `calib.parameters.MODELS`.
-        sigmas: position (m), roll and pitch, heading (degrees) expected of the trajectory; None: of the IMU's grade.
+        sigmas: position (m), roll and pitch, heading (degrees) expected of the trajectory; None: as navigation
+            with the plan's IMU and receiver would have them.
         control: use the plan's control points.
         control_sigma_m: of them.
     """
@@ -120,8 +124,11 @@ def plan_calibration(plan: Plan, wish: PlanWish) -> PlannedCalibration:
     """
     survey = Survey(plan)
     frame = Tangent.at(survey.site.origin_e)
-    grade = next((table.grade for table in plan.tables.imu.values()), "tactical")
-    sigmas = EXPECTED[grade] if wish.sigmas is None else wish.sigmas
+    try:
+        navigation = navigated(survey, BEGIN_NS) if wish.sigmas is None else None
+    except NavigationError as error:
+        raise UserError(one_line(str(error)), ExitCode.USAGE) from error
+    sigmas = wish.sigmas or (_by_the_grade(plan) if navigation is None else navigation.sigmas)
     heads, scans = _heads(plan)
     lines = [
         Line(strip.name, 0, number + 1, _gps(strip.start_s), _gps(strip.end_s))
@@ -131,11 +138,16 @@ def plan_calibration(plan: Plan, wish: PlanWish) -> PlannedCalibration:
     control = _control(survey, frame, wish.control_sigma_m) if wish.control else []
     try:
         flight, features = planned(frame, heads, scans, [_trajectory(survey, sigmas)], lines, [*surfaces, *control])
-        predicted = predict(flight, features, Wish(wish.model), gauss_markov(flight))
+        prior = gauss_markov(flight) if navigation is None else navigation.prior(flight)
+        predicted = predict(flight, features, Wish(wish.model), prior)
     except (FlightError, ParameterError, NormalError) as error:
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error
     used = sum(len(plane.control) for plane in features.planes)
     return PlannedCalibration(survey, flight, features, predicted, _rows(predicted), sigmas, used)
+
+
+def _by_the_grade(plan: Plan) -> tuple[float, float, float]:
+    return EXPECTED[next((table.grade for table in plan.tables.imu.values()), "tactical")]
 
 
 def _gps(time_s: float) -> int:

@@ -147,8 +147,8 @@ def _words(figure: Figure, planned: PlannedCalibration) -> None:
     position_m, tilt_deg, heading_deg = planned.sigmas
     assumed = (
         f"Predicted from {kinds['roof']} roofs and {kinds['ground']} pieces of ground that two swaths or more see, "
-        f"{planned.control} control points; trajectory ± {position_m:g} m, roll and pitch ± {tilt_deg:g}°, heading "
-        f"± {heading_deg:g}°, correlated in time."
+        f"{planned.control} control points; trajectory ± {position_m:.2g} m, roll and pitch ± {tilt_deg:.2g}°, heading "
+        f"± {heading_deg:.2g}°, correlated in time."
     )
     text = "\n".join(textwrap.wrap(assumed, LETTERS + 8))
     figure.text(left, WORDS[1] / PAGE[1], text, fontsize=7.5, color=MUTED, va="bottom")

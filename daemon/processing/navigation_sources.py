@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -149,26 +149,29 @@ class NavigationSources:
 
     def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
         """Lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be found."""
-        primary = np.array(self.gnss.lever_arm_m, dtype=np.float64)
-        arms, baseline = [primary], None
+        arms = [np.array(self.gnss.lever_arm_m, dtype=np.float64)]
         if self.gnss.secondary_lever_arm_m is not None:
             arms.append(np.array(self.gnss.secondary_lever_arm_m, dtype=np.float64))
-            baseline = arms[1] - primary
-            length_m = float(np.linalg.norm(baseline))
+            length_m = float(np.linalg.norm(arms[1] - arms[0]))
             if length_m < MIN_BASELINE_M:
                 raise ConfigError(
                     f"gnss.{self.gnss_name}.secondary_lever_arm_m: is {length_m:.2f} m from lever_arm_m; "
                     f"want the second antenna's place, {MIN_BASELINE_M:g} m or more away, or leave it out"
                 )
-        return Setup(
-            noise=noise_of(self.imu.noise),
-            lever_arms_b=np.stack(arms),
-            baseline_b=baseline,
-            estimate_time_offset_s=time_sigma_s,
-            gnss_correlation_s=CORRELATION_S,
-            gnss_correlated_share=CORRELATED_SHARE,
-            gnss_sigma_scale={int(fix): SIGMA_FACTOR for fix in FixType},
-        )
+        return filter_setup(noise_of(self.imu.noise), arms, time_sigma_s=time_sigma_s)
+
+
+def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s: float = 0.0) -> Setup:
+    """The filter's setup of a unit, and of a receiver with antennas (3,), primary first; see `NavigationSources`."""
+    return Setup(
+        noise=noise,
+        lever_arms_b=np.stack(arms_b),
+        baseline_b=arms_b[1] - arms_b[0] if len(arms_b) > 1 else None,
+        estimate_time_offset_s=time_sigma_s,
+        gnss_correlation_s=CORRELATION_S,
+        gnss_correlated_share=CORRELATED_SHARE,
+        gnss_sigma_scale={int(fix): SIGMA_FACTOR for fix in FixType},
+    )
 
 
 def files_of(session: Session, config: Config | None) -> dict[str, bytes]:
