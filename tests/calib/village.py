@@ -91,12 +91,14 @@ class Made:
         truth: the true calibration.
         trajectory: the true one.
         flown: the log and the files beside it: ``flown.folder / "truth.npz"``, ``control.csv``.
+        plan: its text.
     """
 
     flight: Flight
     truth: Calibration
     trajectory: Trajectory
     flown: Flown
+    plan: str
 
     def at_truth(self) -> Flight:
         """With the points where the true calibration puts them."""
@@ -129,7 +131,8 @@ def village(
     for index in lines:
         name, (x0, y0), (x1, y1), height = LINES[index]
         text += LINE.format(name=name, x0=x0, y0=y0, x1=x1, y1=y1, height=height)
-    flown = fly_short(folder, text + plan_more)
+    text += plan_more
+    flown = fly_short(folder, text)
     trajectory = told(flown.truth(), sigma_m, sigma_deg)
     file = folder / "true_trajectory.csv"
     file.write_text(csv_text(trajectory))
@@ -139,7 +142,7 @@ def village(
     read = read_flight(wish, kept, lambda what, done, total: None)
     truth = read_calibration((folder / "left.true.toml").read_text(), "left.true.toml")
     flight = replace(read.flight, trajectories=(trajectory,))
-    return Made(flight, truth, trajectory, flown)
+    return Made(flight, truth, trajectory, flown, text)
 
 
 def told(trajectory: Trajectory, sigma_m: float, sigma_deg: float) -> Trajectory:

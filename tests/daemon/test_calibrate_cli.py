@@ -16,8 +16,10 @@ from calib.features import Features, Plane
 from daemon.cli.main import run_app
 from daemon.errors import UserError
 from daemon.processing.calibrate_run import refuse_no_planes
+from daemon.processing.calibration_plan import PlanWish, plan_calibration
 from daemon.processing.warm_calibration import warm_calibration
 from georef.calibration import read_calibration
+from sim.plan import parse_plan
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
@@ -123,6 +125,20 @@ def test_the_record_has_what_was_told_and_its_matrices_beside_it(products: Path)
 
 def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:
     assert (products / "new_loops").read_text() == ""
+
+
+def test_the_plan_says_beforehand_what_the_flight_gives(made: Made, tmp_path: Path) -> None:
+    """Sigmas, the log's own IMU and GNSS navigated, within a quarter of those that were predicted."""
+    output, control = tmp_path / "left.toml", str(made.flown.folder / "control.csv")
+    given = ("--model", "basic", "--control", control, "--trajectory-datum", "same", "--workers", "1")
+    assert run_app(["calibrate", str(made.flown.log), "-o", str(output), *given]) == 0
+    found = read_calibration(output.read_text(), "left.toml")
+    planned = plan_calibration(parse_plan(made.plan, tmp_path), PlanWish("basic"))
+    names = planned.predicted.names
+    assert set(names) == {"left.omega_rad", "left.phi_rad", "left.kappa_rad", "left.range_offset_m"}
+    for name, predicted in zip(names, planned.predicted.sigmas, strict=True):
+        sigma = found.sigmas[list_of(name.removeprefix("left."))]
+        assert 0.75 < predicted / sigma < 1.25, name
 
 
 def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
