@@ -29,7 +29,7 @@ def command(
         str | None,
         typer.Option(
             metavar="P,R,H",
-            help="Expected of the trajectory: position (m), roll and pitch, heading (degrees); else as its IMU and receiver allow.",
+            help="Expected of the trajectory: position (m), roll and pitch, heading (degrees); else by its sensors.",
         ),
     ] = None,
     no_control: Annotated[bool, typer.Option("--no-control", help="Without the plan's control points.")] = False,
