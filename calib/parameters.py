@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Head
+from calib.intensity_curve import at_knots, curve, nodes_of
 from calib.outcome import Held
 from georef.beams import OusterGeometry, SpinningGeometry
 from georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
@@ -29,7 +30,7 @@ MODELS: Mapping[str, tuple[str, ...]] = {
     "full": tuple(parameter.name for parameter in PARAMETERS),
 }
 # What a column of the design is, besides the places of PARAMETERS
-SLOT, ZONE, HAT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
+SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
 BEAM_PARTS = {"azimuth_rad": AZIMUTH, "elevation_rad": ELEVATION, "range_m": RANGE}
 _BY_CONVENTION = "scan_angle_offset_rad"
 
@@ -96,12 +97,15 @@ class Unknowns:
         base: calibration of each head, with what is not estimated.
         items: (u,).
         held: parameters of the model that are not among them at the user's word or by convention.
-        smoothness_m: of the range correction by intensity.
+        knots: (k,) intensities of the range correction by intensity; none: it is not estimated. The base's tables
+            are at these.
+        smoothness_m: of it.
     """
 
     base: tuple[Calibration, ...]
     items: tuple[Unknown, ...]
     held: tuple[Held, ...] = ()
+    knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     smoothness_m: float = 0.02
 
     @property
@@ -171,11 +175,11 @@ class Unknowns:
     def _bends(self, head: int, values: FloatArray) -> Iterator[tuple[FloatArray, float]]:
         """Of the inner knots: their corrections from the line through their neighbours."""
         at, kinds, arguments = self.of_head(head)
-        place = dict(zip(arguments[kinds == HAT].tolist(), at[kinds == HAT].tolist(), strict=True))
+        place = dict(zip(arguments[kinds == KNOT].tolist(), at[kinds == KNOT].tolist(), strict=True))
         table = self._with(head, values).ibrc
         if not place or table is None:
             return
-        knots, corrections = table
+        knots, corrections = self.knots, at_knots(table[1])
         for knot in range(1, len(knots) - 1):
             share = (knots[knot] - knots[knot - 1]) / (knots[knot + 1] - knots[knot - 1])
             row = np.zeros(len(self.items))
@@ -188,7 +192,7 @@ class Unknowns:
     def _with(self, head: int, values: FloatArray) -> Calibration:
         base = self.base[head]
         parameters, offsets, beams = base.parameters.copy(), list(base.range_offsets), dict(base.beams)
-        knots = None if base.ibrc is None else (base.ibrc[0], base.ibrc[1].copy())
+        correction_m = None if base.ibrc is None else base.ibrc[1].copy()
         for item, value in zip(self.items, values.tolist(), strict=True):
             if item.head != head:
                 continue
@@ -196,12 +200,15 @@ class Unknowns:
                 parameters[item.kind] = value
             elif item.kind in (SLOT, ZONE):
                 _put_offset(offsets, item, value)
-            elif item.kind == HAT and knots is not None:
-                knots[1][item.argument] = value
+            elif item.kind == KNOT and correction_m is not None:
+                correction_m[item.argument] = value
             else:
                 part = item.name.rsplit(".", 1)[-1]
                 beams[item.argument] = replace(beams.get(item.argument, BeamCorrection()), **{part: value})
-        return replace(base, parameters=parameters, range_offsets=tuple(offsets), ibrc=knots, beams=beams)
+        table = base.ibrc
+        if len(self.knots) and correction_m is not None:
+            table = nodes_of(self.knots), curve(self.knots, correction_m)
+        return replace(base, parameters=parameters, range_offsets=tuple(offsets), ibrc=table, beams=beams)
 
 
 def unknowns(flight: Flight, wish: Wish, start: Mapping[str, Calibration] | None = None) -> Unknowns:
@@ -229,7 +236,8 @@ def unknowns(flight: Flight, wish: Wish, start: Mapping[str, Calibration] | None
             elif parameter.name in MODELS[wish.model]:
                 held.append(Held(head.name, parameter.name, word))
         items += _extras(index, head, base, wish)
-    return Unknowns(tuple(bases), tuple(items), tuple(held), wish.ibrc_smoothness_m)
+    knots = np.array(wish.ibrc_knots, dtype=np.float64)
+    return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m)
 
 
 def _named(head: Head, name: str, names: frozenset[str] | Mapping[str, float]) -> bool:
@@ -273,7 +281,7 @@ def _extras(index: int, head: Head, base: Calibration, wish: Wish) -> Iterator[U
         for knot, value in enumerate(base.ibrc[1].tolist()):
             if knot != _reference(wish):
                 name = f"ibrc.{knot}"
-                yield Unknown(index, HAT, knot, f"{head.name}.{name}", value, _prior(head, name, wish))
+                yield Unknown(index, KNOT, knot, f"{head.name}.{name}", value, _prior(head, name, wish))
     if wish.beams and _spins(head):
         for channel in range(1, len(head.geometry.deflection(base).table)):
             for part, kind in BEAM_PARTS.items():

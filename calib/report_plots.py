@@ -232,9 +232,9 @@ def intensity_picture(report: ReportInput) -> Picture | None:
     def draw(canvas: Canvas) -> None:
         axes = canvas.panel(0.6, 0.3, canvas.form.width_in - 0.7, 1.7)
         for i, (_, (intensity, correction_m)) in enumerate(known):
-            axes.plot(intensity, 1000.0 * correction_m, "o-", ms=3.5, lw=1.1, color=colour_of(i))
+            axes.plot(intensity, 1000.0 * correction_m, "-", lw=1.1, color=colour_of(i))
         axes.set_xlabel("Intensity", fontsize=8.5, color=MUTED)
         axes.set_ylabel("mm", fontsize=8.5, color=MUTED)
-        canvas.legend([Line2D([], [], marker="o", color=colour_of(i), label=name) for i, (name, _) in enumerate(known)])
+        canvas.legend([Line2D([], [], color=colour_of(i), label=name) for i, (name, _) in enumerate(known)])
 
     return Picture("Range correction by intensity", "Subtracted from the range.", lambda form: 2.55, draw)

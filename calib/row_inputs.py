@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Swath
+from calib.intensity_curve import at_knots, curve_by_knots
 from calib.parameters import Unknowns
 from calib.row_tables import Beam, Head, Looks, Sigmas
 from georef.beams import OusterGeometry
@@ -85,13 +86,17 @@ def head_table(unknowns: Unknowns, flight: Flight, index: int, model: SensorMode
     before_m = np.nan
     if isinstance(head.geometry, OusterGeometry):
         before_m = float(np.hypot(*head.geometry.beam_origin_m))
+    nodes, by_knot = np.zeros(0), np.zeros((0, 0))
+    if len(unknowns.knots) and calibration.ibrc is not None:
+        nodes, by_knot = calibration.ibrc[0], curve_by_knots(unknowns.knots, at_knots(calibration.ibrc[1]))
     return Head(
         *unknowns.of_head(index),
         calibration.parameters,
         outer[np.newaxis],
         (outer @ inner)[np.newaxis, :, 2].copy(),
         before_m,
-        np.zeros(0) if calibration.ibrc is None else calibration.ibrc[0],
+        nodes,
+        by_knot,
         float(head.noise.range_m),
         float(head.noise.angle_rad),
         float(head.noise.time_s),

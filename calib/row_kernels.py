@@ -30,7 +30,7 @@ ENCODER, ENCODER_SCALE = INDEX["scan_angle_offset_rad"], INDEX["scan_angle_scale
 LATENCY, TORSION = INDEX["encoder_latency_s"], INDEX["torsion_s2"]
 ARM, TIME, IMU = INDEX["lever_arm_x_m"], INDEX["time_offset_s"], INDEX["imu_latency_s"]
 FIRST_EXTRA = len(INDEX)
-SLOT, ZONE, HAT, AZIMUTH, ELEVATION, RANGE = range(FIRST_EXTRA, FIRST_EXTRA + 6)
+SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(FIRST_EXTRA, FIRST_EXTRA + 6)
 
 # Rows of the scratch table: normal in b; what turns of boresight and of the body do, in b; turns of the body in e;
 # along the beam, by scan angle, by tilt; the share of the later knot; f; M; θ; speed along the normal; place in the
@@ -169,15 +169,16 @@ def flown_variance(
 
 
 @kernel
-def hat(knots: FloatArray, knot: int, intensity: float) -> float:
-    """1 at its knot, 0 at its neighbours, linear between; level beyond the ends."""
-    last = len(knots) - 1
-    at = min(max(intensity, knots[0]), knots[last])
-    if at < knots[knot]:
-        return float(max(0.0, 1.0 - (knots[knot] - at) / (knots[knot] - knots[knot - 1])))
-    if at > knots[knot]:
-        return float(max(0.0, 1.0 - (at - knots[knot]) / (knots[knot + 1] - knots[knot])))
-    return 1.0
+def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) -> float:
+    """A row (d,) of a table at its nodes (d,), linear between them, level beyond the ends."""
+    last = len(nodes) - 1
+    if intensity >= nodes[last]:
+        return float(value[row, last])
+    if not intensity > nodes[0]:
+        return float(value[row, 0])
+    at = np.searchsorted(nodes, intensity, side="right") - 1
+    share = (intensity - nodes[at]) / (nodes[at + 1] - nodes[at])
+    return float(value[row, at] + share * (value[row, at + 1] - value[row, at]))
 
 
 @kernel
@@ -188,8 +189,8 @@ def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, 
         return float(along) if row.return_number == argument else 0.0
     if kind == ZONE:
         return float(along) if row.mta_zone == argument else 0.0
-    if kind == HAT:
-        return float(-along * hat(head.knots, argument, row.intensity))
+    if kind == KNOT:
+        return float(-along * between(head.nodes, head.by_knot, argument, row.intensity))
     if row.channel != argument:
         return 0.0
     if kind == RANGE:

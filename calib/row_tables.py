@@ -39,7 +39,7 @@ class Head(NamedTuple):
         outer: (1, 3, 3) Rx(ω) Ry(φ).
         spin_b: (1, 3) a spinning head's axis.
         before_m: of the range that lies before the beam's start; nan: the start turns with the beam.
-        knots: (k,) intensities.
+        nodes: (d,) intensities of its range correction; by_knot: (k, d) derivatives of that by its knots.
         range_m, angle_rad, time_s, divergence_rad: sigmas of a return, and its beam.
     """
 
@@ -50,7 +50,8 @@ class Head(NamedTuple):
     outer: FloatArray
     spin_b: FloatArray
     before_m: float
-    knots: FloatArray
+    nodes: FloatArray
+    by_knot: FloatArray
     range_m: float
     angle_rad: float
     time_s: float

@@ -13,6 +13,7 @@ from scipy import stats
 from calib.adjust import adjust, predict
 from calib.features import ControlPoint, Features, Sighting, TiePoint
 from calib.flight import Flight
+from calib.intensity_curve import STEPS, at_knots, curve_by_knots
 from calib.normals import NormalError, TrajectoryWeight, moved, normals
 from calib.outcome import Adjusted
 from calib.parameters import Wish, unknowns
@@ -383,16 +384,43 @@ def test_where_nothing_is_determined_all_is_held() -> None:
     assert found.calibrations["left"].value("omega_rad") == 0.0
 
 
-def test_a_correction_by_intensity_is_found_and_none_is_not_invented() -> None:
-    knots = np.array([0.0, 30.0, 60.0, 100.0])
-    wish = Wish(ibrc_knots=tuple(knots.tolist()), ibrc_reference=60.0, ibrc_smoothness_m=0.1)
-    for correction in (np.array([-0.06, -0.02, 0.0, 0.05]), np.zeros(4)):
-        built = made(ibrc=(knots, correction))
-        prior = gauss_markov(built.flight, Taus(), 4.0)
-        found = adjust(built.flight, built.features, wish, prior)
-        at = [found.names.index(f"left.ibrc.{knot}") for knot in (0, 1, 3)]
-        assert (found.sigmas[at] < 0.01).all()
-        assert (np.abs(found.values[at] - correction[[0, 1, 3]]) < 3.5 * found.sigmas[at]).all()
-        table = found.calibrations["left"].ibrc
-        assert table is not None
-        assert table[1][2] == 0.0
+KNOTS = np.array([0.0, 10.0, 25.0, 45.0, 70.0, 100.0])
+INTENSITY = np.linspace(0.0, 100.0, 401)
+LOGARITHM = 0.3 * np.log((INTENSITY + 30.0) / (KNOTS[3] + 30.0))
+
+
+def by_intensity(correction_m: FloatArray, noise: float = 1.0) -> Adjusted:
+    """Of a scanner with this correction at `INTENSITY`."""
+    built = made(ibrc=(INTENSITY, correction_m), points=24, noise=noise)
+    wish = Wish(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
+    return adjust(built.flight, built.features, wish, gauss_markov(built.flight, Taus(), 4.0))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0], ids=["there", "none is invented"])
+def test_a_correction_by_intensity_lies_within_its_sigmas(share: float) -> None:
+    """At the knots and in the middle between them."""
+    found = by_intensity(share * LOGARITHM)
+    assert found.converged
+    at = [found.names.index(f"left.ibrc.{knot}") for knot in (0, 1, 2, 4, 5)]
+    covariance = found.correlation[np.ix_(at, at)] * np.outer(found.sigmas[at], found.sigmas[at])
+    assert (found.sigmas[at] < 0.004).all()
+    table = found.calibrations["left"].ibrc
+    assert table is not None
+    assert at_knots(table[1])[3] == 0.0
+    looked = np.arange(0, len(table[0]), STEPS // 2)
+    looked = looked[looked != 3 * STEPS]
+    by_knot = curve_by_knots(KNOTS, at_knots(table[1]))[[0, 1, 2, 4, 5]][:, looked]
+    sigma_m = np.sqrt(np.einsum("kd,kl,ld->d", by_knot, covariance, by_knot))
+    error_m = (table[1] - share * np.interp(table[0], INTENSITY, LOGARITHM))[looked]
+    assert (np.abs(error_m) < 3.0 * sigma_m).all()
+
+
+def test_a_smooth_correction_is_nearer_than_any_line_from_knot_to_knot() -> None:
+    """With hardly any noise: against the best that lines between the same knots could be."""
+    hats = np.stack([np.interp(INTENSITY, KNOTS, one) for one in np.eye(len(KNOTS))], axis=1)
+    best = hats @ np.linalg.lstsq(hats, LOGARITHM)[0]
+    table = by_intensity(LOGARITHM, noise=1e-3).calibrations["left"].ibrc
+    assert table is not None
+    missed_m, lines_m = np.interp(INTENSITY, *table) - LOGARITHM, best - LOGARITHM
+    assert np.sqrt(np.mean(missed_m**2)) < 0.25 * np.sqrt(np.mean(lines_m**2))
+    assert (np.diff(table[1]) > 0.0).all()

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from calib.flight import Flight, Head
+from calib.intensity_curve import at_knots
 from calib.parameters import MODELS, ParameterError, Unknowns, Wish, unknowns
 from georef.beams import LineGeometry, SpinningGeometry
 from georef.calibration import INDEX, BeamCorrection, RangeOffset, nominal
@@ -85,13 +87,18 @@ def test_tables_start_from_those_there_are_and_come_back() -> None:
     asked = extras()
     start = asked.calibrations(asked.start)["top"]
     assert start.ibrc is not None
-    np.testing.assert_allclose(start.ibrc[1], [-0.05, 0.0, 0.025, 0.05])
+    np.testing.assert_allclose(at_knots(start.ibrc[1]), [-0.05, 0.0, 0.025, 0.05])
     assert start.value("range_offset_m") == pytest.approx(-0.05)  # the range is the same
     values = asked.start + np.arange(1, len(asked) + 1) * 1e-3
     done = asked.calibrations(values)["top"]
     by_name = dict(zip(asked.names, values.tolist(), strict=True))
     assert done.ibrc is not None
-    assert done.ibrc[1].tolist() == [by_name["top.ibrc.0"], 0.0, by_name["top.ibrc.2"], by_name["top.ibrc.3"]]
+    told = [by_name["top.ibrc.0"], 0.0, by_name["top.ibrc.2"], by_name["top.ibrc.3"]]
+    assert at_knots(done.ibrc[0]).tolist() == [0.0, 50.0, 75.0, 100.0]
+    assert at_knots(done.ibrc[1]).tolist() == told
+    np.testing.assert_allclose(
+        done.ibrc[1], PchipInterpolator([0.0, 50.0, 75.0, 100.0], told)(done.ibrc[0]), atol=1e-12
+    )
     assert RangeOffset(by_name["top.range_offset_slot.2"], 2) in done.range_offsets
     assert RangeOffset(0.7, 2, 1) in done.range_offsets
     assert RangeOffset(by_name["top.range_offset_zone.3"], None, 3) in done.range_offsets
@@ -99,6 +106,20 @@ def test_tables_start_from_those_there_are_and_come_back() -> None:
     assert done.beams[2] == BeamCorrection(by_name["top.beam.2.azimuth_rad"], 0.02, by_name["top.beam.2.range_m"])
     assert "top.beam.0.range_m" not in asked.names  # the first beam is what others are told from
     assert done.value("phi_rad") == by_name["top.phi_rad"]
+
+
+def test_a_curve_comes_back_at_the_same_knots() -> None:
+    """A calibration goes on from what another one wrote."""
+    asked = extras()
+    done = asked.calibrations(asked.start + np.arange(1, len(asked) + 1) * 1e-3)
+    made = flight()
+    again = replace(made, heads=tuple(replace(head, start=done[head.name]) for head in made.heads))
+    wish = Wish(ibrc_knots=(0.0, 50.0, 75.0, 100.0), ibrc_reference=50.0)
+    asked = unknowns(again, wish)
+    for name, found in asked.calibrations(asked.start).items():
+        before = done[name].ibrc
+        assert before is not None
+        np.testing.assert_array_equal(found.ibrc, before)
 
 
 def test_pseudo_observations_are_priors_and_bends() -> None:
@@ -110,7 +131,8 @@ def test_pseudo_observations_are_priors_and_bends() -> None:
     np.testing.assert_allclose(asked.pseudo(values + step)[1] - misclosure, design @ step, atol=1e-12)
     table = asked.calibrations(values)["top"].ibrc
     assert table is not None
-    bend = table[1][2] - (table[1][1] + table[1][3]) / 2.0
+    correction_m = at_knots(table[1])
+    bend = correction_m[2] - (correction_m[1] + correction_m[3]) / 2.0
     assert misclosure[3] == pytest.approx(bend / 0.02)
     prior = unknowns(flight(), Wish(priors={"left.phi_rad": 0.01}))
     design, misclosure = prior.pseudo(prior.start + 0.005)

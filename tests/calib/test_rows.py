@@ -173,12 +173,15 @@ def test_columns_of_beams_slots_zones_and_intensities_are_differences_of_the_mod
         for at in [np.arange(index, 160, 2)]
     )
     rows = Rows(flight, planes, asked, None)
-    state = replace(rows.start(), values=asked.start + g.normal(size=len(asked)) * 1e-3)
+    values = asked.start + g.normal(size=len(asked)) * 1e-3
+    for knot, correction_m in ((0, -45.0), (1, -14.0), (3, 22.0)):  # so large that a step stays small beside them
+        values[asked.names.index(f"left.ibrc.{knot}")] = correction_m
+    state = replace(rows.start(), values=values)
     found, _, _, plane = design(rows, state)
     at = np.concatenate([run.at for batch in rows.batches for run in batch.runs])
     normals = np.array([planes[one].normal_t for one in plane])
     for column, name in enumerate(asked.names):
-        step = 1e-4 if name.endswith("_rad") else 1e-2
+        step = 1e-4 if name.endswith("_rad") else 5e-3
         expected = (placed(flight, asked, state.values, column, step)[at] * normals).sum(axis=1)
         size = max(1.0, np.abs(expected).max())
         np.testing.assert_allclose(found[:, column] / size, expected / size, atol=1e-6, err_msg=name)
