@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration_file import CalibrationFileError, Header, calibration_text
 from calib.outcome import Adjusted
@@ -28,7 +27,6 @@ from daemon.processing.calibrate_run import Calibrated, CalibrateWish
 from daemon.processing.sidecar import sha256_of
 from georef.calibration import PARAMETERS
 
-FloatArray = NDArray[np.float64]
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 OUTCOME = "calibration.json"
 MAP_CELLS = 400  # across a map of differences
@@ -257,10 +255,10 @@ def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Ma
     return files
 
 
-def _npz(arrays: Mapping[str, FloatArray]) -> bytes:
-    room = io.BytesIO()
-    np.savez_compressed(room, **arrays)  # type: ignore[arg-type]
-    return room.getvalue()
+def _npz(arrays: Mapping[str, Any]) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
 
 
 def _pairs(report: StripReport) -> dict[tuple[str, str], Numbers]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.record import (
     NAMESPACE,
@@ -22,8 +25,8 @@ from calib.record import (
     record_xml,
     with_told,
 )
-from calib.record_tables import CLASSES, ROWS
-from calib.record_values import Plain, utc_text
+from calib.record_tables import BY_KEY, CLASSES, ROWS
+from calib.record_values import Matrix, Plain, utc_text
 from georef.beams import LineGeometry
 from georef.calibration import INDEX
 from georef.sensor_model import SensorModel
@@ -227,6 +230,128 @@ def test_figures_of_the_flight(outcome: Outcome) -> None:
     np.testing.assert_allclose(arrays["ellipsoidalHeight"], 750.0, atol=0.2)
     np.testing.assert_allclose(np.degrees(arrays["phiLocal"]), 47.18, atol=0.01)
     assert number["CA_Frames.timeRecording"] == utc_text(1_447_000_000 * 10**9)
+
+
+def numbers(outcome: Outcome, **more: Any) -> dict[str, Any]:
+    """By ``CLASS.attribute``: values, and matrices as arrays."""
+    values = record_of(given(outcome, **more)).values.items()
+    return {key: value.content.array if isinstance(value.content, Matrix) else value.content for key, value in values}
+
+
+def test_instruments_are_those_of_the_calibration(outcome: Outcome) -> None:
+    """A boresight of ω, φ, κ on an installation that turns nothing, and the trajectory's sigmas."""
+    calibration, number = outcome.adjusted.calibrations["left"], numbers(outcome)
+    angles = [calibration.value(name) for name in ("omega_rad", "phi_rad", "kappa_rad")]
+    turned = Rotation.from_euler("XYZ", angles).as_matrix()
+    np.testing.assert_allclose(number["CA_BFrame.attitudeSensor"], turned, atol=1e-12)
+    assert number["CA_SensorSystem.relativeAttitude"] == number["CA_IMU.boresightAngle"] == tuple(angles)
+    assert number["CA_SensorSystem.relativePosition"] == number["CA_BFrame.leverArm"] == (0.12, -0.03, 0.28)
+    np.testing.assert_allclose(np.degrees(number["CA_IMU.attitudeAccuracy"]), [0.003, 0.003, 0.006])
+
+
+def test_control_is_that_of_the_calibration(outcome: Outcome) -> None:
+    number = numbers(outcome)
+    points = [point for plane in outcome.features.planes for point in plane.control]
+    assert number["CA_TestRange.numberControlPoints"] == len(points) == 10
+    np.testing.assert_array_equal(number["CA_TestRange.controlPoint"], [point.position_t for point in points])
+    off_m = [point.misclosure_m for point in outcome.adjusted.control]
+    assert number["CA_PositionalError.errorZ"] == pytest.approx(math.sqrt(np.mean(np.square(off_m))))
+    assert number["CA_PositionalError.errorType"] == "rootMeanSquareError"
+    assert number["CA_PositionalError.quantityType"] == "mean"
+
+
+def test_papers_are_those_of_the_calibration(outcome: Outcome) -> None:
+    number = numbers(outcome, settings={"Swath": "0.1.0"})
+    assert number["CA_CalibrationValidation.calibrationType"] == "inFlight"
+    assert number["CA_OpticsSensorGeometry.geometryCalibrationDate"] == "2026-11-21T10:15:00+00:00"
+    assert number["CA_OpticsSensorGeometry.geometryCalibrationType"] == "self-calibration in flight: combined"
+    assert number["CA_Distortion.selfCalibrationModel"] == "other"
+    assert number["CA_Distortion.sigmaNaught"] == math.sqrt(outcome.adjusted.variance_factor)
+    assert number["CA_Distortion.software"] == "Swath 0.1.0"
+    assert number["CA_Distortion.propertiesAlgorithm"].startswith("Gauss–Helmert, 5 iterations")
+    assert number["CA_Documentation.certificateIdentification"] == outcome.header.id
+    assert number["CA_Documentation.geometricQuality"] == "CA_PositionalError"
+    assert number["SD_Calibration.calibrationDate"] == "2026-11-21"
+
+
+def test_errors_are_values_with_sigmas(outcome: Outcome) -> None:
+    """Of the scanner; of the trajectory root mean squares of what the adjustment corrected."""
+    calibration, number = outcome.adjusted.calibrations["left"], numbers(outcome)
+    for key, names in {
+        "boresight": ("omega_rad", "phi_rad", "kappa_rad"),
+        "range": ("range_offset_m",),
+        "scanAngle": ("scan_angle_offset_rad",),
+        "scannerAssembly": ("scan_plane_tilt_rad",),
+    }.items():
+        pairs = [(calibration.value(name), calibration.sigmas[INDEX[name]]) for name in names]
+        np.testing.assert_array_equal(number[f"CA_ErrorModel.{key}"], pairs)
+    fit = outcome.adjusted.trajectory
+    assert fit is not None
+    for key, corrections in (("positionBody", fit.position_l), ("attitudeBody", fit.attitude_rad)):
+        np.testing.assert_allclose(number[f"CA_ErrorModel.{key}"], np.sqrt(np.mean(corrections**2, axis=0)))
+
+
+def test_angles_and_ranges_are_those_of_the_returns(outcome: Outcome) -> None:
+    """In the order of the residuals, as corrected: θ and ρ give back where a return lies in the sensor's frame."""
+    arrays, group = record_of(given(outcome)).arrays(), outcome.adjusted.residuals[0]
+    rows = np.flatnonzero(group.weight > 0.0)
+    assert len(arrays["thetaTarget"]) == len(arrays["rhoTarget"]) == len(rows)
+    for row in (0, len(rows) // 2, len(rows) - 1):
+        swath = outcome.flight.swaths[group.swath[rows[row]]]
+        measured = swath.rows[group.at[rows[row]]]
+        value = outcome.adjusted.calibrations["left"].value
+        range_m = (1.0 + value("range_scale")) * measured["range_m"] + value("range_offset_m")
+        angle = (1.0 + value("scan_angle_scale")) * (measured["encoder_rad"] - value("scan_angle_offset_rad"))
+        assert arrays["rhoTarget"][row, 0] == pytest.approx(range_m, abs=1e-6)
+        assert arrays["thetaTarget"][row, 0] == pytest.approx(angle, abs=1e-9)
+
+
+def test_planes_stand_with_their_derivatives(outcome: Outcome) -> None:
+    """A2 · (s1 … s4) of a plane about its centre is the distance from it; G_c is that of unit normals; δ2 if given."""
+    record = record_of(given(outcome))
+    arrays, group = record.arrays(), outcome.adjusted.residuals[0]
+    planes_e = arrays["lidarPlaneParameters"]
+    np.testing.assert_allclose(arrays["designMatrixUnitLength"][:, :3], 2.0 * planes_e[:, :3])
+    assert not arrays["designMatrixUnitLength"][:, 3].any()
+    mine = planes_e[group.feature[group.weight > 0.0]]
+    across = np.einsum("nk,nk->n", arrays["designMatrix2"][:, :3], mine[:, :3])
+    exact = np.einsum("nk,nk->n", arrays["lidarObjectPoint"], mine[:, :3]) + mine[:, 3]
+    np.testing.assert_allclose(across, exact, atol=1e-6)
+    np.testing.assert_array_equal(arrays["designMatrix2"][:, 3], 1.0)
+    assert "CA_LidarCalComputation.corrections2" in record.missing
+    corrections = np.full((len(planes_e), 4), 1e-4)
+    told = record_of(given(outcome, corrections2=corrections))
+    assert "CA_LidarCalComputation.corrections2" not in told.missing
+    np.testing.assert_array_equal(told.arrays()["corrections2"], corrections)
+
+
+@pytest.mark.parametrize(("nodes", "whole"), [(160, True), (240, False)])
+def test_a_correction_by_intensity_stands_in_the_record(outcome: Outcome, nodes: int, whole: bool) -> None:
+    """Where there is one; a long table like other large matrices."""
+    assert "CA_Intensity.intensityCorrection" not in numbers(outcome)
+    table = np.linspace(0.0, 1000.0, nodes + 1), np.linspace(-0.02, 0.03, nodes + 1)
+    calibration = replace(outcome.adjusted.calibrations["left"], ibrc=table)
+    changed = replace(outcome, adjusted=replace(outcome.adjusted, calibrations={"left": calibration}))
+    record = record_of(given(changed, attachment="left.npz"))
+    np.testing.assert_array_equal(record.arrays()["intensityCorrection"], np.column_stack(table))
+    flat = from_json(record_json(record))
+    assert ("CA_Intensity.intensityCorrection.rows" in flat) == whole
+    assert flat["CA_Intensity.intensityCorrection.matrix.attachment"] == "left.npz"
+
+
+@pytest.mark.parametrize("key", [row.key for row in ROWS])
+def test_what_people_tell_stands_in_its_class(outcome: Outcome, key: str) -> None:
+    """Whatever the attribute, over what the calibration says and instead of its being missing."""
+    words: dict[str, Plain] = {
+        "Integer": 7,
+        "Length": 0.25,
+        "CA_ValidationMethod": "testfield, other",
+        "CA_CalibrationType": "testRange",
+    }
+    told = words.get(BY_KEY[key].type, "as the papers say")
+    record = record_of(given(outcome, told={key: told}))
+    assert (record.values[key].content, record.values[key].note) == (told, "as told")
+    assert key not in record.missing
 
 
 def test_gps_time_as_utc() -> None:

@@ -121,6 +121,11 @@ def test_the_record_has_what_was_told_and_its_matrices_beside_it(products: Path)
     normals = matrices["lidarPlaneParameters"][:, :3] + found[:, :3]
     assert np.abs(np.linalg.norm(normals, axis=1) - 1.0).max() < 1e-12  # the unit-length condition, exactly
     assert 0.0 < np.abs(found[:, :3]).max() < np.radians(1.0)
+    told = {attribute["name"]: attribute for owner in record["classes"] for attribute in owner["attributes"]}
+    design = told["designMatrix1"]["matrix"]
+    assert design["attachment"] == "left.record.npz"
+    with np.load(products / "report" / design["attachment"]) as arrays:
+        assert arrays[design["array"]].shape == (told["lidarNObjectPoints"]["value"], 16)
 
 
 def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:

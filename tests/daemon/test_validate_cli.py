@@ -226,17 +226,37 @@ def test_a_record_that_cannot_be_told_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_control_above_the_geoid_is_refused(log: Path, made: Cast, tmp_path: Path) -> None:
+def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
+    """Points on the true surface, or below it; how many."""
     from georef.earth import geodetic_from_e
 
+    places = made.true_t[0][20_000:180_000:8_000]
     rows = ["name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"]
-    for number, place in enumerate(made.true_t[0][20_000:180_000:8_000]):
+    for number, place in enumerate(places):
         lat, lon, height = geodetic_from_e(made.flight.frame.e_from_t(place))
-        rows.append(f"P{number},{np.degrees(lat):.9f},{np.degrees(lon):.9f},{height - 48.0:.4f},0.02")
+        rows.append(f"P{number},{np.degrees(lat):.9f},{np.degrees(lon):.9f},{height - lower_m:.4f},0.02")
+    path.write_text("\n".join(rows))
+    return len(places)
+
+
+def test_control_above_the_geoid_is_refused(log: Path, made: Cast, tmp_path: Path) -> None:
     control = tmp_path / "control.csv"
-    control.write_text("\n".join(rows))
+    control_of(made, control, 48.0)
     with pytest.raises(UserError, match=r"control.csv: control lies 48\.0 m below the laser's ground everywhere"):
         run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--control", str(control))
+
+
+def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path: Path) -> None:
+    """Those that the laser met."""
+    control, file = tmp_path / "control.csv", file_of(tmp_path / "c1.toml", boresight(0.0))
+    given = control_of(made, control)
+    record_beside(tmp_path / "left.record.json", "c1")
+    run(str(file), str(log), "-o", str(tmp_path / "out"), "--control", str(control))
+    told = attributes_of(tmp_path / "out" / "left.record.json")
+    assert "testfield" in told["CA_GeometryValidation.validationMethod"]["value"]
+    methods = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]["methods"]
+    (testfield,) = [one for one in methods if one["method"] == "testfield"]
+    assert 5 < told["CA_TestRange.numberCheckPoints"]["value"] == testfield["points"] <= given
 
 
 def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> None:
