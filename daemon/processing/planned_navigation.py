@@ -21,7 +21,16 @@ from daemon.processing.navigation_sources import filter_setup, noise_of
 from georef.earth import e_from_geodetic
 from georef.navigation.cross_covariance import error_chain
 from georef.navigation.filter import FilterRun
-from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, Setup, Solution, Start, sort_observations
+from georef.navigation.inputs import (
+    OBSERVATION_DTYPE,
+    Inertial,
+    Kind,
+    NavigationError,
+    Setup,
+    Solution,
+    Start,
+    sort_observations,
+)
 from georef.navigation.solve import solve
 from georef.records import FixType, GnssHeading, Int64Array, StructArray
 from georef.timescales import SECOND_NS
@@ -66,7 +75,8 @@ def navigated(survey: Survey, begin_ns: int) -> PlannedNavigation | None:
         begin_ns: GPS time of its start.
 
     Raises:
-        NavigationError: no filter runs on it; PlanError: its receiver's antennas stand in one place.
+        NavigationError: there are never satellites, or no filter runs on it.
+        PlanError: its receiver's antennas stand in one place.
     """
     tables = survey.plan.tables
     unit, receiver = next(iter(tables.imu.items()), None), next(iter(tables.gnss.items()), None)
@@ -113,6 +123,8 @@ def _observations(survey: Survey, name: str, table: GnssTable, setup: Setup, beg
     receiver = Receiver(table, survey.trajectory, seed=seed, name=name, noise=True)
     epochs = receiver.epochs(1, int(survey.trajectory.end_s * table.rate_hz) - 1)
     there = epochs.fix != FixType.NONE
+    if not there.any():
+        raise NavigationError(f"gnss.{name}.outage: lasts the whole flight; want an end before that of the last line")
     time_ns, age_ns = _gps(begin_ns, epochs.time_s[there]), _gps(0, epochs.velocity_age_s[there])
     place_e = e_from_geodetic(epochs.lat_rad, epochs.lon_rad, epochs.height_m)
     position, velocity = np.zeros((2, len(time_ns)), OBSERVATION_DTYPE)

@@ -179,6 +179,11 @@ def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.Ca
             "a nutating scanner cannot be planned for; want one of oscillating, polygon, monogon",
         ),
         ({"lines": OPPOSITE[:1]}, {"no_control": True}, "no roof and no ground is seen from two lines"),
+        (
+            {"more": "[[gnss.rover.outage]]\nat_s = 0.0\nfor_s = 3000.0\n"},
+            {},
+            "gnss.rover.outage: lasts the whole flight; want an end",
+        ),
         ({}, {"model": "all"}, "model: got 'all', want one of basic, scanner, full"),
         ({}, {"sigmas": "0.02,0.004"}, '--sigmas: got "0.02,0.004", want three numbers'),
         ({}, {"sigmas": "0.02,0,0.01"}, '--sigmas: got "0.02,0,0.01", want numbers above 0'),
