@@ -297,7 +297,18 @@ def _adjusted(flight: Flight, features: Features, found: Calibration, random: np
         {"left": calibration}, names, np.zeros(count), values, sigmas, np.full(count, np.inf), correlation, held,
         _trajectory_fit(flight, random), residuals, groups, fits, 1.018, 21540.0, 0.034, 5, 3, True,
         {"range_m": 0.087, "control": 0.04}, np.array([3e-4, 0.02, 0.4, 0.9, 1.2, 1.9, 2.6]),
+        planes_e=_planes_e(flight, features, random),
     )  # fmt: skip
+
+
+def _planes_e(flight: Flight, features: Features, random: np.random.Generator) -> FloatArray:
+    """As adjusted: turned by a hundredth of a degree, moved by millimetres."""
+    normals_e = np.array([plane.normal_t for plane in features.planes]) @ flight.frame.rot_t_from_e
+    centres_e = flight.frame.e_from_t(np.array([plane.centre_t for plane in features.planes]))
+    normals_e += random.normal(0.0, 2e-4, normals_e.shape)
+    normals_e /= np.linalg.norm(normals_e, axis=1, keepdims=True)
+    away = -np.einsum("ij,ij->i", normals_e, centres_e) + random.normal(0.0, 2e-3, len(normals_e))
+    return np.column_stack([normals_e, away])
 
 
 def _trajectory_fit(flight: Flight, random: np.random.Generator) -> TrajectoryFit:

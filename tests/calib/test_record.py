@@ -307,7 +307,9 @@ def test_angles_and_ranges_are_those_of_the_returns(outcome: Outcome) -> None:
 
 
 def test_planes_stand_with_their_derivatives(outcome: Outcome) -> None:
-    """A2 · (s1 … s4) of a plane about its centre is the distance from it; G_c is that of unit normals; δ2 if given."""
+    """A2 · (s1 … s4) of a plane about its centre is the distance from it; G_c is that of unit normals; δ2 leads
+    to those adjusted.
+    """
     record = record_of(given(outcome))
     arrays, group = record.arrays(), outcome.adjusted.residuals[0]
     planes_e = arrays["lidarPlaneParameters"]
@@ -318,11 +320,10 @@ def test_planes_stand_with_their_derivatives(outcome: Outcome) -> None:
     exact = np.einsum("nk,nk->n", arrays["lidarObjectPoint"], mine[:, :3]) + mine[:, 3]
     np.testing.assert_allclose(across, exact, atol=1e-6)
     np.testing.assert_array_equal(arrays["designMatrix2"][:, 3], 1.0)
-    assert "CA_LidarCalComputation.corrections2" in record.missing
-    corrections = np.full((len(planes_e), 4), 1e-4)
-    told = record_of(given(outcome, corrections2=corrections))
-    assert "CA_LidarCalComputation.corrections2" not in told.missing
-    np.testing.assert_array_equal(told.arrays()["corrections2"], corrections)
+    assert arrays["corrections2"].shape == planes_e.shape
+    np.testing.assert_allclose(planes_e + arrays["corrections2"], outcome.adjusted.planes_e, rtol=1e-12)
+    unknown = replace(outcome.adjusted, planes_e=np.zeros((0, 4)))
+    assert "CA_LidarCalComputation.corrections2" in record_of(replace(given(outcome), adjusted=unknown)).missing
 
 
 @pytest.mark.parametrize(("nodes", "whole"), [(160, True), (240, False)])
