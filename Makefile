@@ -17,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-peers test-vm test-vm-long test-long soak-short fuzz lint ready bench bench-calibration install uninstall clean
+.PHONY: help demo test test-peers test-vm test-vm-long test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -46,6 +46,9 @@ test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long
+
+soak: $(VENV)/.tests ## two hours of all kinds of sensors at their full rates (root, for the buffers; alone)
+	$(BIN)/python -m benchmarks.soak --minutes 120 --rate 1
 
 soak-short: $(VENV)/.tests ## an hour of all kinds of sensors at a tenth of their rate (MINUTES=, RATE=)
 	$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) --rate $(RATE)

@@ -4,15 +4,14 @@ python -m benchmarks.soak [--minutes 60] [--rate 0.1] [--keep DIR]
 
 At rate 1: two scanners of 10 000 datagrams/s, GNSS receivers of 921600 and 115200 baud, inertial units of 1000 and
 200 samples/s on CAN, PPS. The rate is that share of all of it but the PPS and the time messages. Every finished part
-is read at once, with the official reader too, and removed (unless kept): the disk does not limit the length.
+is read at once, with the official reader too, and removed (unless kept): the disk does not limit the length. Latency is
+the age of a chunk's oldest message, by the stamp of its arrival, when the chunk can be read; its others are younger.
 Exit status 1 when a check fails.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import shutil
 import signal
 import subprocess
@@ -22,13 +21,15 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.acquire import cpu_s, free_port
-from benchmarks.soak_log import Found, is_finished
+from benchmarks.soak_log import Found
 from benchmarks.soak_sensors import InertialUnit, Pulse, Receiver, Scanner, Sensor
+from benchmarks.soak_watchers import Watcher, note_ages, read_parts
 
 DBC = Path(__file__).resolve().parent.parent / "fixtures" / "config" / "imu.dbc"
 EXPECTED_EVENTS = {
@@ -42,7 +43,10 @@ EXPECTED_EVENTS = {
 }
 WARM_UP = 0.2  # share of the run before memory and descriptors are judged
 RSS_GROWTH_MB = 3.0  # from the second third of the rest to its last: a leak of 1 kB a second shows within the hour
+LATER = 1.5  # by which the median latency of the last third may be that of the first
+PERCENTILES = (50.0, 95.0, 99.0, 99.9)
 PARTS = 12  # of a run, so that the index of the growing part rises and falls several times
+PART_MINUTES = 2.0  # at most: the disk holds a part that is read while the next one grows
 
 TABLES = """[session]
 name = "soak"
@@ -112,7 +116,7 @@ class Soak:
             Scanner("scanner/left", ports[0], 10_000 * rate),
             Scanner("scanner/right", ports[1], 10_000 * rate),
         ]
-        config = TABLES.format(folder=folder, split_minutes=max(0.5, minutes / PARTS))
+        config = TABLES.format(folder=folder, split_minutes=max(0.5, min(minutes / PARTS, PART_MINUTES)))
         for name, port in zip(("left", "right"), ports, strict=True):
             config += SCANNER.format(name=name, port=port)
         for number, (name, hz) in enumerate((("main", 1000 * rate), ("spare", 200 * rate))):
@@ -120,18 +124,22 @@ class Soak:
         (folder / "swath.toml").write_text(config)
         self.found = Found()
         self.samples: list[Sample] = []
+        self.ages: list[tuple[float, float]] = []
         self.cpu_percent = 0.0
         self.exit_status = -1
         self.journal = ""
 
     def run(self, tell: Callable[[str], None]) -> None:
         """Record, look every second, read every part that is finished; then end everything."""
+        logs = self._folder / "logs"
         command = [sys.executable, "-m", "daemon.cli.main", "run", str(self._folder / "swath.toml")]
         with (self._folder / "journal.txt").open("w") as journal:
             recorder = subprocess.Popen(command, stderr=journal)
+        reader, ages = Watcher(read_parts, logs, keep=self._keep), Watcher(note_ages, logs)
         try:
             self._start_as_opened(recorder)
             self._watch(recorder, tell)
+            self.ages = ages.found()
             for sensor in self.sensors:
                 sensor.stop.set()
             for sensor in self.sensors:
@@ -145,7 +153,7 @@ class Soak:
             for sensor in self.sensors:
                 if isinstance(sensor, (Receiver, Pulse)):
                     sensor.unplug()
-        self._read_finished()
+        self.found = reader.found()
         self.journal = (self._folder / "journal.txt").read_text()
 
     def _start_as_opened(self, recorder: subprocess.Popen[bytes]) -> None:
@@ -169,7 +177,6 @@ class Soak:
             if recorder.poll() is not None or any(sensor.failed for sensor in self.sensors):
                 break
             self.samples.append(look(recorder.pid, elapsed))
-            self._read_finished()
             if elapsed // 60 > told:
                 told = int(elapsed // 60)
                 self.cpu_percent = (cpu_s(recorder.pid) - before) / elapsed * 100
@@ -177,20 +184,6 @@ class Soak:
                 tell(f"{told} min: {now.rss_mb:.1f} MB, {now.descriptors} files, {self.cpu_percent:.1f} % CPU")
             time.sleep(1.0)
         self.cpu_percent = (cpu_s(recorder.pid) - before) / (time.monotonic() - start_s) * 100
-
-    def _read_finished(self) -> None:
-        """The parts that no longer grow, in their order."""
-        logs = self._folder / "logs"
-        growing = ""
-        with contextlib.suppress(OSError, ValueError):
-            growing = json.loads((logs / "recording.json").read_text())["path"]
-        paths = sorted(logs.glob("*.mcap"), key=lambda path: int(path.stem.rpartition("_")[2]))
-        for path in paths[self.found.parts if self._keep else 0 :]:
-            if path.name == growing or not is_finished(path):
-                return
-            self.found.read(path)
-            if not self._keep:
-                path.unlink()
 
 
 def look(pid: int, seconds: float) -> Sample:
@@ -214,10 +207,6 @@ def growth(samples: list[Sample]) -> tuple[float, float]:
 def problems(soak: Soak) -> list[str]:
     """Everything that is not as it should be."""
     wrong = soak.found.wrong + account_problems(soak) + process_problems(soak)
-    for source, parser in soak.found.parsers.items():
-        counters = parser.counters
-        if counters.errors or counters.bad_checksums or counters.bytes_skipped:
-            wrong.append(f"{source}: {dict(counters.errors)}, {counters.bad_checksums} bad checksums")
     wrong += [f"event: {event}" for event in soak.found.events if event["code"] not in EXPECTED_EVENTS]
     if (state := soak.found.status.get("gnss/rover", {}).get("time_state")) != "LOCKED":
         wrong.append(f"gnss/rover is {state} at the end")
@@ -247,7 +236,20 @@ def process_problems(soak: Soak) -> list[str]:
     judged = soak.samples[int(len(soak.samples) * WARM_UP) :]
     if judged and min(s.descriptors for s in judged[-60:]) > min(s.descriptors for s in judged[:60]):
         wrong.append("open files grew")
+    thirds = latencies(soak.ages)
+    if not thirds or thirds[-1][0] > LATER * thirds[0][0]:
+        wrong.append(f"latency grew, or was not seen: {[f'{third[0]:.3f} s' for third in thirds]}")
     return wrong
+
+
+def latencies(ages: list[tuple[float, float]]) -> list[list[float]]:
+    """`PERCENTILES` of the ages of each third of a run, seconds; nothing of a run without chunks."""
+    if not ages:
+        return []
+    at_s, age_s = np.array(ages).T
+    edges = np.linspace(0.0, at_s[-1] + 1e-9, 4)
+    thirds = [age_s[(at_s >= low) & (at_s < high)] for low, high in pairwise(edges)]
+    return [np.percentile(third, PERCENTILES).tolist() for third in thirds if len(third)]
 
 
 def report(soak: Soak) -> None:
@@ -265,6 +267,9 @@ def report(soak: Soak) -> None:
     print(
         f"memory {min(memory):.1f} to {max(memory):.1f} MB, {grown:+.2f} MB in the last third, slope {slope:+.2f} MB/h"
     )
+    print(f"{'latency, ms':<14} {'':>12} " + " ".join(f"{f'{percent:g} %':>9}" for percent in PERCENTILES))
+    for name, third in zip(("first third", "second", "last"), latencies(soak.ages), strict=False):
+        print(f"{name:<14} {'':>12} " + " ".join(f"{1e3 * value:>9.0f}" for value in third))
     print(f"open files {files}, {soak.cpu_percent:.1f} % CPU, {found.parts} parts")
     print(f"events {dict(Counter(event['code'] for event in found.events))}")
 

@@ -47,6 +47,15 @@ class Found:
             self.wrong.append(f"{path.name}: the readers disagree: {ours - theirs} {theirs - ours}")
         self.parts += 1
 
+    def without_parsers(self) -> Found:
+        """The same with what parsers counted among what is wrong, to be handed to another process."""
+        for source, parser in self.parsers.items():
+            counters = parser.counters
+            if counters.errors or counters.bad_checksums or counters.bytes_skipped:
+                self.wrong.append(f"{source}: {dict(counters.errors)}, {counters.bad_checksums} bad checksums")
+        self.parsers = {}
+        return self
+
     def _take(self, topic: str, times_ns: Any, units: Any) -> None:
         source = source_of_topic(topic)
         if source is not None:

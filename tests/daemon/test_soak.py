@@ -22,6 +22,7 @@ def good(tmp_path: Path) -> Iterator[Soak]:
         soak.found.status[sensor.source] = {"written": number, "bytes": 50 * number, "time_state": "LOCKED"}
     soak.found.events = [{"code": "session_started"}, {"code": "part_closed"}]
     soak.samples = [Sample(float(at), 45.0 + at % 3, 32 + at % 2) for at in range(600)]
+    soak.ages = [(float(at), 0.25 + 0.01 * (at % 5)) for at in range(600)]
     yield soak
     for sensor in soak.sensors:
         sensor.close()
@@ -63,6 +64,14 @@ def leak_files(soak: Soak) -> None:
         sample.descriptors += int(sample.seconds / 100)
 
 
+def fall_behind(soak: Soak) -> None:
+    soak.ages = [(at, age * (1.0 + at / 500.0)) for at, age in soak.ages]
+
+
+def see_no_chunk(soak: Soak) -> None:
+    soak.ages = []
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
@@ -73,6 +82,8 @@ def leak_files(soak: Soak) -> None:
         (lose_time, "gnss/rover is HOLDOVER at the end"),
         (leak_memory, "memory grew by 4."),
         (leak_files, "open files grew"),
+        (fall_behind, "latency grew, or was not seen: ['0."),
+        (see_no_chunk, "latency grew, or was not seen: []"),
     ],
 )
 def test_each_check_can_fail(good: Soak, spoil: Callable[[Soak], None], told: str) -> None:

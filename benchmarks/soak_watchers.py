@@ -1,0 +1,98 @@
+"""What looks at a soak's logs beside the senders, each in a process of its own so that no sender waits for it.
+
+One reads every part that is finished; one follows the growing part by the heads of its chunks and notes how old
+messages are when they can be read: that is when `swath live` and the status line see them.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import struct
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from benchmarks.soak_log import Found, is_finished
+from daemon.log.scan import OP_CHUNK
+from daemon.parts import read_sign
+
+POLL_S = 0.005
+FAR_S = 5.0  # no chunk is as old as this but for a clock that was set
+NICE = 10  # of the reader: senders and recorder come first
+_HEAD, _SPAN, _MAGIC_BYTES = struct.Struct("<BQ"), struct.Struct("<QQ"), 8
+
+
+class Watcher:
+    """A process that looks at a directory until it is told to stop, and then gives what it found."""
+
+    def __init__(self, look: Callable[[Path, bool, Connection], None], directory: Path, *, keep: bool = False) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._ours, theirs = context.Pipe()
+        self._process = context.Process(target=look, args=(directory, keep, theirs), daemon=True)
+        self._process.start()
+
+    def found(self) -> Any:
+        """Tell it to stop; what it found.
+
+        Raises:
+            EOFError: it has failed.
+        """
+        self._ours.send(None)
+        found = self._ours.recv()
+        self._process.join()
+        return found
+
+
+def read_parts(directory: Path, keep: bool, ask: Connection) -> None:
+    """Read parts as they are finished, and remove them unless they are kept; in the end the last one, too."""
+    os.nice(NICE)
+    found, asked = Found(), False
+    while not asked:
+        asked = ask.poll(1.0)
+        sign = read_sign(directory)
+        paths = sorted(directory.glob("*.mcap"), key=lambda path: int(path.stem.rpartition("_")[2]))
+        for path in paths[found.parts if keep else 0 :]:
+            if (sign is not None and path == sign.path) or not is_finished(path):
+                break
+            found.read(path)
+            if not keep:
+                path.unlink()
+    ask.send(found.without_parsers())
+
+
+def note_ages(directory: Path, keep: bool, ask: Connection) -> None:
+    """Seconds since the beginning, and age in seconds of the oldest message of each chunk when it was seen whole."""
+    ages: list[tuple[float, float]] = []
+    begun_s, path, file, at = time.monotonic(), Path(), -1, 0
+    while not ask.poll(POLL_S):
+        sign = read_sign(directory)
+        if sign is not None and sign.path != path:
+            if file >= 0:
+                _chunks_from(file, at, begun_s, ages)
+                os.close(file)
+            try:
+                path, file, at = sign.path, os.open(sign.path, os.O_RDONLY), _MAGIC_BYTES
+            except OSError:
+                continue
+        if file >= 0:
+            at = _chunks_from(file, at, begun_s, ages)
+    if file >= 0:
+        os.close(file)
+    ask.send(ages)
+
+
+def _chunks_from(file: int, at: int, begun_s: float, ages: list[tuple[float, float]]) -> int:
+    """Note the chunks behind a place that are whole; where the next record begins."""
+    size = os.fstat(file).st_size
+    while at + _HEAD.size <= size:
+        opcode, length = _HEAD.unpack(os.pread(file, _HEAD.size, at))
+        if at + _HEAD.size + length > size:
+            break
+        if opcode == OP_CHUNK:
+            oldest_ns, _ = _SPAN.unpack(os.pread(file, _SPAN.size, at + _HEAD.size))
+            ages.append((time.monotonic() - begun_s, (time.time_ns() - oldest_ns) / 1e9))
+        at += _HEAD.size + length
+    return at
