@@ -1,19 +1,21 @@
 """What the search for planes costs on one core, beside a copy of the points.
 
-python -m benchmarks.planes [--repeats 3] [--json FILE]
+python -m benchmarks.planes [--repeats 3] [--returns 12] [--json FILE]
 
 Figures are medians over the repeats, returns a second of this process's own CPU time: of finding planes anew, of
 finding the same ones again after a calibration, and of reading all points and writing them once. A flight of six
 strips over houses on rolling ground, some five returns a square metre, made of heights alone: the search asks nothing
-else of a flight.
+else of a flight. Its returns are mapped from files, as `swath calibrate` has them; more of them are longer strips.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +34,8 @@ from georef.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 
-STRIPS, RETURNS = 6, 2_000_000  # of a strip
-LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 1000.0, 200.0, 500.0
+STRIPS, RETURNS_PER_M = 6, 2_000  # of a strip
+HALF_WIDTH_M, HEIGHT_M = 200.0, 500.0
 HOUSE_M, LOT_M = 12.0, 40.0
 SPEED_MPS = 50.0
 
@@ -59,32 +61,43 @@ def ground(east: FloatArray, north: FloatArray) -> FloatArray:
     return np.where(roof, base + 8.0 - 0.7 * np.abs(turned), height)
 
 
-def strip(number: int, frame: Tangent, draws: np.random.Generator) -> tuple[Swath, FloatArray, NDArray[np.int64]]:
+def mapped(folder: Path, name: str, array: NDArray[Any]) -> NDArray[Any]:
+    """The array from a file."""
+    np.save(folder / f"{name}.npy", array)
+    loaded: NDArray[Any] = np.load(folder / f"{name}.npy", mmap_mode="r")
+    return loaded
+
+
+def strip(
+    number: int, count: int, folder: Path, frame: Tangent, draws: np.random.Generator
+) -> tuple[Swath, FloatArray, NDArray[np.int64]]:
     """A swath, where its aircraft was (k, 3) in e, and when."""
-    second = np.arange(RETURNS) * (LENGTH_M / SPEED_MPS / RETURNS)
-    along = SPEED_MPS * second - 0.5 * LENGTH_M
+    length_m = count / RETURNS_PER_M
+    second = np.arange(count) / (SPEED_MPS * RETURNS_PER_M)
+    along = SPEED_MPS * second - 0.5 * length_m
     across = HALF_WIDTH_M * (2.0 * (50.0 * second % 1.0) - 1.0)
     turn = number * np.pi / 2.0
     east, north = along * np.cos(turn) - across * np.sin(turn), along * np.sin(turn) + across * np.cos(turn)
-    up = ground(east, north) + draws.normal(0.0, 0.02, RETURNS)
-    rows = np.zeros(RETURNS, RETURN_DTYPE)
+    up = ground(east, north) + draws.normal(0.0, 0.02, count)
+    rows = np.zeros(count, RETURN_DTYPE)
     rows["return_number"] = rows["number_of_returns"] = 1
     rows["range_m"] = np.hypot(across, HEIGHT_M)
-    start_ns = number * 100_000_000_000
-    epochs = np.arange(0.0, LENGTH_M / SPEED_MPS, 0.1)
-    way = SPEED_MPS * epochs - 0.5 * LENGTH_M
+    start_ns = number * 10_000_000_000_000
+    epochs = np.arange(0.0, length_m / SPEED_MPS, 0.1)
+    way = SPEED_MPS * epochs - 0.5 * length_m
     place_t = np.stack([way * np.cos(turn), way * np.sin(turn), np.full(len(way), HEIGHT_M)], axis=1)
     time_ns = start_ns + np.rint(1e9 * second).astype(np.int64)
-    points = np.stack([east, north, up], axis=1)
-    swath = Swath(f"{number:02d}", 0, number, 0, rows, time_ns, points)
+    columns = {"rows": rows, "time": time_ns, "points": np.stack([east, north, up], axis=1)}
+    taken = [mapped(folder, f"{number}.{name}", column) for name, column in columns.items()]
+    swath = Swath(f"{number:02d}", 0, number, 0, *taken)
     return swath, frame.e_from_t(place_t), start_ns + np.rint(1e9 * epochs).astype(np.int64)
 
 
-def flight() -> Flight:
+def flight(returns: int, folder: Path) -> Flight:
     """All strips."""
     frame = Tangent.at(np.asarray(e_from_geodetic(np.radians(47.4), np.radians(8.9), 0.0)))
     draws = np.random.default_rng(7)
-    made = [strip(number, frame, draws) for number in range(STRIPS)]
+    made = [strip(number, returns // STRIPS, folder, frame, draws) for number in range(STRIPS)]
     position_e, time_ns = np.concatenate([one[1] for one in made]), np.concatenate([one[2] for one in made])
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_ns), 1))
     unsaid = np.full_like(position_e, np.nan)
@@ -93,13 +106,16 @@ def flight() -> Flight:
     return Flight(frame, (head,), (trajectory,), tuple(one[0] for one in made))
 
 
-def measure(repeats: int) -> tuple[list[Figure], str]:
+def measure(repeats: int, asked: int, folder: Path) -> tuple[list[Figure], str]:
     """All lines of the table, and what was found."""
-    whole = flight()
+    whole = flight(asked, folder)
     returns = sum(len(swath) for swath in whole.swaths)
     found = find_planes(whole)
     by = np.array([0.1, 0.0, 0.02])
-    moved = replace(whole, swaths=tuple(replace(swath, points_t=swath.points_t + by) for swath in whole.swaths))
+    points = [mapped(folder, f"{swath.name}.moved", swath.points_t + by) for swath in whole.swaths]
+    moved = replace(
+        whole, swaths=tuple(replace(one, points_t=place) for one, place in zip(whole.swaths, points, strict=True))
+    )
 
     def rate(work: object) -> float:
         assert callable(work)
@@ -118,10 +134,12 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3, help="measurements a figure, of which the median counts")
+    parser.add_argument("--returns", type=float, default=12.0, help="millions of them")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     arguments = parser.parse_args()
     keep_freed_memory()  # as every command of ours does
-    figures, what = measure(arguments.repeats)
+    with tempfile.TemporaryDirectory() as folder:
+        figures, what = measure(arguments.repeats, int(1e6 * arguments.returns), Path(folder))
     print(f"{'planes, one core: ' + what:<66} {'rate':>9} {'asked':>8} {'copy':>9}")
     for one in figures:
         asked = f"{one.target / 1e6:>4.0f} M/s" if one.target else ""
