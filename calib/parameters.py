@@ -43,6 +43,8 @@ class ParameterError(ValueError):
 class Wish:
     """What is to be estimated. Names are SI ones, of all scanners (``phi_rad``) or of one (``left.phi_rad``).
 
+    What is said of one scanner's parameter stands above what is said of all; of the same name `fix` counts first.
+
     Attributes:
         model: key of `MODELS`.
         fix: parameters of the model that keep their value.
@@ -240,22 +242,29 @@ def unknowns(flight: Flight, wish: Wish, start: Mapping[str, Calibration] | None
     return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m)
 
 
-def _named(head: Head, name: str, names: frozenset[str] | Mapping[str, float]) -> bool:
-    return name in names or f"{head.name}.{name}" in names
+def _asked(head: Head, name: str, wish: Wish) -> str:
+    """``fix``, ``free``, ``prior`` or nothing: what is said of it on this head, else on all."""
+    for key in (f"{head.name}.{name}", name):
+        for word, names in (("fix", wish.fix), ("prior", wish.priors), ("free", wish.free)):
+            if key in names:
+                return word
+    return ""
 
 
 def _prior(head: Head, name: str, wish: Wish) -> float:
+    if _asked(head, name, wish) == "free":
+        return np.inf
     return wish.priors.get(f"{head.name}.{name}", wish.priors.get(name, np.inf))
 
 
 def _word(head: Head, name: str, wish: Wish) -> str | None:
     """Why a parameter is not estimated; None: it is."""
-    asked = _named(head, name, wish.free) or _named(head, name, wish.priors)
+    asked = _asked(head, name, wish)
     if name in head.geometry.without:
-        if asked:
+        if asked in ("free", "prior"):
             raise ParameterError(f"{head.name}.{name}: cannot be freed: this scanner has no such parameter")
         return "such a scanner has no such parameter"
-    if _named(head, name, wish.fix):
+    if asked == "fix":
         return "held at your word"
     if asked:
         return None

@@ -36,7 +36,7 @@ def command(
     polygons: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Planes to use: WKT,name; polygons in output.crs.")
     ] = None,
-    model: Annotated[str, typer.Option(help="basic, scanner or full.")] = "scanner",
+    model: Annotated[str, typer.Option(help="basic, scanner, full, or a file FILE.toml.")] = "scanner",
     fix: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters that keep their value, as phi_deg.")] = "",
     free: Annotated[str, typer.Option(metavar="KEY,…", help="Parameters beyond the model.")] = "",
     prior: Annotated[
@@ -75,7 +75,7 @@ def command(
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from daemon.cli.georef import calibrations_given
     from daemon.config import load_config
-    from daemon.processing.calibrate_model import model_of
+    from daemon.processing.calibrate_model import file_of, model_of
     from daemon.processing.calibrate_products import write_products
     from daemon.processing.calibrate_record import facts_of
     from daemon.processing.calibrate_run import CalibrateWish, calibrate
@@ -105,6 +105,7 @@ def command(
         ),
         output=output,
         model=model_of(model, fix, free, prior or []),
+        model_file=file_of(model),
         control=control,
         ties=ties,
         polygons=polygons,

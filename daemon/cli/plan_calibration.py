@@ -24,7 +24,7 @@ def command(
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="PNG, PDF or SVG; else <plan>-calibration.png, here."),
     ] = None,
-    model: Annotated[str, typer.Option(help="basic, scanner or full: which parameters.")] = "scanner",
+    model: Annotated[str, typer.Option(help="basic, scanner, full, or a file FILE.toml.")] = "scanner",
     sigmas: Annotated[
         str | None,
         typer.Option(
@@ -46,13 +46,14 @@ def command(
     require_installed("swath plan-calibration", "matplotlib")
     from rich.console import Console
 
+    from daemon.processing.calibrate_model import model_of
     from daemon.processing.calibration_plan import PlanWish, plan_calibration
     from daemon.processing.calibration_plan_page import draw_planned, require_picture
     from daemon.sim_plans import Wish
 
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
     require_picture(picture)
-    asked = PlanWish(model, None if sigmas is None else _three(sigmas), not no_control, control_sigma)
+    asked = PlanWish(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
     wish = Wish(plan)
     with Console(stderr=True).status("flying on paper"), wish.told():
         planned = plan_calibration(wish.load(), asked)
@@ -82,6 +83,7 @@ def _three(text: str) -> tuple[float, float, float]:
 def _document(planned: PlannedCalibration, picture: Path) -> dict[str, Any]:
     return {
         "verdict": planned.sentence,
+        "notes": planned.notes,
         "parameters": [{key: value for key, value in row.items() if key != "basic"} for row in planned.rows],
         "planes": planned.predicted.planes,
         "control_points": planned.control,
@@ -104,5 +106,7 @@ def _print(console: Console, planned: PlannedCalibration, picture: Path) -> None
     for row in planned.rows:
         if row["why"]:
             print(one_line(f"{row['scanner']} {row['name']}: {row['why']}; to determine it: {row['remedy']}"))
+    for note in planned.notes:
+        print(one_line(note))
     print(planned.sentence)
     print(one_line(str(picture)))

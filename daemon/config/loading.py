@@ -92,20 +92,26 @@ def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
     return config
 
 
-def describe(details: ErrorDetails) -> str:
-    """One line of one finding of the models: key path, what was got, what would be right."""
+def describe(details: ErrorDetails, tables: type[BaseModel] = Tables) -> str:
+    """One line of one finding of the models: key path, what was got, what would be right.
+
+    Args:
+        details: the finding.
+        tables: the model of the whole file.
+    """
     location = [item for item in details["loc"] if item != "[key]"]
     kind, context = details["type"], details.get("ctx", {})
     key = _key_path(location)
     if details["loc"][-1:] == ("[key]",):
         return f"{key}: a name becomes a topic; want 1 to 64 of A-Z a-z 0-9 _ -"
     if kind == "extra_forbidden":
-        return f"{key}: unknown key; {_suggestion(location)}"
+        return f"{key}: unknown key; {_suggestion(location, tables)}"
+    field = _walk(location, tables)[1]
     if kind == "missing":
-        return f"{key}: missing; want {_wanted_of_field(_field_at(location))}"
+        return f"{key}: missing; want {_wanted_of_field(field)}"
     if kind == "value_error":
         return f"{key}: {context['error']}" if key else str(context["error"])
-    return f"{key}: got {shown(details['input'])}, want {_wanted(kind, context, location)}"
+    return f"{key}: got {shown(details['input'])}, want {_wanted(kind, context, field)}"
 
 
 def shown(value: object) -> str:
@@ -126,7 +132,7 @@ def _key_path(location: Sequence[int | str]) -> str:
     return path
 
 
-def _wanted(kind: str, context: Mapping[str, Any], location: Sequence[int | str]) -> str:
+def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> str:
     if kind == "literal_error":
         return str(context["expected"]).replace("'", '"')
     if kind in ("too_short", "too_long") and kind == "too_short" and context.get("min_length") == 1:
@@ -138,9 +144,9 @@ def _wanted(kind: str, context: Mapping[str, Any], location: Sequence[int | str]
     if kind == "string_pattern_mismatch":
         return _wanted_of_pattern(str(context["pattern"]))
     if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
-        return _bounds(_field_at(location)) or f"{kind} {context}"
+        return _bounds(field) or f"{kind} {context}"
     wanted = _TYPE_WANTED.get(kind, kind)
-    bounds = _bounds(_field_at(location)) if kind in ("float_type", "int_type") else ""
+    bounds = _bounds(field) if kind in ("float_type", "int_type") else ""
     return f"{wanted} {bounds}".rstrip()
 
 
@@ -189,9 +195,9 @@ def _is_named(annotation: object) -> bool:
     return get_origin(annotation) is dict
 
 
-def _walk(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
+def _walk(location: Sequence[int | str], tables: type[BaseModel]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
     """The innermost model on the way to a location, and the last field passed."""
-    model: type[BaseModel] | None = Tables
+    model: type[BaseModel] | None = tables
     field: FieldInfo | None = None
     skip = False
     for item in location:
@@ -207,12 +213,8 @@ def _walk(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, FieldI
     return model, field
 
 
-def _field_at(location: Sequence[int | str]) -> FieldInfo | None:
-    return _walk(location)[1]
-
-
-def _suggestion(location: Sequence[int | str]) -> str:
-    model, _ = _walk(location[:-1])
+def _suggestion(location: Sequence[int | str], tables: type[BaseModel]) -> str:
+    model, _ = _walk(location[:-1], tables)
     known = list(model.model_fields) if model is not None else []
     close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
     if close:

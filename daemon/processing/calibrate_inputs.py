@@ -35,12 +35,12 @@ class PolygonError(ValueError):
     """A file of polygons that cannot be used; one line for the user."""
 
 
-def text_of(path: Path) -> str:
-    """Of a file; UserError where there is none."""
+def text_of(path: Path, want: str = "CSV") -> str:
+    """Of a file that is to be such a one; UserError where there is none."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want CSV"
+        why = (error.strerror if isinstance(error, OSError) else None) or f"no text; want {want}"
         raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
 
 

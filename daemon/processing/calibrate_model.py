@@ -1,39 +1,170 @@
-"""What `swath calibrate` is asked to estimate, from its options."""
+"""What a calibration is asked to estimate: by a model's name or a file, and options on top of it."""
 
 from __future__ import annotations
 
-from calib.parameters import Wish
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from calib.parameters import MODELS, Wish
 from daemon.errors import ExitCode, UserError
+from daemon.processing.model_file import SUFFIX, ModelTables, read_model
 from georef.calibration import PARAMETERS
 
+FREE, FIXED = "free", "fixed"
+# of keys in files the names here, and SI units a unit of the key
+_PARAMETERS = {parameter.key: (parameter.name, parameter.factor) for parameter in PARAMETERS}
+_BEAM_PARTS = {
+    "azimuth_deg": ("azimuth_rad", math.pi / 180.0),
+    "elevation_deg": ("elevation_rad", math.pi / 180.0),
+    "range_m": ("range_m", 1.0),
+}
 
-def model_of(model: str, fix: str, free: str, priors: list[str]) -> Wish:
-    """Keys of a calibration file, as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
+Known = Mapping[str, tuple[str, float]]
+States = dict[tuple[str, str], str | float]  # by scanner (of all: empty) and name: FREE, FIXED, or a prior's sigma, SI
+
+
+def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = ()) -> Wish:
+    """A model, and keys of a calibration file as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
+
+    An option stands above what a file says of the same parameter; that of all scanners also above what it says of one.
+
+    Args:
+        model: of `calib.parameters.MODELS`, or a file (`daemon.processing.model_file`).
+        fix, free: keys, with commas between.
+        priors: ``KEY=SIGMA``, each in its key's unit.
 
     Raises:
-        UserError: one is no parameter, or a sigma is none.
+        UserError: there is no such model or file, a key is no parameter, or a sigma is none.
     """
-    sigmas: dict[str, float] = {}
-    for entry in priors:
-        key, _, value = entry.partition("=")
-        try:
-            sigma = float(value)
-        except ValueError:
-            raise UserError(f'--prior {entry}: want KEY=SIGMA, as "phi_deg=0.01"', ExitCode.USAGE) from None
-        name, factor = _name_of(key, "--prior")
-        sigmas[name] = sigma * factor
-    named = {
-        option: frozenset(_name_of(key, option)[0] for key in text.split(",") if key)
-        for option, text in (("--fix", fix), ("--free", free))
+    tables = _tables(model)
+    wish = _of_tables(tables)
+    known = _PARAMETERS | _entries(wish)
+    said = _states(tables.parameters.items(), f"{model}: parameters.", known)
+    own = _states(((key, FREE) for key in free.split(",") if key), "--free ", known)
+    own |= _states(map(_prior, priors), "--prior ", known)
+    own |= _states(((key, FIXED) for key in fix.split(",") if key), "--fix ", known)
+    left = {at: state for at, state in said.items() if at not in own and ("", at[1]) not in own}
+    states = {f"{scanner}.{name}" if scanner else name: state for (scanner, name), state in (left | own).items()}
+    return replace(
+        wish,
+        fix=frozenset(name for name, state in states.items() if state == FIXED),
+        free=frozenset(name for name, state in states.items() if state == FREE),
+        priors={name: state for name, state in states.items() if not isinstance(state, str)},
+    )
+
+
+def file_of(model: str) -> Path | None:
+    """The file that a model is given as; None: by its name."""
+    return Path(model) if model.lower().endswith(SUFFIX) else None
+
+
+def of_parameters(wish: Wish) -> Wish:
+    """Without what is asked for in tables: the parameters alone."""
+    entries = {name for name, _ in _entries(wish).values()}
+    priors = {name: sigma for name, sigma in wish.priors.items() if not {name, name.partition(".")[2]} & entries}
+    return Wish(wish.model, wish.fix, wish.free, priors)
+
+
+def in_words(wish: Wish) -> str:
+    """For reports: the model and all that is said beside it, in a file's keys and units."""
+    back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(wish)).items()}
+
+    def told(name: str, sigma: float | None = None) -> str:
+        scanner, own = ("", name) if name in back else (name.partition(".")[0] + ".", name.partition(".")[2])
+        key, factor = back[own]
+        return f"{scanner}{key}" if sigma is None else f"{scanner}{key} {sigma / factor:g}"
+
+    lists = {
+        FIXED: [told(name) for name in sorted(wish.fix)],
+        FREE: [told(name) for name in sorted(wish.free)],
+        "prior": [told(name, sigma) for name, sigma in sorted(wish.priors.items())],
     }
-    return Wish(model, named["--fix"], named["--free"], sigmas)
+    return "; ".join(
+        [wish.model, *(f"{word} {', '.join(names)}" for word, names in lists.items() if names), *tables_in_words(wish)]
+    )
 
 
-def _name_of(key: str, option: str) -> tuple[str, float]:
-    """The model's name of a key, and SI a unit of the key."""
-    scanner, dot, bare = key.strip().rpartition(".")
-    for parameter in PARAMETERS:
-        if bare in (parameter.key, parameter.name):
-            return f"{scanner}{dot}{parameter.name}", parameter.factor if bare == parameter.key else 1.0
-    keys = ", ".join(parameter.key for parameter in PARAMETERS)
-    raise UserError(f"{option} {key}: is no parameter; want one of {keys}", ExitCode.USAGE)
+def tables_in_words(wish: Wish) -> list[str]:
+    """What is asked for in tables."""
+    words = []
+    if wish.ibrc_knots:
+        reference = "" if wish.ibrc_reference is None else f" (reference {wish.ibrc_reference:g})"
+        knots = ", ".join(f"{knot:g}" for knot in wish.ibrc_knots)
+        words.append(f"ibrc at {knots}{reference}, smooth to {wish.ibrc_smoothness_m:g} m")
+    for word, numbers in (("return slot", wish.range_offset_slots), ("zone", wish.range_offset_zones)):
+        if numbers:
+            words.append(f"range offset of {word} {', '.join(map(str, numbers))}")
+    if wish.beams:
+        words.append(f"beam {', '.join(key for key, (name, _) in _BEAM_PARTS.items() if name in wish.beams)}")
+    return words
+
+
+def _tables(model: str) -> ModelTables:
+    file = file_of(model)
+    if file is not None:
+        return read_model(file)
+    if model not in MODELS:
+        raise UserError(f'--model: got "{model}", want {", ".join(MODELS)}, or a file FILE{SUFFIX}', ExitCode.USAGE)
+    return ModelTables.model_validate({"model": model})
+
+
+def _of_tables(tables: ModelTables) -> Wish:
+    """All but the parameters."""
+    wish, ibrc, offsets, beam = Wish(tables.model), tables.ibrc, tables.range_offset, tables.beam
+    if ibrc is not None:
+        wish = replace(
+            wish, ibrc_knots=tuple(ibrc.knots), ibrc_reference=ibrc.reference, ibrc_smoothness_m=ibrc.smoothness_m
+        )
+    if offsets is not None:
+        slots, zones = tuple(offsets.return_slots), tuple(offsets.mta_zones)
+        wish = replace(wish, range_offset_slots=slots, range_offset_zones=zones)
+    if beam is not None:
+        wish = replace(wish, beams=frozenset(_BEAM_PARTS[part][0] for part in beam.estimate))
+    return wish
+
+
+def _entries(wish: Wish) -> dict[str, tuple[str, float]]:
+    """Of the tables that are asked for, what priors may be of: as of `_PARAMETERS`."""
+    names = [f"range_offset_slot.{slot}" for slot in wish.range_offset_slots]
+    names += [f"range_offset_zone.{zone}" for zone in wish.range_offset_zones]
+    middle, reference = len(wish.ibrc_knots) // 2, wish.ibrc_reference
+    zero = middle if reference is None else wish.ibrc_knots.index(reference)
+    names += [f"ibrc.{knot}" for knot in range(len(wish.ibrc_knots)) if knot != zero]
+    parts = {key: one for key, one in _BEAM_PARTS.items() if one[0] in wish.beams}
+    beams = {f"beam.{key}": (f"beam.{name}", factor) for key, (name, factor) in parts.items()}
+    return {name: (name, 1.0) for name in names} | beams
+
+
+def _prior(entry: str) -> tuple[str, float]:
+    key, _, value = entry.partition("=")
+    try:
+        sigma = float(value)
+    except ValueError:
+        sigma = math.nan
+    if not 0.0 < sigma < math.inf:
+        raise UserError(f'--prior {entry}: want KEY=SIGMA, above 0, as "phi_deg=0.01"', ExitCode.USAGE)
+    return key, sigma
+
+
+def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) -> States:
+    """By the names here; ``before`` stands before keys in messages."""
+    found: States = {}
+    for text, state in said:
+        key = text.strip()
+        scanner, own = ("", key) if key in known or "." not in key else tuple(key.split(".", 1))
+        if own not in known:
+            raise UserError(f"{before}{key}: is no parameter; {_want(scanner, own, known)}", ExitCode.USAGE)
+        if isinstance(state, str) and own not in _PARAMETERS:
+            raise UserError(f"{before}{key}: its table asks for it; want a prior, or nothing", ExitCode.USAGE)
+        name, factor = known[own]
+        found[scanner, name] = state if isinstance(state, str) else state * factor
+    return found
+
+
+def _want(scanner: str, own: str, known: Known) -> str:
+    close = difflib.get_close_matches(own, known, n=1, cutoff=0.6)
+    before = f"{scanner}." if scanner else ""
+    return f"did you mean {before}{close[0]}?" if close else f"want one of {', '.join(known)}"

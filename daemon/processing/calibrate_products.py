@@ -22,6 +22,7 @@ from calib.report_input import DifferenceMap, ReportInput
 from calib.report_verdict import Verdict, judge
 from calib.strips import Numbers, StripReport, differences
 from daemon.errors import ExitCode, UserError
+from daemon.processing.calibrate_model import in_words
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import Calibrated, CalibrateWish
 from daemon.processing.sidecar import sha256_of
@@ -96,7 +97,8 @@ def _write(files: Mapping[Path, bytes]) -> None:
 def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
     """Name and SHA-256 of every file that went in; logs first."""
     paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
-    paths += [path for path in (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons) if path is not None]
+    given = (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons, wish.model_file)
+    paths += [path for path in given if path is not None]
     return [(path.name, sha256_of(path)) for path in paths]
 
 
@@ -288,7 +290,7 @@ def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
     air = done.kept.logged[0].setup.config.atmosphere
     return {
         "Swath": importlib.metadata.version("swath"),
-        "model": wish.model.model,
+        "model": in_words(wish.model),
         "observed": ", ".join(wish.observe) + (", control" if done.control else ""),
         "trajectory": "; ".join(trajectory.name for trajectory in done.flight.trajectories),
         "trajectory errors": "; ".join(done.prior.notes) or f"{len(done.prior)} knots",

@@ -24,7 +24,7 @@ def facts_of(file: Path) -> dict[str, Plain]:
         UserError: it is no such file, or something in it is no attribute or not what the attribute takes.
     """
     try:
-        tables = tomllib.loads(text_of(file))
+        tables = tomllib.loads(text_of(file, "TOML"))
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"{file}: is no TOML: {error}") from error
     facts: dict[str, Plain] = {}

@@ -80,6 +80,7 @@ class CalibrateWish:
         logs: what is read and how; what it says of products does not count.
         output: the calibration file; of several scanners a folder for theirs.
         model: what is estimated.
+        model_file: that says so; None: none does.
         control: CSV of surveyed points.
         ties: CSV of points picked in several strips; beside what is observed.
         polygons: CSV of polygons that planes fill; instead of those that would be found.
@@ -93,6 +94,7 @@ class CalibrateWish:
     logs: Wish
     output: Path
     model: Model = field(default_factory=Model)
+    model_file: Path | None = None
     control: Path | None = None
     ties: Path | None = None
     polygons: Path | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from calib.parameters import ParameterError, Wish
 from calib.plan import Line, Predicted, Scan, Surface, planned, predict
 from calib.trajectory_errors import gauss_markov
 from daemon.errors import ExitCode, UserError, one_line
+from daemon.processing.calibrate_model import of_parameters, tables_in_words
 from daemon.processing.planned_navigation import navigated
 from georef.beams import LineGeometry
 from georef.calibration import PARAMETERS, read_calibration
@@ -62,14 +63,14 @@ class PlanWish:
     """What is asked.
 
     Attributes:
-        model: key of `calib.parameters.MODELS`.
+        model: what is estimated. Of it the parameters are predicted: pulses on paper return once, without intensity.
         sigmas: position (m), roll and pitch, heading (degrees) expected of the trajectory; None: as navigation
             with the plan's IMU and receiver would have them.
         control: use the plan's control points.
         control_sigma_m: of them.
     """
 
-    model: str = "scanner"
+    model: Wish = field(default_factory=lambda: Wish("scanner"))
     sigmas: tuple[float, float, float] | None = None
     control: bool = True
     control_sigma_m: float = 0.01
@@ -86,6 +87,7 @@ class PlannedCalibration:
         rows: a parameter each, for tables and JSON.
         sigmas: that were expected of the trajectory.
         control: number of control points on planes.
+        unplanned: what was asked for and is not predicted, in words.
     """
 
     survey: Survey
@@ -95,6 +97,18 @@ class PlannedCalibration:
     rows: list[dict[str, Any]]
     sigmas: tuple[float, float, float]
     control: int
+    unplanned: tuple[str, ...] = ()
+
+    @property
+    def fixed(self) -> list[str]:
+        """Of the boresight and the range offset what the user wants held, as ``left phi_deg``."""
+        keys = {parameter.name: parameter.key for parameter in PARAMETERS if parameter.key in BASIC}
+        return [f"{one.scanner} {keys[one.name]}" for one in self.predicted.held if not one.remedy and one.name in keys]
+
+    @property
+    def notes(self) -> list[str]:
+        """What the prediction does not speak of, a line each."""
+        return [f"not predicted: {words}; pulses on paper return once, without intensity" for words in self.unplanned]
 
     @property
     def lacking(self) -> list[str]:
@@ -111,6 +125,7 @@ class PlannedCalibration:
         if not self.lacking:
             rest = len(self.rows) - len(basic)
             extra = f", and {more} of {rest} others" if rest else ""
+            extra += f"; {', '.join(self.fixed)} held at your word" if self.fixed else ""
             return f"This flight determines boresight and range offset{extra}."
         words = " and ".join(part for part in (", ".join(self.lacking[:-1]), self.lacking[-1]) if part)
         return f"This flight does not determine {words}."
@@ -139,11 +154,12 @@ def plan_calibration(plan: Plan, wish: PlanWish) -> PlannedCalibration:
     try:
         flight, features = planned(frame, heads, scans, [_trajectory(survey, sigmas)], lines, [*surfaces, *control])
         prior = gauss_markov(flight) if navigation is None else navigation.prior(flight)
-        predicted = predict(flight, features, Wish(wish.model), prior)
+        predicted = predict(flight, features, of_parameters(wish.model), prior)
     except (FlightError, ParameterError, NormalError) as error:
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error
     used = sum(len(plane.control) for plane in features.planes)
-    return PlannedCalibration(survey, flight, features, predicted, _rows(predicted), sigmas, used)
+    unplanned = tuple(tables_in_words(wish.model))
+    return PlannedCalibration(survey, flight, features, predicted, _rows(predicted), sigmas, used, unplanned)
 
 
 def _by_the_grade(plan: Plan) -> tuple[float, float, float]:

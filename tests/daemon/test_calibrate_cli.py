@@ -13,6 +13,7 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from calib.features import Features, Plane
+from calib.parameters import Wish
 from daemon.cli.main import run_app
 from daemon.errors import UserError
 from daemon.processing.calibrate_run import refuse_no_planes
@@ -138,7 +139,7 @@ def test_the_plan_says_beforehand_what_the_flight_gives(made: Made, tmp_path: Pa
     given = ("--model", "basic", "--control", control, "--trajectory-datum", "same", "--workers", "1")
     assert run_app(["calibrate", str(made.flown.log), "-o", str(output), *given]) == 0
     found = read_calibration(output.read_text(), "left.toml")
-    planned = plan_calibration(parse_plan(made.plan, tmp_path), PlanWish("basic"))
+    planned = plan_calibration(parse_plan(made.plan, tmp_path), PlanWish(Wish("basic")))
     names = planned.predicted.names
     assert set(names) == {"left.omega_rad", "left.phi_rad", "left.kappa_rad", "left.range_offset_m"}
     for name, predicted in zip(names, planned.predicted.sigmas, strict=True):

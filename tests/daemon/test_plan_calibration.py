@@ -184,7 +184,7 @@ def test_a_poor_unit_is_said_before_the_flight(tmp_path: Path, capsys: pytest.Ca
             {},
             "gnss.rover.outage: lasts the whole flight; want an end",
         ),
-        ({}, {"model": "all"}, "model: got 'all', want one of basic, scanner, full"),
+        ({}, {"model": "all"}, '--model: got "all", want basic, scanner, full, or a file FILE.toml'),
         ({}, {"sigmas": "0.02,0.004"}, '--sigmas: got "0.02,0.004", want three numbers'),
         ({}, {"sigmas": "0.02,0,0.01"}, '--sigmas: got "0.02,0,0.01", want numbers above 0'),
     ],
