@@ -68,6 +68,22 @@ def of_parameters(wish: Wish) -> Wish:
     return Wish(wish.model, wish.fix, wish.free, priors)
 
 
+def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
+    """How people are told of an unknown, as ``phi_deg`` or ``ibrc.2 at 1500``; SI units a unit of it.
+
+    Args:
+        name: without its scanner, as ``phi_rad``, ``ibrc.2``, ``beam.3.azimuth_rad``.
+        knots: intensities of the knots.
+    """
+    before, _, last = name.rpartition(".")
+    if before == "ibrc" and knots:
+        return f"{name} at {knots[int(last)]:g}", 1.0
+    for key, (own, factor) in (_PARAMETERS | _BEAM_PARTS).items():
+        if own == last:
+            return f"{before}.{key}" if before else key, factor
+    return name, 1.0
+
+
 def in_words(wish: Wish) -> str:
     """For reports: the model and all that is said beside it, in a file's keys and units."""
     back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(wish)).items()}
@@ -154,9 +170,9 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
     found: States = {}
     for text, state in said:
         key = text.strip()
-        scanner, own = ("", key) if key in known or "." not in key else tuple(key.split(".", 1))
+        scanner, _, own = ("", "", key) if key in known else key.partition(".")
         if own not in known:
-            raise UserError(f"{before}{key}: is no parameter; {_want(scanner, own, known)}", ExitCode.USAGE)
+            raise UserError(f"{before}{key}: is no parameter; {_want(key, known)}", ExitCode.USAGE)
         if isinstance(state, str) and own not in _PARAMETERS:
             raise UserError(f"{before}{key}: its table asks for it; want a prior, or nothing", ExitCode.USAGE)
         name, factor = known[own]
@@ -164,7 +180,11 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
     return found
 
 
-def _want(scanner: str, own: str, known: Known) -> str:
-    close = difflib.get_close_matches(own, known, n=1, cutoff=0.6)
-    before = f"{scanner}." if scanner else ""
-    return f"did you mean {before}{close[0]}?" if close else f"want one of {', '.join(known)}"
+def _want(key: str, known: Known) -> str:
+    """What would be right, instead of a key of all scanners or of one."""
+    scanner, _, own = key.partition(".")
+    for before, text in (("", key), (f"{scanner}.", own)):
+        close = difflib.get_close_matches(text, known, n=1, cutoff=0.6) if text else []
+        if close:
+            return f"did you mean {before}{close[0]}?"
+    return f"want one of {', '.join(known)}"

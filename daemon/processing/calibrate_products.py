@@ -7,7 +7,7 @@ import hashlib
 import importlib.metadata
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,10 @@ from calib.report_input import DifferenceMap, ReportInput
 from calib.report_verdict import Verdict, judge
 from calib.strips import Numbers, StripReport, differences
 from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_model import in_words
+from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import Calibrated, CalibrateWish
 from daemon.processing.sidecar import sha256_of
-from georef.calibration import PARAMETERS
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 OUTCOME = "calibration.json"
@@ -58,7 +57,11 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     files: dict[Path, bytes] = {path: texts[name].encode() for name, path in _paths(wish, headers).items()}
     report = _report(wish, done, headers, before, after, inputs)
     verdict = judge(report)
-    record = _record(done, headers, before, after, inputs) | {"verdict": _verdict_entry(verdict)}
+    record = _record(done, headers, before, after, inputs) | {
+        "model": in_words(wish.model),
+        "ibrc_knots": list(wish.model.ibrc_knots),
+        "verdict": _verdict_entry(verdict),
+    }
     if wish.report is not None:
         tell("report", 0, 1)
         files |= _report_files(wish.report, done, report, wish.facts)
@@ -66,7 +69,10 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     _write(files)
     written = [str(path) for path in files]
     reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
-    return Told(record | {"files": written}, [*_lines(done, before, after), verdict.sentence, *reasons, *written])
+    return Told(
+        record | {"files": written},
+        [*_lines(done, wish.model.ibrc_knots, before, after), verdict.sentence, *reasons, *written],
+    )
 
 
 def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:
@@ -301,13 +307,13 @@ def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
 # ---------------------------------------------------------------------- for people
 
 
-def _lines(done: Calibrated, before: StripReport, after: StripReport) -> list[str]:
+def _lines(done: Calibrated, knots: Sequence[float], before: StripReport, after: StripReport) -> list[str]:
     adjusted = done.adjusted
     lines = [f"{'parameter':34}{'start':>14}{'found':>14}{'sigma':>12}"]
-    lines += _parameter_lines(adjusted)
+    lines += _parameter_lines(adjusted, knots)
     for held in adjusted.held:
         remedy = f"; {held.remedy}" if held.remedy else ""
-        lines.append(f"not estimated: {held.scanner} {_key(held.name)}: {held.why}{remedy}")
+        lines.append(f"not estimated: {held.scanner} {key_of(held.name, knots)[0]}: {held.why}{remedy}")
     planes, ties = len(done.features.planes), len(done.features.ties)
     seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
     lines.append(
@@ -320,21 +326,16 @@ def _lines(done: Calibrated, before: StripReport, after: StripReport) -> list[st
 
 
 def _profile_lines(check: Check) -> list[str]:
-    told = [f"{one.scanner}.{_key(one.parameter)} {one.normalised:+.1f}" for one in check.comparisons]
+    told = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
     return [f"profiles less adjustment, in sigmas: {', '.join(told)}"] if told else []
 
 
-def _parameter_lines(adjusted: Adjusted) -> list[str]:
-    factors = {parameter.name: (parameter.key, parameter.factor) for parameter in PARAMETERS}
+def _parameter_lines(adjusted: Adjusted, knots: Sequence[float]) -> list[str]:
     lines = []
     for name, start, value, sigma in zip(
         adjusted.names, adjusted.start.tolist(), adjusted.values.tolist(), adjusted.sigmas.tolist(), strict=True
     ):
         scanner, _, bare = name.partition(".")
-        key, factor = factors.get(bare, (bare, 1.0))
+        key, factor = key_of(bare, knots)
         lines.append(f"{scanner + '.' + key:34}{start / factor:14.5f}{value / factor:14.5f}{sigma / factor:12.5f}")
     return lines
-
-
-def _key(name: str) -> str:
-    return next((parameter.key for parameter in PARAMETERS if parameter.name == name), name)

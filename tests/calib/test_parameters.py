@@ -63,6 +63,24 @@ def test_the_scan_angle_s_offset_is_held_unless_it_is_freed() -> None:
     assert "left.scan_angle_offset_rad" in freed.names
 
 
+def test_what_is_said_of_one_scanner_stands_above_what_is_said_of_all() -> None:
+    asked = unknowns(
+        flight(),
+        Wish(
+            fix=frozenset(["omega_rad", "left.phi_rad"]),
+            free=frozenset(["top.omega_rad", "top.kappa_rad"]),
+            priors={"phi_rad": 0.1, "kappa_rad": 0.2},
+        ),
+    )
+    found = dict(zip(asked.names, asked.prior_sigmas.tolist(), strict=True))
+    assert {name: sigma for name, sigma in found.items() if not name.endswith("range_offset_m")} == {
+        "top.omega_rad": np.inf,
+        "top.phi_rad": 0.1,
+        "left.kappa_rad": 0.2,
+        "top.kappa_rad": np.inf,
+    }
+
+
 def extras() -> Unknowns:
     """All that is beyond the model."""
     made = flight()

@@ -7,6 +7,7 @@ import math
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from daemon.errors import UserError
 from daemon.processing.calibrate_run import refuse_no_planes
 from daemon.processing.calibration_plan import PlanWish, plan_calibration
 from daemon.processing.warm_calibration import warm_calibration
-from georef.calibration import read_calibration
+from georef.calibration import Calibration, read_calibration
 from sim.plan import parse_plan
 from tests.calib.village import Made, village
 
@@ -37,7 +38,7 @@ def arguments(made: Made, output: Path, *more: str) -> list[str]:
     trajectory = made.flown.folder / "true_trajectory.csv"
     return [
         *("calibrate", str(made.flown.log), "-o", str(output), "--trajectory", str(trajectory)),
-        *("--trajectory-datum", "same", "--workers", "1", "--model", "basic", *more),
+        *("--trajectory-datum", "same", "--workers", "1", *(() if "--model" in more else ("--model", "basic")), *more),
     ]
 
 
@@ -174,6 +175,68 @@ def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys:
     assert "orthometric" in line
 
 
+IBRC = (("intensity", [0.0, 4000.0]), ("correction_m", [0.10, -0.10]))  # what every intensity does to the range
+
+
+@pytest.fixture(scope="module")
+def by_intensity(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    table = "\n".join(f"{key} = {values}" for key, values in IBRC)
+    folder, more = tmp_path_factory.mktemp("by_intensity"), f"[scanner.left.ibrc]\n{table}\n"
+    return village(folder, prf_hz=20_000.0, lines=(0, 1, 2, 3, 4), plan_more=more)
+
+
+def asked(made: Made, folder: Path, capsys: pytest.CaptureFixture[str], model: str) -> tuple[Any, Calibration]:
+    """What is told to scripts, and the file, of a run with a model's file."""
+    output, file, control = folder / "left.toml", folder / "model.toml", made.flown.folder / "control.csv"
+    file.write_text(model)
+    capsys.readouterr()
+    assert run_app(arguments(made, output, "--model", str(file), "--control", str(control), "--json")) == 0
+    return json.loads(capsys.readouterr().out), read_calibration(output.read_text(), "left.toml")
+
+
+def test_a_model_s_file_asks_for_the_correction_by_intensity(
+    by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    knots = [500.0, 1000.0, 1500.0, 2000.0]
+    told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n[ibrc]\nknots = {knots}\nreference = 1000\n')
+    unknowns = {one["name"]: one for one in told["unknowns"]}
+    assert set(unknowns) == {
+        *(f"left.{name}" for name in (*ANGLES, "range_offset_m")),
+        *map("left.ibrc.{}".format, (0, 2, 3)),
+    }
+    assert found.ibrc is not None
+    in_file = np.interp(knots, *found.ibrc).tolist()
+    assert in_file[1] == 0.0
+    for knot in (0, 2, 3):
+        one = unknowns[f"left.ibrc.{knot}"]
+        assert 0.0 < one["sigma"] < 0.01
+        assert in_file[knot] == pytest.approx(one["value"], abs=1e-9)
+        assert abs(one["value"] - 5e-5 * (1000.0 - knots[knot])) < 3.0 * one["sigma"], (knot, one)
+    # the range offset is that of the reference, whose correction was 0.05 m
+    sigma = found.sigmas[list_of("range_offset_m")]
+    assert abs(found.value("range_offset_m") - (by_intensity.truth.value("range_offset_m") - 0.05)) < 3.0 * sigma
+    assert told["ibrc_knots"] == knots
+    assert told["model"] == "basic; ibrc at 500, 1000, 1500, 2000 (reference 1000), smooth to 0.02 m"
+    assert "model.toml" in [one["name"] for one in told["inputs"]]
+
+
+def test_what_the_flight_does_not_show_of_a_model_s_tables_is_held_and_said(
+    by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No return is so bright, and next to none is a second one; all are in one zone."""
+    tables = "[ibrc]\nknots = [500, 1000, 2500, 60000]\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0]\n"
+    told, found = asked(by_intensity, tmp_path, capsys, f'model = "basic"\n{tables}')
+    held = {one["name"]: one for one in told["held"]}
+    assert {"ibrc.3", "range_offset_slot.2", "range_offset_zone.0"} <= set(held)
+    assert not [one for one in told["unknowns"] if one["name"].removeprefix("left.") in held]
+    for one in held.values():
+        assert one["why"]
+        assert one["remedy"]
+    assert "cannot tell it apart from left.range_offset_m" in held["range_offset_zone.0"]["why"]
+    assert "Not determined by this flight: " in told["verdict"]["sentence"]
+    assert found.range_offsets == ()
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
@@ -181,6 +244,8 @@ def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys:
         (("--fix", "phi"), "phi"),
         (("--prior", "phi_deg=much"), "--prior"),
         (("--control", "nowhere.csv"), "nowhere.csv"),
+        (("--model", "all"), "--model"),
+        (("--model", "nowhere.toml"), "nowhere.toml"),
         (("--scanner", "right"), "right"),
     ],
 )
