@@ -128,6 +128,24 @@ def test_sigmas_go_by_the_noise_of_the_unit(
         assert found[1][name] / found[0][name] > factor, (name, found)
 
 
+def test_a_model_s_file_is_predicted_as_far_as_paper_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Parameters held, freed and with priors; tables are told as not predicted."""
+    plan, picture, model = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png", tmp_path / "model.toml"
+    model.write_text(
+        'model = "basic"\n[parameters]\nkappa_deg = "fixed"\nphi_deg = { prior = 0.0001 }\n'
+        "[ibrc]\nknots = [100, 1000]\n[range_offset]\nreturn_slots = [1, 2]\n"
+    )
+    planned(plan, picture, model=str(model))
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"] == "This flight determines boresight and range offset; left kappa_deg held at your word."
+    assert set(sigmas_of(told)) == {"omega_deg", "phi_deg", "range_offset_m"}
+    assert sigmas_of(told)["phi_deg"] < 0.0001
+    words = ("ibrc at 100, 1000, smooth to 0.02 m", "range offset of return slot 1, 2")
+    assert told["notes"] == [f"not predicted: {one}; pulses on paper return once, without intensity" for one in words]
+    planned(plan, picture, model=str(model), as_json=False)
+    assert "not predicted: ibrc at 100, 1000" in capsys.readouterr().out
+
+
 def test_without_a_receiver_the_trajectory_goes_by_the_grade(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
