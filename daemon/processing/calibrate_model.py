@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calib.parameters import MODELS, Wish
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.model_file import SUFFIX, ModelTables, read_model
 from georef.calibration import PARAMETERS
 
@@ -172,7 +172,7 @@ def _states(said: Iterable[tuple[str, str | float]], before: str, known: Known) 
         key = text.strip()
         scanner, _, own = ("", "", key) if key in known else key.partition(".")
         if own not in known:
-            raise UserError(f"{before}{key}: is no parameter; {_want(key, known)}", ExitCode.USAGE)
+            raise UserError(one_line(f"{before}{key}: is no parameter; {_want(key, known)}"), ExitCode.USAGE)
         if isinstance(state, str) and own not in _PARAMETERS:
             raise UserError(f"{before}{key}: its table asks for it; want a prior, or nothing", ExitCode.USAGE)
         name, factor = known[own]

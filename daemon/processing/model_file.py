@@ -5,6 +5,7 @@ Keys are those of a calibration file (CONVENTIONS), validated as the configurati
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -37,7 +38,7 @@ def _state(value: object) -> str | float:
     if value in ("free", "fixed"):
         return str(value)
     sigma = value.get(PRIOR) if isinstance(value, dict) and len(value) == 1 else None
-    if isinstance(sigma, int | float) and not isinstance(sigma, bool) and 0.0 < sigma < float("inf"):
+    if isinstance(sigma, int | float) and not isinstance(sigma, bool) and 0.0 < sigma <= sys.float_info.max:
         return float(sigma)
     got = f"{PRIOR} = {shown(value[PRIOR])}" if isinstance(value, dict) and PRIOR in value else shown(value)
     raise ValueError(f"got {got}, {_ANY_STATE}")
@@ -45,7 +46,14 @@ def _state(value: object) -> str | float:
 
 def _by_key(table: object) -> object:
     """With ``left.phi_deg`` as one key also where it stands without quotes, which TOML takes for a table in a table."""
-    return dict(_flat("", table)) if isinstance(table, dict) else table
+    if not isinstance(table, dict):
+        return table
+    found: dict[str, Any] = {}
+    for key, value in _flat("", table):
+        if key in found:
+            raise ValueError(f"{key} stands there twice; want it once")
+        found[key] = value
+    return found
 
 
 def _flat(before: str, table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -133,11 +141,11 @@ def read_model(file: Path) -> ModelTables:
         UserError: it cannot be read; ConfigError: all that is wrong with it, one line each.
     """
     try:
-        document = tomllib.loads(text_of(file, "TOML"))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        return ModelTables.model_validate(tomllib.loads(text_of(file, "TOML")))
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{file}: not TOML: {error}") from error
-    try:
-        return ModelTables.model_validate(document)
+    except RecursionError as error:
+        raise ConfigError(f"{file}: nested too deeply; want the tables of a model") from error
     except ValidationError as error:
         lines = [describe(details, ModelTables) for details in error.errors(include_url=False)]
         raise ConfigError([f"{file}: {line}" for line in lines]) from error
