@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from calib.parameters import Wish
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_model import file_of, in_words, key_of, model_of, of_parameters, tables_in_words
 
+PAGE = Path(__file__).resolve().parents[2] / "docs/calibration.md"
 DEG = math.pi / 180.0
 WHOLE = """
 model = "full"
@@ -68,6 +70,16 @@ def test_a_file_reaches_all_that_can_be_asked_for(tmp_path: Path) -> None:
         range_offset_slots=(1, 2),
         range_offset_zones=(0, 3),
     )
+
+
+def test_the_example_of_the_page_is_such_a_file(tmp_path: Path) -> None:
+    (example,) = re.findall(r"^```toml\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
+    wish = model_of(file(tmp_path, example))
+    assert wish.priors == {"left.kappa_rad": 0.02 * DEG, "range_offset_slot.2": 0.03}
+    assert wish.ibrc_reference in wish.ibrc_knots
+    assert wish.range_offset_slots
+    assert wish.range_offset_zones
+    assert len(wish.beams) == 3
 
 
 def test_an_empty_file_is_the_model_that_there_is_without_one(tmp_path: Path) -> None:
