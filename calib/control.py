@@ -25,6 +25,7 @@ FloatArray = NDArray[np.float64]
 
 COLUMNS = ("name", "lat_deg", "lon_deg", "h_ellipsoidal_m", "sigma_m")
 HEADER = ",".join(COLUMNS)
+SMALLEST_SIGMA_M = 1e-6
 LIMITS = {"lat_deg": 90.0, "lon_deg": 360.0, "h_ellipsoidal_m": 9000.0, "sigma_m": 10.0}
 MOST_MISTAKES = 10
 SAME_PLACE_M = 0.01
@@ -145,7 +146,7 @@ def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
     except ValueError:
         value = math.nan
     least, most = (0.0 if column == "sigma_m" else -LIMITS[column]), LIMITS[column]
-    if not least <= value <= most or (column == "sigma_m" and value == 0.0):
+    if not least <= value <= most or (column == "sigma_m" and value < SMALLEST_SIGMA_M):
         unit = column.rpartition("_")[2].replace("deg", "degrees").replace("m", "metres", 1)
         hint = "; are these metres of a map?" if column in ("lat_deg", "lon_deg") and abs(value) > 1000.0 else ""
         want = f"{unit} above 0, at most {most:g}" if column == "sigma_m" else f"{unit} from {least:g} to {most:g}"
@@ -165,7 +166,9 @@ def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
         names.setdefault(point.name, line)
     if len(read) > 1:
         places = e_from_geodetic(*np.array([[p.lat_rad, p.lon_rad, p.height_m] for _, p in read]).T)
-        for one_at, other_at in sorted(cKDTree(places).query_pairs(SAME_PLACE_M)):
+        distance, nearest = cKDTree(places).query(places, k=2, distance_upper_bound=SAME_PLACE_M)
+        found = {tuple(sorted(pair)) for pair in nearest[np.isfinite(distance).all(axis=1)].tolist()}
+        for one_at, other_at in sorted(found):
             (line, one), (other_line, other) = read[one_at], read[other_at]
             if one.name != other.name:
                 mistakes.append(

@@ -23,6 +23,7 @@ FloatArray = NDArray[np.float64]
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 ALPHA = 0.001
+EARLIEST, LATEST = 1980, 2500  # years in which calibrations are made
 FEWEST_FOR_TREND = 3
 YEAR_S = 365.25 * 86_400.0
 
@@ -207,6 +208,10 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
             raise HistoryError(f"calibration {one.id}: names no installation; a history wants calibration.installation")
         if not isinstance(created, dt.datetime):
             raise HistoryError(f"calibration {one.id}: calibration.created is no time; want 2026-11-21T10:15:00Z")
+        if not EARLIEST <= created.year <= LATEST:
+            raise HistoryError(
+                f"calibration {one.id}: calibration.created is of the year {created.year}; want its own time"
+            )
         if one.id in seen:
             raise HistoryError(f"calibration {one.id}: stands twice; want each once")
         seen.add(one.id)

@@ -18,6 +18,8 @@ from calib.flight import Flight, Swath
 FloatArray = NDArray[np.float64]
 
 HEADER = ("name", "strip", "x", "y", "z", "sigma_m")
+FARTHEST = 1e9  # in any unit of a map
+SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 10.0
 CHUNK = 1_000_000
 
 
@@ -70,13 +72,18 @@ def read_picked(text: str, name: str) -> tuple[Picked, ...]:
     Raises:
         PickedError: not such a file; line and what would be right.
     """
-    rows = list(csv.reader(io.StringIO(text)))
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    reader = csv.reader(io.StringIO(text))
+    try:
+        rows = [(reader.line_num, cells) for cells in reader]
+    except csv.Error as error:
+        raise PickedError(f"{name}: line {reader.line_num}: no CSV: {error}") from None
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
     if sorted(header) != sorted(HEADER):
-        raise PickedError(f"{name}: line 1: got {', '.join(header) or 'nothing'}; want the columns {', '.join(HEADER)}")
+        got = " ".join(", ".join(header).split()) or "nothing"
+        raise PickedError(f"{name}: line 1: got {got}; want the columns {', '.join(HEADER)}")
     picked = [
         _row(dict(zip(header, cells, strict=False)), f"{name}: line {number}")
-        for number, cells in enumerate(rows[1:], 2)
+        for number, cells in rows[1:]
         if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
     ]
     if not picked:
@@ -97,11 +104,11 @@ def _row(cells: dict[str, str], where: str) -> Picked:
             number = float(values[key])
         except ValueError:
             number = math.nan
-        if not math.isfinite(number):
-            raise PickedError(f"{where}: {key}: got {values[key]!r}, want a number")
+        if not abs(number) <= FARTHEST:
+            raise PickedError(f"{where}: {key}: got {values[key]!r}, want a number of at most {FARTHEST:g}")
         numbers.append(number)
-    if numbers[3] <= 0.0:
-        raise PickedError(f"{where}: sigma_m: got {numbers[3]:g}, want more than 0")
+    if not SMALLEST_SIGMA_M <= numbers[3] <= LARGEST_SIGMA_M:
+        raise PickedError(f"{where}: sigma_m: got {numbers[3]:g}, want more than 0, at most {LARGEST_SIGMA_M:g}")
     return Picked(values["name"], values["strip"], np.array(numbers[:3]), numbers[3], where)
 
 

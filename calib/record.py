@@ -21,7 +21,8 @@ from calib.flight import Flight
 from calib.outcome import Adjusted
 from calib.record_content import content_of
 from calib.record_tables import BY_KEY, CALIBRATION_TYPES, CLASSES, ROWS, VALIDATION_METHODS, Class, Row
-from calib.record_values import Matrix, Plain, Value
+from calib.record_values import Matrix, Plain, Value, is_document, is_plain
+from georef.toml_tables import key_text
 
 Document = dict[str, Any]  # what a record's JSON holds
 
@@ -32,6 +33,9 @@ NOTE = (
     "elements are this record's own, for no public schema of part 2 is known. confirmed=false: the name, its class, "
     "obligation or type is this record's reading of a clause."
 )
+
+
+_LONGEST_KEY = 80  # that names are compared with
 
 
 class RecordError(ValueError):
@@ -108,14 +112,17 @@ def told_value(key: str, value: Plain, note: str = "as told") -> Value:
     """
     row = BY_KEY.get(key)
     if row is None:
-        near = get_close_matches(key, BY_KEY, 1, 0.0)
-        raise RecordError(f"{key} is no attribute of the record; did you mean {near[0]}?")
+        near = get_close_matches(key[:_LONGEST_KEY], BY_KEY, 1, 0.0)
+        named = ".".join(map(key_text, key.split(".")))
+        raise RecordError(f"{named} is no attribute of the record; did you mean {near[0]}?")
+    if not is_plain(value):
+        raise RecordError(f"{key}: got {value!r}, want text, a number, or a list of numbers")
     choices = {"CA_ValidationMethod": tuple(VALIDATION_METHODS), "CA_CalibrationType": CALIBRATION_TYPES}.get(row.type)
     if choices is not None and any(word not in choices for word in str(value).split(", ")):
         raise RecordError(f"{key}: got {value!r}, want {', '.join(choices)}")
     if row.type == "Integer" and (isinstance(value, bool) or not isinstance(value, int)):
         raise RecordError(f"{key}: got {value!r}, want a whole number")
-    if row.type == "Length" and (isinstance(value, bool | str) or not np.isfinite(value).all()):
+    if row.type == "Length" and isinstance(value, str):
         raise RecordError(f"{key}: got {value!r}, want metres")
     unit = {"Length": "m", "Angle": "rad", "DirectPosition": "m"}.get(row.type, "")
     return Value(value, unit if not isinstance(value, str) else "", note)
@@ -223,7 +230,7 @@ def _word(value: object) -> str:
 
 def _clean(text: str) -> str:
     """Without the control characters that XML cannot hold."""
-    return "".join(one if one >= " " or one in "\t\n" else "\ufffd" for one in text)
+    return "".join(one if (one >= " " or one in "\t\n") and one not in "\ufffe\uffff" else "\ufffd" for one in text)
 
 
 # ---------------------------------------------------------------------- a record that is told more
@@ -240,16 +247,22 @@ def read_document(text: str, name: str) -> Document:
         RecordError: it is no such record.
     """
     try:
-        document = json.loads(text)
-        known = document["version"] == VERSION and all(isinstance(document[key], str) for key in ("id", "note"))
+        document = json.loads(text, parse_constant=_refuse)
+        json.dumps(document, ensure_ascii=False).encode()  # half a pair of UTF-16 is no text
+        known = document["version"] == VERSION and is_document(document)
         named = [(owner["name"], one["name"]) for owner in document["classes"] for one in owner["attributes"]]
         lost = [(one["class"], one["name"]) for one in document["missing"]]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         known, named, lost = False, [], []
     if not known or any(f"{owner}.{one}" not in BY_KEY for owner, one in (*named, *lost)):
         raise RecordError(f"{name}: no record of a calibration; want NAME.record.json of swath calibrate --report")
     told: Document = document
     return told
+
+
+def _refuse(constant: str) -> float:
+    """JSON has no NaN and no infinity; Python's reader takes them."""
+    raise ValueError(constant)
 
 
 def with_told(document: Document, told: Mapping[str, tuple[Plain, str]]) -> Document:

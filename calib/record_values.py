@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,3 +68,53 @@ def utc_text(gps_ns: int) -> str:
     start = dt.datetime(GPS_EPOCH.year, GPS_EPOCH.month, GPS_EPOCH.day, tzinfo=dt.UTC)
     moment = start + dt.timedelta(microseconds=gps_ns // 1000) - dt.timedelta(seconds=leap_seconds)
     return moment.isoformat().replace("+00:00", "Z")
+
+
+def is_plain(value: object) -> bool:
+    """Whether it is text, a finite number, or numbers: `Plain`."""
+    if isinstance(value, tuple):
+        return all(_is_number(one) for one in value)
+    return isinstance(value, str) or _is_number(value)
+
+
+def is_document(document: Any) -> bool:
+    """Whether what JSON gave is laid out as a record: heads, classes, attributes with a value or a matrix."""
+    heads = isinstance(document, dict) and all(isinstance(document.get(key), str) for key in ("id", "note"))
+    if not heads or len(document["id"].splitlines()) != 1:
+        return False
+    classes, missing = document.get("classes"), document.get("missing")
+    if not (isinstance(classes, list) and isinstance(missing, list)):
+        return False
+    lost = all(_has_words(one, ("class", "name"), ()) for one in missing)
+    return lost and all(
+        _has_words(owner, ("name", "standard"), ("attributes",))
+        and isinstance(owner.get("attributes"), list)
+        and all(_is_attribute(one) for one in owner["attributes"])
+        for owner in classes
+    )
+
+
+def _is_attribute(one: Any) -> bool:
+    if not _has_words(one, ("name", "type"), ("value", "values", "matrix")):
+        return False
+    if "matrix" in one:
+        rows = one.get("values", [])
+        numbers = isinstance(rows, list) and all(isinstance(row, list) and is_plain(tuple(row)) for row in rows)
+        return numbers and _has_words(one["matrix"], (), ())
+    value = one.get("value")
+    return is_plain(tuple(value) if isinstance(value, list) else value)
+
+
+def _has_words(table: Any, texts: tuple[str, ...], others: tuple[str, ...]) -> bool:
+    """A table with these texts, and words, numbers or truths under names of letters for the rest but the others."""
+    return (
+        isinstance(table, dict)
+        and all(isinstance(table.get(key), str) for key in texts)
+        and all(key.isascii() and key.isidentifier() for key in table)
+        and all(isinstance(value, bool) or is_plain(value) for key, value in table.items() if key not in others)
+    )
+
+
+def _is_number(value: object) -> bool:
+    """Finite, no truth, and small enough for a number of 64 bits."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from daemon.config.tables import Tables
 from daemon.log.format import LogError
 from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
 from drivers.core.registry import UnknownProtocolError, find_driver
+from georef.toml_tables import TomlError, toml_tables
 
 
 def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
@@ -27,8 +27,8 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
         return None
     try:
         text = stored.decode()
-        return Config(Tables.model_validate(tomllib.loads(text)), Path("config.toml"), text)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError, ValidationError) as error:
+        return Config(Tables.model_validate(toml_tables(text)), Path("config.toml"), text)
+    except (UnicodeDecodeError, TomlError, ValidationError) as error:
         raise LogError(f"config.toml in the log: {str(error).splitlines()[0]}") from error
 
 

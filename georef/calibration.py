@@ -6,7 +6,6 @@ Read from a calibration file (CONVENTIONS, "Calibration file"), or nominal where
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -15,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from georef.toml_tables import TomlError, key_text, toml_tables
+
 FloatArray = NDArray[np.float64]
 
 CONVENTIONS = 1  # version of docs/conventions.md
@@ -22,6 +23,7 @@ METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
 RANGES = ("corrected", "vacuum")
 REFRACTIONS = ("none", "ardc", "spherical")
 ROTATION_TOLERANCE = 1e-6
+LARGEST, LEAST_SIGMA = 1e18, 1e-15  # in the units of the file: far beyond what anything is, and still to be squared
 MOST = 65_535  # of channels, which have 16 bits, and of what is fewer
 ONE_TABLE = "want it once"
 TABLES = ("calibration", "parameters", "sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
@@ -162,9 +164,9 @@ def read_calibration(text: str, name: str) -> Calibration:
         CalibrationError: one line a mistake.
     """
     try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"{name}: not TOML: {str(error).splitlines()[0]}") from error
+        document = toml_tables(text)
+    except TomlError as error:
+        raise CalibrationError(f"{name}: {error}") from error
     reader = _Reader(document)
     calibration = reader.calibration()
     if reader.mistakes:
@@ -185,8 +187,10 @@ class _Reader:
         self._version(header)
         parameters, _ = self._values("parameters")
         sigmas, estimated = self._values("sigma")
-        for index in np.flatnonzero(sigmas < 0.0).tolist():
-            self._wrong(f"sigma.{PARAMETERS[index].key}", f"got {sigmas[index]:g}, want at least 0")
+        in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
+        for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
+            want = "at least 0" if sigmas[index] < 0.0 else f"0, which is held, or at least {LEAST_SIGMA:g}"
+            self._wrong(f"sigma.{PARAMETERS[index].key}", f"got {in_units[index]:g}, want {want}")
         return Calibration(
             id=self._text(header, "id"),
             scanner=self._text(header, "scanner"),
@@ -211,7 +215,7 @@ class _Reader:
     def _known(self, table: Mapping[str, Any], where: str, keys: tuple[str, ...]) -> None:
         """What nobody would look at, as a table or key that is misspelt, is wrong too."""
         for key in sorted(table.keys() - set(keys)):
-            self._wrong(f"{where}{key}", f"is not known; want {', '.join(keys)}")
+            self._wrong(f"{where}{key_text(key)}", f"is not known; want {', '.join(keys)}")
 
     def _table(self, key: str, *, needed: bool = False) -> Mapping[str, Any]:
         table = self._document.get(key)
@@ -223,10 +227,11 @@ class _Reader:
 
     def _text(self, header: Mapping[str, Any], key: str) -> str:
         value = header.get(key)
-        if isinstance(value, str) and value:
+        if isinstance(value, str) and value.splitlines() == [value]:
             return value
         if header:
-            self._wrong(f"calibration.{key}", f"{'missing' if value is None else 'not text'}; want text in quotes")
+            got = "missing" if value is None else "no line" if isinstance(value, str) and value else "not text"
+            self._wrong(f"calibration.{key}", f"{got}; want text in quotes")
         return ""
 
     def _version(self, header: Mapping[str, Any]) -> None:
@@ -251,6 +256,9 @@ class _Reader:
             got = "missing" if value is None else f"got {value!r}"
             self._wrong(f"{where}.{key}", f"{got}, want a number")
             return 0.0
+        if abs(value) > LARGEST:
+            self._wrong(f"{where}.{key}", f"got {value:g}, want a number, at most {LARGEST:g} either way")
+            return 0.0
         return float(value)
 
     def _whole(self, table: Mapping[str, Any], key: str, where: str, *, least: int = 0) -> int:
@@ -266,7 +274,7 @@ class _Reader:
         table = self._table(section, needed=section == "parameters")
         values, said = np.zeros(len(PARAMETERS)), set()
         for key in sorted(table.keys() - _INDEX_OF_KEY.keys()):
-            self._wrong(f"{section}.{key}", "no parameter of the model; want the keys of CONVENTIONS")
+            self._wrong(f"{section}.{key_text(key)}", "no parameter of the model; want the keys of CONVENTIONS")
         for index, parameter in enumerate(PARAMETERS):
             needed = parameter.needed and section == "parameters" and bool(table)
             if parameter.key in table or needed:
@@ -376,12 +384,12 @@ def _is_correlation(matrix: FloatArray) -> bool:
 
 
 def _array(value: object, shape: tuple[int, ...] | None) -> FloatArray | None:
-    """Finite numbers of this shape (None: a list of any length), or None."""
+    """Numbers of this shape (None: a list of any length), none beyond `LARGEST`, or None."""
     try:
         array = np.array(value)
     except ValueError:
         return None
-    if array.dtype.kind not in "if" or not np.isfinite(array).all():
+    if array.dtype.kind not in "if" or not (np.abs(array.astype(np.float64)) <= LARGEST).all():
         return None
     if array.ndim != 1 if shape is None else array.shape != shape:
         return None

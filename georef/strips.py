@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +18,7 @@ from georef.points import FloatArray
 from georef.records import Int64Array
 
 SECOND_NS = 1_000_000_000
+LATEST_NS = 1 << 62  # of GPS time, in 2126: differences and sums of two stay within 64 bits
 MAX_STRIPS = 65_535  # a point source id has 16 bits
 CSV_COLUMNS = ("start_gps_ns", "end_gps_ns")
 Span = tuple[int, int]
@@ -165,10 +166,22 @@ def read_strips(text: str, name: str) -> list[Span]:
         StripError: a column is missing, a value is no integer, a strip has no length, or two overlap.
     """
     rows = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    try:
+        strips = sorted(_spans(rows, name))
+    except csv.Error as error:
+        raise StripError(f"{name}: line {rows.reader.line_num}: no CSV: {error}") from None
+    for (_, end), (start, _) in pairwise(strips):
+        if start < end:
+            raise StripError(f"{name}: the strip that begins at {start} overlaps the one before, which ends at {end}")
+    if not strips:
+        raise StripError(f"{name}: has no strips")
+    return strips
+
+
+def _spans(rows: csv.DictReader[str], name: str) -> Iterator[Span]:
     missing = [column for column in CSV_COLUMNS if column not in (rows.fieldnames or [])]
     if missing:
         raise StripError(f"{name}: no column {missing[0]}; want a first line {','.join(CSV_COLUMNS)}")
-    strips: list[Span] = []
     for row in rows:
         try:
             start, end = (int(row[column]) for column in CSV_COLUMNS)
@@ -176,11 +189,8 @@ def read_strips(text: str, name: str) -> list[Span]:
             raise StripError(f"{name}: line {rows.line_num}: want two integers, GPS nanoseconds") from None
         if end <= start:
             raise StripError(f"{name}: line {rows.line_num}: the strip ends at {end}, before it begins")
-        strips.append((start, end))
-    strips.sort()
-    for (_, end), (start, _) in pairwise(strips):
-        if start < end:
-            raise StripError(f"{name}: the strip that begins at {start} overlaps the one before, which ends at {end}")
-    if not strips:
-        raise StripError(f"{name}: has no strips")
-    return strips
+        if not 0 <= start < end <= LATEST_NS:
+            raise StripError(
+                f"{name}: line {rows.line_num}: {start} to {end} is beyond all GPS time; want nanoseconds since 1980"
+            )
+        yield start, end

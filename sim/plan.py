@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -12,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from georef.timescales import gps_ns_from_unix, table_leap_seconds
+from georef.toml_tables import TomlError, toml_tables
 from sim.errors import PlanError
 from sim.plan_tables import Tables
 from sim.toml_text import toml_text
@@ -69,9 +69,9 @@ def load_plan(name: str | Path) -> Plan:
 def parse_plan(text: str, folder: Path) -> Plan:
     """A plan from its text; raises `PlanError`."""
     try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise PlanError("plan", f"not TOML: {str(error).splitlines()[0]}") from None
+        document = toml_tables(text)
+    except TomlError as error:
+        raise PlanError("plan", str(error)) from None
     tables = _validated(document)
     start = tables.flight.start
     if start.tzinfo is None:

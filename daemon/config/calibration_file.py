@@ -5,12 +5,12 @@ The full model is read by calib; the recorder only keeps a copy, and refuses to 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from daemon.config.tables import ScannerConfig
+from georef.toml_tables import TomlError, toml_tables
 
 CONVENTIONS_VERSION = 1
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
@@ -29,9 +29,12 @@ NEEDED_PARAMETERS = (
 def check_calibration(path: Path, scanner: str, table: ScannerConfig) -> Iterator[str]:
     """Findings of a calibration file for the scanner of that name: what is wrong, what would be right."""
     try:
-        document = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        yield f"not TOML: {str(error).splitlines()[0]}"
+        document = toml_tables(path.read_bytes().decode("utf-8"))
+    except UnicodeDecodeError as error:
+        yield f"not TOML: {error}"
+        return
+    except TomlError as error:
+        yield str(error)
         return
     header, parameters = document.get("calibration"), document.get("parameters")
     if not isinstance(header, dict) or not isinstance(parameters, dict):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -18,6 +17,7 @@ from daemon.config.checks import check_devices
 from daemon.config.config import Config
 from daemon.config.tables import Tables
 from daemon.errors import ConfigError, ExitCode, UserError
+from georef.toml_tables import TomlError, toml_tables
 
 MAX_CONFIG_BYTES = 4 * 1024 * 1024  # no sane configuration is larger; a log given by mistake is not read whole
 _SHOWN_CHARACTERS = 60
@@ -66,11 +66,9 @@ def parse_config(text: str, path: Path) -> Config:
         ConfigError: all that is wrong with it, one line each.
     """
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from error
-    except RecursionError as error:
-        raise ConfigError(f"{path}: not a configuration: nested too deeply") from error
+        table = toml_tables(text)
+    except TomlError as error:
+        raise ConfigError(f"{path}: {error}") from error
     return validate(table, path, text)
 
 

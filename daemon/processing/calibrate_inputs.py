@@ -27,7 +27,8 @@ from daemon.processing.calibration_flight import KeptFlight
 FloatArray = NDArray[np.float64]
 
 COLUMNS = ("WKT", "name")
-_POLYGON = re.compile(r"^POLYGON\s*Z?\s*\(\(([^()]*)\)\)$", re.IGNORECASE)
+FARTHEST = 1e9  # in any unit of a map
+_POLYGON = re.compile(r"^POLYGON\s*(?:Z\s*)?\(\(([^()]*)\)\)$", re.IGNORECASE)
 _WANT = 'want "POLYGON ((x y, x y, x y, x y))", one ring, no holes'
 
 
@@ -92,6 +93,13 @@ def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
         PolygonError: not such a file; line and what would be right.
     """
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    try:
+        return _rings(reader, name)
+    except csv.Error as error:
+        raise PolygonError(f"{name}: line {reader.reader.line_num}: no CSV: {error}") from None
+
+
+def _rings(reader: csv.DictReader[str], name: str) -> dict[str, FloatArray]:
     missing = [column for column in COLUMNS if column not in (reader.fieldnames or ())]
     if missing:
         raise PolygonError(f"{name}: line 1: no column {missing[0]}; want the columns {', '.join(COLUMNS)}")
@@ -99,7 +107,8 @@ def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
     for row in reader:
         where, key = f"{name}: line {reader.line_num}", (row["name"] or "").strip()
         if not key or key in found:
-            raise PolygonError(f"{where}: name: {'is missing' if not key else f'{key} is there twice'}; want one each")
+            wrong = f"{' '.join(key.split())} is there twice" if key else "is missing"
+            raise PolygonError(f"{where}: name: {wrong}; want one each")
         found[key] = _ring(row["WKT"] or "", where)
     if not found:
         raise PolygonError(f"{name}: no polygons; want at least one")
@@ -116,7 +125,7 @@ def _ring(text: str, where: str) -> FloatArray:
             x, y = (float(word) for word in corner.split()[:2])
         except ValueError:
             x = y = math.nan
-        if not (math.isfinite(x) and math.isfinite(y)):
+        if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
             raise PolygonError(f"{where}: WKT: got the corner {corner.strip()!r}; {_WANT}")
         corners.append((x, y))
     if len(corners) > 1 and corners[0] == corners[-1]:

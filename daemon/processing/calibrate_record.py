@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from daemon.processing.calibration_flight import KeptFlight
 from daemon.processing.navigate import Navigated
 from daemon.processing.navigation_series import used_positions
 from georef.timescales import SECOND_NS
+from georef.toml_tables import TomlError, key_text, toml_tables
 
 
 def facts_of(file: Path) -> dict[str, Plain]:
@@ -24,13 +24,13 @@ def facts_of(file: Path) -> dict[str, Plain]:
         UserError: it is no such file, or something in it is no attribute or not what the attribute takes.
     """
     try:
-        tables = tomllib.loads(text_of(file, "TOML"))
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{file}: is no TOML: {error}") from error
+        tables = toml_tables(text_of(file, "TOML"))
+    except TomlError as error:
+        raise UserError(f"{file}: {error}") from error
     facts: dict[str, Plain] = {}
     for owner, table in tables.items():
         if not isinstance(table, dict):
-            raise UserError(f"{file}: {owner}: want a table a class, as [CA_GNSS] with numberSatellites = 14")
+            raise UserError(f"{file}: {key_text(owner)}: want a table a class, as [CA_GNSS] with numberSatellites = 14")
         for name, value in table.items():
             key = f"{owner}.{name}"
             facts[key] = tuple(value) if isinstance(value, list) else value

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import laspy
 import lazrs
@@ -14,7 +16,77 @@ from laspy.errors import LaspyException
 SKIPPED_POINTS = 200_000
 Points: TypeAlias = laspy.ScaleAwarePointRecord
 Selection: TypeAlias = laspy.DecompressionSelection
-UNREADABLE = (LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error)
+UNREADABLE = (
+    *(LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error),
+    *(TypeError, AttributeError, OverflowError, MemoryError),  # of laspy, where a record is none of its kind
+)
+_HEADER_BYTES, _VLR_BYTES, _EVLR_BYTES = 375, 54, 60  # LAS 1.4-R15
+_SIZES = struct.Struct("<HII")  # of the header, offset of the points, number of records between
+_EXTENDED = struct.Struct("<QI")  # where extended records begin, and how many
+_SIZES_AT, _MINOR_AT, _EXTENDED_AT = 94, 25, 235
+_POINT, _POINT_AT = struct.Struct("<BH"), 104  # format with the bit of LAZ, bytes of a point
+_COMPRESSED, _MOST_POINT_BYTES = 0x80, 2048
+
+
+def open_points(path: Path, selection: Selection | None = None) -> laspy.LasReader:
+    """A reader of a file whose header names no more records than the file has room for: laspy would read on for hours.
+
+    Raises one of UNREADABLE.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES)
+        _refuse_records(head, size)
+        _refuse_chunks(file, head, size)
+    with _panics_told():
+        return laspy.open(path) if selection is None else laspy.open(path, decompression_selection=selection)
+
+
+def _refuse_records(head: bytes, size: int) -> None:
+    if len(head) >= _SIZES_AT + _SIZES.size:
+        header_bytes, points_at, count = _SIZES.unpack_from(head, _SIZES_AT)
+        if points_at > size or header_bytes + count * _VLR_BYTES > points_at:
+            raise ValueError(f"{count} records before the points at byte {points_at} of {size}")
+    if len(head) == _HEADER_BYTES and head[_MINOR_AT] >= 4:
+        begin, count = _EXTENDED.unpack_from(head, _EXTENDED_AT)
+        if count and begin + count * _EVLR_BYTES > size:
+            raise ValueError(f"{count} records from byte {begin} of {size} on")
+
+
+def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
+    """Points of a size that none has, or a table of more chunks than there are bytes: lazrs would end the process."""
+    if len(head) < _POINT_AT + _POINT.size:
+        return
+    kind, point_bytes = _POINT.unpack_from(head, _POINT_AT)
+    if point_bytes > _MOST_POINT_BYTES:
+        raise ValueError(f"points of {point_bytes} bytes")
+    if not kind & _COMPRESSED:
+        return
+    points_at = _SIZES.unpack_from(head, _SIZES_AT)[1]
+    if points_at > size - 8:
+        return
+    file.seek(points_at)
+    (table_at,) = struct.unpack("<q", file.read(8))
+    if table_at == -1:  # written to a pipe: it stands at the end
+        file.seek(size - 8)
+        (table_at,) = struct.unpack("<q", file.read(8))
+    if not 0 <= table_at <= size - 8:
+        return  # a file cut off, whose first points can be read
+    file.seek(table_at)
+    _, count = struct.unpack("<II", file.read(8))
+    if count > size:
+        raise ValueError(f"{count} chunks in {size} bytes")
+
+
+@contextmanager
+def _panics_told() -> Iterator[None]:
+    """A panic of lazrs, which is no Exception, as the ValueError that it should be."""
+    try:
+        yield
+    except BaseException as error:
+        if type(error).__name__ == "PanicException":  # of pyo3, which lets nobody import it
+            raise ValueError(f"lazrs: {error}") from error
+        raise
 
 
 class PointReader:
@@ -26,7 +98,7 @@ class PointReader:
 
     def __init__(self, path: Path, selection: Selection) -> None:
         """Raises one of UNREADABLE."""
-        self._reader = laspy.open(path, decompression_selection=selection)
+        self._reader = open_points(path, selection)
         self._at = 0
         self._can_seek = not has_varying_chunks(self._reader.header)
 
@@ -41,7 +113,8 @@ class PointReader:
     def go_to(self, number: int) -> None:
         """The next point to be read is this one, which has not been read yet."""
         if number != self._at and self._can_seek:
-            self._reader.seek(number)
+            with _panics_told():
+                self._reader.seek(number)
             self._at = number
         while self._at < number:
             if not len(self.read(min(SKIPPED_POINTS, number - self._at))):
@@ -49,7 +122,8 @@ class PointReader:
 
     def read(self, count: int) -> Points:
         """So many points, or as many as there are."""
-        points = self._reader.read_points(count)
+        with _panics_told():
+            points = self._reader.read_points(count)
         self._at += len(points)
         return points
 
@@ -57,7 +131,8 @@ class PointReader:
 def has_varying_chunks(header: laspy.LasHeader) -> bool:
     """Whether a LAZ file's chunks vary in size."""
     found = header.vlrs.get("LasZipVlr")
-    return bool(found) and bool(lazrs.LazVlr(found[0].record_data).uses_variable_size_chunks())
+    with _panics_told():
+        return bool(found) and bool(lazrs.LazVlr(found[0].record_data).uses_variable_size_chunks())
 
 
 def sample_of(path: Path, size: int) -> Points:
@@ -65,7 +140,7 @@ def sample_of(path: Path, size: int) -> Points:
 
     Raises one of UNREADABLE.
     """
-    with laspy.open(path) as reader:
+    with open_points(path) as reader:
         header = reader.header
     with PointReader(path, Selection.XY_RETURNS_CHANNEL) as points:
         if not has_varying_chunks(header):

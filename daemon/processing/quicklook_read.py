@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, sample_of
+from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
 from daemon.processing.quicklook_sidecar import height_unit_in, sidecar_of
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -28,6 +28,8 @@ SAMPLE_POINTS = 100_000
 SAMPLE_A_CELL = 8.0
 SIGMA_NAMES = ("sigma_easting", "sigma_northing", "sigma_height")
 NOISE_CLASSES = (7, 18)  # LAS 1.4 R15, table 17: low and high noise
+LARGEST_SCALE, FARTHEST = 1000.0, 1e9  # units of the coordinates, of any map there is
+MOST_CELLS = 1_000_000_000  # along a side, so that a cell's number has 64 bits
 METRES_PER_DEGREE = 111_320.0  # of the equator; good to 0.5 % anywhere, for pictures only
 WANTED = (  # layers of LAZ that are decoded: all others would cost time and show nothing
     Selection.XY_RETURNS_CHANNEL
@@ -172,14 +174,20 @@ def open_source(path: Path) -> Source:
         QuickLookError: it is no LAS or LAZ file, or its coordinates are geocentric.
     """
     try:
-        with laspy.open(path) as reader:
+        with open_points(path) as reader:
             header = reader.header
             names = set(header.point_format.extra_dimension_names)
     except UNREADABLE as error:
         raise QuickLookError(f"{path}: not a LAS or LAZ file that can be read ({_line(error)})") from error
-    if not (np.isfinite(header.scales).all() and (np.asarray(header.scales) > 0).all()):
-        raise QuickLookError(f"{path}: the header's scale factors are {list(header.scales)}, want numbers above 0")
+    scales, offsets = np.asarray(header.scales, float), np.asarray(header.offsets, float)
+    if not ((scales > 0) & (scales <= LARGEST_SCALE)).all():
+        wrong = f"the header's scale factors are {scales.tolist()}, want numbers above 0, at most {LARGEST_SCALE:g}"
+        raise QuickLookError(f"{path}: {wrong}")
+    if not (np.abs(offsets) <= FARTHEST).all():
+        raise QuickLookError(f"{path}: the header's offsets are {offsets.tolist()}, want at most {FARTHEST:g}")
     low, high = np.array(header.mins, float), np.array(header.maxs, float)
+    if not (np.abs([low, high]) <= FARTHEST).all():
+        low, high = np.full(3, np.nan), np.full(3, np.nan)  # the points themselves say it
     crs, trouble = _crs_of(header)
     if crs is not None and crs.is_geocentric:
         raise QuickLookError(f"{path}: coordinates are geocentric ({crs.name}); a map wants a projected CRS")
@@ -221,7 +229,7 @@ def units_of(sources: Sequence[Source]) -> Units:
     if plain.is_geographic or any("degree" in axis.unit_name for axis in axes):
         north_m = METRES_PER_DEGREE
         up_m = axes[2].unit_conversion_factor if len(axes) > 2 else 1.0
-        lat_deg = float(np.clip((sources[0].low[1] + sources[0].high[1]) / 2, -89.9, 89.9))
+        lat_deg = float(np.clip(np.nan_to_num(sources[0].low[1] + sources[0].high[1]) / 2, -89.9, 89.9))
         east_m = north_m * math.cos(math.radians(lat_deg))
         return Units(east_m, north_m, up_m, "°", "coordinates in degrees: lengths and areas are good to 1 % only")
     if not axes:
@@ -316,8 +324,8 @@ def density_near(source: Source, units: Units) -> float:
     extent_m = np.maximum(np.ptp(places_m, axis=0), 1.0)
     side_m = math.sqrt(float(extent_m.prod()) / len(places_m))
     for _ in range(8):  # cells shrink until they hold as few as are told apart from empty ones
-        cells = np.floor((places_m - places_m.min(axis=0)) / side_m).astype(np.int64)
-        covered = len(np.unique(cells[:, 0] * (int(extent_m[1] / side_m) + 2) + cells[:, 1]))
+        cells = np.minimum(np.floor((places_m - places_m.min(axis=0)) / side_m), MOST_CELLS).astype(np.int64)
+        covered = len(np.unique(cells[:, 0] * (min(int(extent_m[1] / side_m), MOST_CELLS) + 2) + cells[:, 1]))
         found = len(places_m) / covered
         if SAMPLE_A_CELL / 2 <= found <= SAMPLE_A_CELL * 2:
             break

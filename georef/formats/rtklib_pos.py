@@ -23,6 +23,7 @@ FloatArray = NDArray[np.float64]
 TIME_SYSTEMS = ("GPST", "UTC", "JST")
 HEADER = re.compile(rf"^%\s*({'|'.join(TIME_SYSTEMS)})\s+(\S.*)$", re.MULTILINE)
 DMS = "(d'\")"
+LARGEST = 1e9  # no place, speed or sigma is so large
 GEODETIC, ECEF = ("latitude", "longitude", "height"), ("x-ecef", "y-ecef", "z-ecef")
 # Column Q (manual, appendix B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP
 FIX_TYPES = {
@@ -65,7 +66,7 @@ def read_rtklib_pos(text: str, name: str, *, leap_seconds: int | None = None) ->
         "line",
         numbered[0][0],
         fix_type=fix_types(table.get("q"), FIX_TYPES),
-        satellites=None if "ns" not in table else np.clip(table["ns"], 0, 255).astype(np.uint8),
+        satellites=None if "ns" not in table else byte_counts(table["ns"]),
         velocity_sigma_l=_stacked(table, ("sdvn", "sdve", "sdvu")) if "sdvn" in table else None,
         position_correlation_l=_correlation_l(table, position_sigma_l),
     )
@@ -82,6 +83,9 @@ def _columns(numbered: list[tuple[int, list[str]]], titles: list[str], name: str
         values = np.array([row[2:] for _, row in numbered], dtype=np.float64).reshape(len(numbered), -1)
     except ValueError as error:
         raise TrajectoryError(f"{name}: {error}") from None
+    large = (np.abs(values) > LARGEST).any(axis=1)  # nan: unsaid
+    if large.any():
+        raise TrajectoryError(f"{name}: line {numbered[int(np.argmax(large))][0]} has a number beyond {LARGEST:g}")
     table, begin = {}, 0
     for title, width in zip(titles, widths, strict=True):
         value = values[:, begin]
@@ -106,14 +110,19 @@ def fix_types(quality: FloatArray | None, known: dict[int, FixType]) -> NDArray[
     return np.array([known.get(int(q) if np.isfinite(q) else 0, FixType.NONE) for q in quality], dtype=np.uint8)
 
 
+def byte_counts(said: FloatArray) -> NDArray[np.uint8]:
+    """(n,) whole numbers from 0 to 255; 0 where none is said."""
+    return np.clip(np.nan_to_num(said, nan=0.0), 0, 255).astype(np.uint8)
+
+
 def _correlation_l(table: dict[str, FloatArray], sigma_l: FloatArray) -> FloatArray | None:
     """(n, 3) of north–east, north–down, east–down, of sdne, sdeu, sdun: roots of covariances with their sign."""
     if not all(column in table for column in ("sdne", "sdeu", "sdun")):
         return None
     mixed = _stacked(table, ("sdne", "sdun", "sdeu")) * np.array([1.0, -1.0, -1.0])
     scale = sigma_l[:, [0, 0, 1]] * sigma_l[:, [1, 2, 2]]
-    found: FloatArray = np.copysign(mixed**2, mixed) / np.where(scale > 0.0, scale, np.inf)
-    return np.where(np.abs(found) < 1.0, found, 0.0)
+    found: FloatArray = np.copysign(mixed**2, mixed) / np.where(scale > mixed**2, scale, np.inf)
+    return np.where(np.isfinite(found), found, 0.0)
 
 
 def _gps_ns(system: str, dates: list[str], clocks: list[str], name: str, leap_seconds: int | None) -> Int64Array:

@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 
 SBET_DOUBLES, SMRMSG_DOUBLES = 17, 10
 SBET_BYTES, SMRMSG_BYTES = 8 * SBET_DOUBLES, 8 * SMRMSG_DOUBLES
+LARGEST, USED_DOUBLES = 1e9, 11  # no place, speed or angle is so large; accelerations and rates behind are not taken
 ARC_MINUTE = float(np.radians(1.0 / 60.0))
 # Signs of the platform's y and z axes against right and down: plain north, east, down; POSPac's; east, up
 AXES = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
@@ -141,12 +142,19 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
             f"{name}: {len(data)} bytes are {whole} records of {kind} ({size} bytes) and {over} over: truncated or none"
         )
     table = np.frombuffer(data, dtype="<f8").reshape(-1, doubles).astype(np.float64)
+    table[np.isnan(table)] = np.nan  # one that signals would, at the first reckoning
     time_s = table[:, 0]
     wrong = ~((time_s >= 0.0) & (time_s < 10.0 * WEEK_S))
     if wrong.any():
         at = int(np.argmax(wrong))
         raise TrajectoryError(
             f"{name}: time {time_s[at]:.6g} at record {at + 1} is no second of a week; {kind} is expected"
+        )
+    large = (np.abs(table[:, 1:USED_DOUBLES]) > LARGEST).any(axis=1)  # nan: unsaid
+    if large.any():
+        raise TrajectoryError(
+            f"{name}: record {int(np.argmax(large)) + 1} has a number beyond {LARGEST:g}; {kind} is expected, "
+            "metres and radians"
         )
     return table
 

@@ -22,8 +22,9 @@ from georef.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
 
-CLOCK = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)")
-WEEK, SECONDS = re.compile(r"\d{1,5}"), re.compile(r"\d{1,7}(\.\d*)?")
+CLOCK = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)", re.ASCII)
+WEEK, SECONDS = re.compile(r"\d{1,4}", re.ASCII), re.compile(r"\d{1,7}(\.\d*)?", re.ASCII)
+FIRST_YEAR, LAST_YEAR = 1980, 2125  # of GPS time in 64 bits of nanoseconds, with room for differences
 
 
 def gps_days(texts: Sequence[str], order: str, name: str) -> Int64Array:
@@ -75,8 +76,12 @@ def _date(text: str, order: str, name: str) -> dt.date:
     try:
         fields = {letter: int(part) for letter, part in zip(order, parts, strict=True)}
         year = fields["Y"] + (2000 if fields["Y"] < 100 else 0)
+        if not FIRST_YEAR <= year <= LAST_YEAR:
+            raise TrajectoryError(f"{name}: {text[:20]!r} is of no year from {FIRST_YEAR} to {LAST_YEAR}")
         return dt.date(year, fields["M"], fields["D"])
-    except (ValueError, KeyError):
+    except TrajectoryError:
+        raise
+    except (ValueError, KeyError, OverflowError):
         raise TrajectoryError(f"{name}: {text!r} is no date in the order {order}") from None
 
 

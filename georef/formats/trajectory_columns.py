@@ -18,6 +18,8 @@ Span = tuple[int, int]
 
 LOWEST_M, HIGHEST_M = -1000.0, 50_000.0
 GREATEST_SPEED_MPS = 1000.0
+GREATEST_SAID_MPS, GREATEST_SIGMA = 1e5, 1e6  # of single rows: beyond, numbers mean something else
+EARLIEST_NS, LATEST_NS = 0, 1 << 62  # GPS time, 1980 to 2126: differences of times stay within 64 bits
 COURSE_FROM_MPS, GREATEST_COURSE_ERROR_RAD, COURSE_OUTLIERS = 20.0, float(np.radians(5.0)), 0.01
 COURSE_PIECE_NS, LONGEST_PIECE_NS = SECOND_NS, 3 * SECOND_NS  # pieces of flight whose course is looked at
 HEADING_OFF_RAD = float(np.radians(45.0))  # more than any drift angle
@@ -73,7 +75,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
     """The trajectory of a file's rows; TrajectoryError where they cannot be meant."""
     if len(columns.time_ns) < 2:
         raise TrajectoryError(f"{name}: has {len(columns.time_ns)} epochs; a trajectory needs two")
-    for check in (_check_finite, _check_sigmas, _check_position, _check_attitude, _check_time, _check_course):
+    for check in CHECKS:
         check(columns, name)
     return Trajectory.from_geodetic(
         columns.time_ns,
@@ -156,6 +158,17 @@ def _check_sigmas(columns: TrajectoryColumns, name: str) -> None:
         bad = np.logical_or.reduce(sigma < 0.0, axis=1)  # nan: unsaid
         if bad.any():
             raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is negative")
+        bad = np.logical_or.reduce(sigma > GREATEST_SIGMA, axis=1)
+        if bad.any():
+            raise TrajectoryError(f"{name}: a sigma of the {what} at {columns.at(bad)} is beyond {GREATEST_SIGMA:g}")
+
+
+def _check_velocity(columns: TrajectoryColumns, name: str) -> None:
+    fast = np.logical_or.reduce(np.abs(columns.velocity_l) > GREATEST_SAID_MPS, axis=1)  # nan: unsaid
+    if fast.any():
+        raise TrajectoryError(
+            f"{name}: a velocity at {columns.at(fast)} is beyond {GREATEST_SAID_MPS:g} m/s; want metres a second"
+        )
 
 
 def _check_position(columns: TrajectoryColumns, name: str) -> None:
@@ -193,6 +206,9 @@ def _check_attitude(columns: TrajectoryColumns, name: str) -> None:
 
 
 def _check_time(columns: TrajectoryColumns, name: str) -> None:
+    far = (columns.time_ns < EARLIEST_NS) | (columns.time_ns > LATEST_NS)
+    if far.any():
+        raise TrajectoryError(f"{name}: time at {columns.at(far)} is before 1980 or after 2125: no GPS time")
     steps = np.diff(columns.time_ns)
     stuck = np.r_[False, steps <= 0]
     if stuck.any():
@@ -240,6 +256,17 @@ def _check_heading_unit(columns: TrajectoryColumns, name: str, pieces: Int64Arra
     off, off_as_radians = (np.median(np.abs(_folded(course - heading))) for heading in (nose, np.degrees(nose)))
     if off > HEADING_OFF_RAD > off_as_radians:
         raise TrajectoryError(f"{name}: degrees are expected; roll, pitch and heading look like radians")
+
+
+CHECKS = (
+    _check_finite,
+    _check_sigmas,
+    _check_velocity,
+    _check_position,
+    _check_attitude,
+    _check_time,
+    _check_course,
+)
 
 
 # --- pieces of flight ---

@@ -40,6 +40,9 @@ def read_csv(text: str, name: str) -> TrajectoryColumns:
     unknown = set(header[len(COLUMNS) :]) - {*SIGMAS, *OTHER_NAMES, *IN_DEGREES, *UNUSED}
     if unknown:
         raise TrajectoryError(f"{name}: column {min(unknown)} is not known; sigmas are {', '.join(SIGMAS)}")
+    if len(set(header)) < len(header):
+        twice = next(column for column in header if header.count(column) > 1)
+        raise TrajectoryError(f"{name}: column {twice} is there twice; want each once")
     table = _numbers(lines[first + 1 :], header, name, first + 2)
     degrees = {column: np.radians(table[column]) for column in header if column.endswith("_deg")}
     position_sigma_l, attitude_sigma_rad = _sigmas(table, degrees)
@@ -77,12 +80,14 @@ def csv_text(trajectory: Trajectory) -> str:
 
 def _numbers(lines: list[str], header: list[str], name: str, first_line: int) -> NDArray[np.void]:
     dtype = [(column, "i8" if column == "gps_ns" else "f8") for column in header]
-    if not lines:
+    if not any(line.strip() for line in lines):
         return np.empty(0, dtype)
     try:
         return np.atleast_1d(np.loadtxt(lines, dtype=dtype, delimiter=",", comments=None))
     except ValueError as error:
         for number, line in enumerate(lines, first_line):
+            if not line.strip():
+                continue
             try:
                 np.loadtxt([line], dtype=dtype, delimiter=",", comments=None)
             except ValueError as one:

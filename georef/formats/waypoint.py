@@ -17,11 +17,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.formats.rtklib_pos import degrees_of, fix_types
+from georef.formats.rtklib_pos import byte_counts, degrees_of, fix_types
 from georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on
 from georef.formats.trajectory_columns import Span, TrajectoryColumns, continuous_of_week, placed_in_week
 from georef.records import FixType, Int64Array
-from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS
+from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S
 from georef.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
@@ -65,8 +65,9 @@ FIX_TYPES = {
 }
 NEEDED = {"lat": "Latitude", "lon": "Longitude", "height": "H-Ell"}
 TOKEN = re.compile(r"\([^)]*\)|\S+")
-UTC_OFFSET = re.compile(r"^\s*UTC Offset:\s*-?(\d+)(?:\.0*)?\s*s?\s*$", re.MULTILINE | re.IGNORECASE)
-SCALING = re.compile(r"^\s*(Position|Attitude):\s*(\d+(?:\.\d+)?)\s*$", re.MULTILINE)
+UTC_OFFSET = re.compile(r"^[ \t]*UTC Offset:[ \t]*-?([0-9]{1,3})(?:\.0*)?[ \t]*s?[ \t]*$", re.MULTILINE | re.IGNORECASE)
+SCALING = re.compile(r"^[ \t]*(Position|Attitude):[ \t]*([0-9]{1,6}(?:\.[0-9]{1,9})?)[ \t]*$", re.MULTILINE)
+MOST_COLUMNS = 200  # of an export; profiles have some 30
 DATE_ORDERS = {"(MDY)": "MDY", "(YMD)": "YMD", "(DMY)": "DMY"}
 RADIANS, METRES, METRES_PER_SECOND = {"(deg)": np.pi / 180, "(rad)": 1.0}, {"(m)": 1.0}, {"(m/s)": 1.0}
 
@@ -160,6 +161,8 @@ def read_waypoint(
     if 0 < len(absent) < len(angles):
         raise TrajectoryError(f"{name}: has no column {absent[0].title()}; export roll, pitch and heading")
     scale = {what.lower(): float(factor) for what, factor in SCALING.findall(sheet.header)}
+    if 0.0 in scale.values():
+        raise TrajectoryError(f"{name}: its header scales sigmas by 0; export them at 1 sigma")
     up = np.array([1.0, 1.0, -1.0])
     sigmas = [sheet.quantity(f"sigma_{axis}", METRES) / scale.get("position", 1.0) for axis in "ned"]
     angle_sigmas = [sheet.angle_rad(f"sigma_{angle}") / scale.get("attitude", 1.0) for angle in angles]
@@ -172,9 +175,7 @@ def read_waypoint(
         "line",
         sheet.first_line,
         fix_type=fix_types(sheet.numbers("quality") if "quality" in sheet.columns else None, FIX_TYPES),
-        satellites=np.clip(sheet.numbers("satellites"), 0, 255).astype(np.uint8)
-        if "satellites" in sheet.columns
-        else None,
+        satellites=byte_counts(sheet.numbers("satellites")) if "satellites" in sheet.columns else None,
         velocity_sigma_l=np.stack(
             [sheet.quantity(f"sigma_v_{axis}", METRES_PER_SECOND) for axis in ("north", "east", "up")], axis=1
         )
@@ -204,6 +205,10 @@ def _sheet(text: str, name: str) -> Sheet:
     at = _title_line(lines)
     if at is None:
         raise TrajectoryError(f"{name}: no line of column names (Latitude, Longitude, …) with their units below it")
+    if len(lines[at].split()) > MOST_COLUMNS:
+        raise TrajectoryError(
+            f"{name}: line {at + 1} names more than {MOST_COLUMNS} columns; export those of a trajectory"
+        )
     columns, words = _layout(lines[at], lines[at + 1])
     counts = [len(line.split()) for line in lines[at + 2 :]]
     rows = [number for number, count in enumerate(counts) if count == words]
@@ -281,10 +286,13 @@ def _gps_ns(sheet: Sheet, span_ns: Span | None, week: int | None, leap_seconds: 
 def _of_seconds(sheet: Sheet, time: str, days: Int64Array | None, span_ns: Span | None, week: int | None) -> Int64Array:
     """Seconds of the week, or of the day where a date says that they are."""
     seconds = sheet.numbers(time)
-    if not np.isfinite(seconds).all():
-        raise TrajectoryError(f"{sheet.name}: a time is no number")
+    if not ((seconds >= 0.0) & (seconds < 10.0 * WEEK_S)).all():
+        raise TrajectoryError(f"{sheet.name}: a time is no number of seconds of a week")
     if "week" in sheet.columns and week is None:
-        weeks = np.rint(sheet.numbers("week")).astype(np.int64)
+        said = sheet.numbers("week")
+        if not ((said >= 0.0) & (said < 10_000.0)).all():
+            raise TrajectoryError(f"{sheet.name}: a week is no GPS week; whole numbers up to 9999 are expected")
+        weeks = np.rint(said).astype(np.int64)
         gps_ns: Int64Array = weeks * WEEK_NS + np.rint(seconds * SECOND_NS).astype(np.int64)
         return gps_ns
     if days is not None:

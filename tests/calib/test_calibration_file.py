@@ -20,7 +20,9 @@ HEADER = Header("2026-11-21T10:15:00Z-ab12", CREATED, "planes", logs=(("a.mcap",
 
 REAL = st.floats(-1e3, 1e3, allow_subnormal=False)
 ANGLE = st.floats(-math.pi, math.pi, allow_subnormal=False)
-TEXT = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20).filter(
+    lambda text: text.splitlines() == [text]
+)
 
 
 @st.composite

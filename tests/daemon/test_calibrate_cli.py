@@ -262,7 +262,7 @@ def test_wrong_use(
         ("[CA_GNSS]\nnumberSatelites = 14\n", "facts.toml: CA_GNSS.numberSatelites is no attribute of the record; did"),
         ("[CA_GNSS]\nnumberSatellites = 1.5\n", "facts.toml: CA_GNSS.numberSatellites: got 1.5, want a whole number"),
         ("CA_GNSS = 3\n", "facts.toml: CA_GNSS: want a table a class"),
-        ("[CA_GNSS\n", "facts.toml: is no TOML"),
+        ("[CA_GNSS\n", "facts.toml: not TOML: "),
     ],
 )
 def test_facts_that_no_record_holds_are_told_before_the_work(

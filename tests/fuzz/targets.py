@@ -7,9 +7,17 @@ from collections.abc import Callable
 from tests.fuzz.engine import Target
 from tests.fuzz.files import file_targets
 from tests.fuzz.logs import log_targets
+from tests.fuzz.office import office_targets
+from tests.fuzz.office_files import office_file_targets
 from tests.fuzz.parsers import parser_targets
 
 
 def all_targets() -> dict[str, Callable[[], Target]]:
-    """What builds each: parsers of every driver there is, the log's readers, captures, the configuration."""
-    return {**dict(parser_targets()), **dict(log_targets()), **dict(file_targets())}
+    """What builds each: parsers of every driver there is, readers of logs, captures, configuration, office files."""
+    return {
+        **dict(parser_targets()),
+        **dict(log_targets()),
+        **dict(file_targets()),
+        **dict(office_targets()),
+        **dict(office_file_targets()),
+    }

@@ -199,7 +199,7 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
 @pytest.mark.parametrize(
     ("added", "wrong"),
     [
-        ("[sigma]\nomega_deg = -1", "sigma.omega_deg: got -0.0174533, want at least 0"),
+        ("[sigma]\nomega_deg = -1", "sigma.omega_deg: got -1, want at least 0"),
         ("sigma = 3", "sigma: not a table; want [sigma]"),
         ("[correlation]\nnames = ['omega_deg']\nmatrix = [[1]]", "correlation.names: want a list of keys of [sigma]"),
         (

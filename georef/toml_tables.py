@@ -1,0 +1,51 @@
+"""TOML as tables: what the standard library's reader leaves to its caller is refused here too, in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from typing import Any
+
+DEEPEST = 32  # tables in tables; no file of ours has more than 5
+LEAST, MOST = -(1 << 63), (1 << 63) - 1  # TOML 1.0.0, Integer: 64 bits are expected, and what is lost is an error
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+class TomlError(ValueError):
+    """Text that is no TOML, or that nobody could mean; one line without the file's name."""
+
+
+def toml_tables(text: str) -> dict[str, Any]:
+    """The tables of a TOML text: numbers of 64 bits, at most `DEEPEST` deep.
+
+    Raises:
+        TomlError: what is wrong, in one line.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TomlError(f"not TOML: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise TomlError(f"not readable: nested too deeply; want tables at most {DEEPEST} deep") from error
+    except ValueError as error:  # more digits than Python turns into a number
+        raise TomlError("a whole number of thousands of digits; want numbers of 64 bits") from error
+    waiting: list[tuple[Any, str, int]] = [(document, "", 0)]
+    while waiting:
+        value, where, depth = waiting.pop()
+        if depth > DEEPEST:
+            raise TomlError(f"{where[:40]}…: nested too deeply; want tables at most {DEEPEST} deep")
+        if isinstance(value, dict):
+            waiting += [
+                (one, f"{where}.{key_text(key)}" if where else key_text(key), depth + 1) for key, one in value.items()
+            ]
+        elif isinstance(value, list):
+            waiting += [(one, where, depth + 1) for one in value]
+        elif isinstance(value, int) and not LEAST <= value <= MOST:
+            raise TomlError(f"{where}: a whole number of {value.bit_length()} bits; want numbers of 64 bits")
+    return document
+
+
+def key_text(key: str) -> str:
+    """A key as TOML writes it: bare, or in quotes on one line."""
+    return key if _BARE.fullmatch(key) else json.dumps(key)
