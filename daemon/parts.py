@@ -47,7 +47,7 @@ def read_sign(directory: Path) -> Sign | None:
         said = json.loads((directory / RECORDING_SIGN).read_text())
         name = PurePath(said["path"]).name
         return Sign(str(said["session_id"]), int(said["part"]), directory / name, str(said["boot_id"]))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
 
 

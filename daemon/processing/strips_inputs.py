@@ -73,7 +73,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Str
     gathered = gather(_file_blocks(look), cells)
     try:
         seen, place = _seen_from(look)
-    except (TrajectoryError, MappingError, OSError, KeyError, TypeError) as error:
+    except (TrajectoryError, MappingError, OSError, KeyError, TypeError, AttributeError, ValueError) as error:
         notes.append(f"{what}: no signatures: {error}")
         return Strips(what, look, gathered, cells.cell_m, None, notes)
     if seen is None:
