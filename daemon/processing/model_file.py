@@ -6,7 +6,6 @@ Keys are those of a calibration file (CONVENTIONS), validated as the configurati
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +26,7 @@ from daemon.config.tables import Section
 from daemon.errors import ConfigError
 from daemon.processing.calibrate_inputs import text_of
 from georef.calibration import MOST, PARAMETERS
+from georef.toml_tables import TomlError, toml_tables
 
 SUFFIX = ".toml"
 PRIOR = "prior"
@@ -141,11 +141,9 @@ def read_model(file: Path) -> ModelTables:
         UserError: it cannot be read; ConfigError: all that is wrong with it, one line each.
     """
     try:
-        return ModelTables.model_validate(tomllib.loads(text_of(file, "TOML")))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file}: not TOML: {error}") from error
-    except RecursionError as error:
-        raise ConfigError(f"{file}: nested too deeply; want the tables of a model") from error
+        return ModelTables.model_validate(toml_tables(text_of(file, "TOML")))
+    except TomlError as error:
+        raise ConfigError(f"{file}: {error}") from error
     except ValidationError as error:
         lines = [describe(details, ModelTables) for details in error.errors(include_url=False)]
         raise ConfigError([f"{file}: {line}" for line in lines]) from error
