@@ -1,0 +1,154 @@
+"""One log on two processors, by the same commands: what is decoded, exported, repaired, georeferenced and navigated.
+
+Everything up to the points in e is the same to the last bit. Beyond it stands PROJ, whose compiler joins products and
+sums on ARM64 (a · b + c, rounded once) and on x86-64 does not, and NumPy's and LAPACK's own loops.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+HERE = Path(__file__).resolve().parent
+TREE = HERE.parent.parent
+ARM64 = HERE / ".cache/venv/bin/python"
+FLOWN_S = "24"
+HANGS_S = 3000.0
+DATA_LOST = 4
+
+# A northing of 5 259 km has a last place of 0.9 nm, a height that PROJ finds at the earth's radius likewise
+MAP_M = 1e-9
+FINE_SCALE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Both:
+    """Where the same command's products lie."""
+
+    host: Path
+    arm64: Path
+
+
+def run(python: str | Path, *words: str | Path, status: int = 0) -> None:
+    """A module of the project's in the tree, which must end with a status."""
+    line = [str(word) for word in (python, "-m", *words)]
+    done = subprocess.run(line, cwd=TREE, capture_output=True, text=True, timeout=HANGS_S, check=False)
+    assert done.returncode == status, f"{line}\n{done.stdout[-4000:]}{done.stderr[-4000:]}"
+
+
+def on_both(folder: Path, *words: str | Path, status: int = 0) -> Both:
+    """A module run by either Python; ``{}`` in a word is its own folder, which may be there."""
+    both = Both(folder / "host", folder / "arm64")
+    for python, own in ((sys.executable, both.host), (ARM64, both.arm64)):
+        own.mkdir(parents=True, exist_ok=True)
+        run(python, *(str(word).replace("{}", str(own)) for word in words), status=status)
+    return both
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Of all files, by their paths in it."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def other_processor() -> None:
+    """It is there and another one; without it there is nothing to prove."""
+    if not ARM64.exists():
+        pytest.fail("there is no Python for ARM64: make test-arm64 installs it (tests/arm64/setup.sh)")
+    said = subprocess.run([ARM64, "-c", "import os; print(os.uname().machine)"], capture_output=True, text=True)
+    assert (os.uname().machine, said.stdout) == ("x86_64", "aarch64\n"), said.stderr
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the log of a virtual flight and what lies beside it, made on the host."""
+    folder = tmp_path_factory.mktemp("flight")
+    run(sys.executable, "daemon.cli.main", "sim", "fly", "small", "--seconds", FLOWN_S, "--no-truth", "-o", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def outcomes(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """What either makes of the log: `tests.arm64.outcome`."""
+    both = on_both(tmp_path_factory.mktemp("outcomes"), "tests.arm64.outcome", flight, "{}/outcome.npz")
+    return np.load(both.host / "outcome.npz"), np.load(both.arm64 / "outcome.npz")
+
+
+def test_every_record_of_every_decoder_is_the_same(outcomes: tuple[Mapping[str, Any], Mapping[str, Any]]) -> None:
+    host, arm64 = ({name: str(found[name]) for name in found if name.startswith("digest ")} for found in outcomes)
+    assert set(host) == {"digest gnss/rover", "digest imu/main", "digest scanner/left"}
+    assert host == arm64
+
+
+@pytest.mark.parametrize("what", ["trajectory", "e"])
+def test_trajectory_and_points_in_e_are_the_same_bit_for_bit(
+    outcomes: tuple[Mapping[str, Any], Mapping[str, Any]], what: str
+) -> None:
+    host, arm64 = outcomes
+    names = [name for name in host if name.startswith(f"{what} ")]
+    assert len(host[names[0]]) > 1000
+    assert {name for name in names if host[name].tobytes() != arm64[name].tobytes()} == set()
+
+
+def test_points_in_the_map_differ_by_projs_last_places_only(
+    outcomes: tuple[Mapping[str, Any], Mapping[str, Any]],
+) -> None:
+    host, arm64 = outcomes
+    names = [name for name in host if name.startswith("map ") and name != "map points_map"]
+    assert {name for name in names if host[name].tobytes() != arm64[name].tobytes()} == set()
+    assert len(host["map points_map"]) > 800_000
+    assert np.abs(host["map points_map"] - arm64["map points_map"]).max() <= MAP_M
+
+
+@pytest.mark.parametrize("scale_m", [1e-3, FINE_SCALE_M])
+def test_files_of_points_are_within_a_unit_of_their_scale(flight: Path, tmp_path: Path, scale_m: float) -> None:
+    words = ("daemon.cli.main", "georef", flight, "-o", "{}", "--scale", f"{scale_m:f}", "--workers", "1")
+    both = on_both(tmp_path, *words)
+    (path,) = both.host.glob("*.laz")
+    host, arm64 = laspy.read(path), laspy.read(both.arm64 / path.name)
+    assert len(host.points) == len(arm64.points) > 800_000
+    for name in host.point_format.dimension_names:
+        apart = np.asarray(host[name]).astype(np.int64) - np.asarray(arm64[name]).astype(np.int64)
+        assert np.abs(apart).max() <= (1 if name in ("X", "Y", "Z") else 0), name
+    moved = sum(np.count_nonzero(np.asarray(host[name]) != np.asarray(arm64[name])) for name in ("X", "Y", "Z"))
+    # a coordinate is rounded to another unit where it lies within MAP_M of the border between two
+    assert moved <= 10 + 2 * 3 * len(host.points) * MAP_M / scale_m
+
+
+def test_exported_captures_are_the_same(flight: Path, tmp_path: Path) -> None:
+    both = on_both(tmp_path, "daemon.cli.main", "export", flight, "{}/exported")
+    host = contents(both.host)
+    assert sum(map(len, host.values())) > 20_000_000
+    assert host == contents(both.arm64)
+
+
+def test_a_repaired_log_is_the_same(flight: Path, tmp_path: Path) -> None:
+    """The end is missing, and within the rest a byte is wrong: chunks are read, checked, written and summed anew."""
+    (log,) = flight.glob("*.mcap")
+    damaged = bytearray(log.read_bytes()[: -(2 << 20)])
+    damaged[len(damaged) // 2] ^= 0x10
+    for own in ("host", "arm64"):
+        (tmp_path / own).mkdir()
+        (tmp_path / own / log.name).write_bytes(damaged)
+    both = on_both(tmp_path, "daemon.cli.main", "recover", "{}", status=DATA_LOST)
+    host = contents(both.host)
+    assert len(host) == 2
+    assert host == contents(both.arm64)
+
+
+def test_navigated_trajectory_is_the_same_to_its_last_places(flight: Path, tmp_path: Path) -> None:
+    words = ("daemon.cli.main", "trajectory", flight, "-o", "{}")
+    both = on_both(tmp_path, *words)
+    (path,) = both.host.glob("*.sbet")
+    host, arm64 = (np.fromfile(folder / path.name, "<f8").reshape(-1, 17) for folder in (both.host, both.arm64))
+    assert len(host) == len(arm64)
