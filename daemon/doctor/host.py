@@ -12,6 +12,7 @@ RMEM_MAX_BYTES = 64 << 20  # what systemd/sysctl/90-swath.conf sets
 FRAGMENTS_BYTES = 32 << 20
 SLOW_IDLE_US = 50  # to wake up from a sleep: the PPS interrupt waits for it
 MEMORY_BYTES = 256 << 20  # the recorder's 64 MiB, a full queue of 64 MiB, and room for the kernel's buffers
+DEBIAN_NAMES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "armmp"}  # of processors, in packages of kernels
 CLOSED_LOOP_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")  # their "powersave" goes as fast as is needed
 
 
@@ -113,8 +114,12 @@ def modules(tree: Tree, needed: Iterable[str]) -> Iterator[Finding]:
         there = name in _known(tree, release, "modules.dep")
         text = f"{name} is not loaded" if there else f"{name} is not part of this kernel ({release})"
         load = f"sudo modprobe {name} && echo {name} | sudo tee /etc/modules-load.d/swath-{name}.conf"
-        mend = load if there else f"install a kernel with {name}: on Debian linux-image-{platform.machine()}"
+        mend = load if there else f"install a kernel with {name}: on Debian {_debian_kernel(platform.machine())}"
         yield Finding("kernel modules", Verdict.WRONG, text, mend)
+
+
+def _debian_kernel(machine: str) -> str:
+    return f"linux-image-{DEBIAN_NAMES.get(machine, machine)}"
 
 
 def _known(tree: Tree, release: str, index: str) -> set[str]:

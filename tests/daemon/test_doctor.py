@@ -125,6 +125,17 @@ def worst(findings: Iterable[Finding]) -> Finding | None:
     return found[0] if found and found[0].verdict is not Verdict.OK else None
 
 
+@pytest.mark.parametrize(
+    ("machine", "package"), [("x86_64", "linux-image-amd64"), ("aarch64", "linux-image-arm64"), ("riscv64", "riscv64")]
+)
+def test_a_kernel_is_named_as_debian_names_it(
+    tree: Tree, machine: str, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    (finding,) = host.modules(tree, ["spcp8x5"])
+    assert finding.mend.endswith(package)
+
+
 @pytest.mark.parametrize("question", [name for name in QUESTIONS if name not in LOADED_LATER])
 def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> None:
     assert worst(QUESTIONS[question](tree)) is None

@@ -1,0 +1,25 @@
+"""Commands that give way do so on every processor: the numbers of system calls differ between them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.daemon.rig import HANGS_S
+
+IOPRIO_GET = {"x86_64": 252, "aarch64": 31}  # asm/unistd_64.h, asm-generic/unistd.h
+IDLE = 3 << 13  # linux/ioprio.h
+ASK = "import ctypes; print(ctypes.CDLL(None).syscall({number}, 1, 0))"
+
+
+@pytest.mark.parametrize("way", ["daemon.priority:give_way", "daemon.processing.live:be_humble"])
+def test_the_disk_is_left_to_others(way: str) -> None:
+    number = IOPRIO_GET.get(os.uname().machine)
+    assert number is not None, "what is ioprio_get's number on this processor?"
+    module, name = way.split(":")
+    code = f"from {module} import {name}; {name}(); {ASK.format(number=number)}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANGS_S, check=True)
+    assert int(done.stdout) & ~0x1FFF == IDLE
