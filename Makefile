@@ -17,10 +17,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-peers test-vm test-vm-long test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
+.PHONY: help demo test test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
 help: ## say what there is to make
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
 demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through real wires into a recorder, about 2 min
 	@$(BIN)/python -m demo
@@ -43,6 +43,11 @@ test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtua
 test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh
 	$(PYTEST) -n 0 -v tests/vm
+
+test-arm64: $(VENV)/.tests ## decoders, log and points on an emulated ARM64, which it installs (root, apt): the same as here
+	@bash tests/arm64/setup.sh $(VENV)
+	$(PYTEST) -n 0 -v tests/arm64
+	tests/arm64/.cache/venv/bin/python -m tests.arm64 -n $(JOBS) --dist loadgroup
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## the tests that take minutes
 	$(PYTEST) -n 0 -m long

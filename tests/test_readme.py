@@ -225,8 +225,8 @@ def test_commands_named_in_the_pages_exist() -> None:
 
 def test_make_help_lists_every_target() -> None:
     listed = {line.split()[1] for line in run("make", "help").stdout.splitlines()}
-    tests = {"test", "test-peers", "test-vm", "test-vm-long", "test-long", "soak", "soak-short", "fuzz", "lint"}
-    assert listed == {"help", "demo", "bench", "bench-calibration", "install", "uninstall", "clean"} | tests
+    tests = {"test", "test-peers", "test-vm", "test-vm-long", "test-arm64", "test-long", "soak", "soak-short", "fuzz"}
+    assert listed == {"help", "demo", "lint", "bench", "bench-calibration", "install", "uninstall", "clean"} | tests
 
 
 def test_make_is_here() -> None:

@@ -138,7 +138,10 @@ def test_options_stand_above_the_file(
             "[parameters]\n'range_offset_slot.1' = 'free'\n[range_offset]\nreturn_slots = [1]",
             "parameters.range_offset_slot.1: its table asks for it; want a prior, or nothing",
         ),
-        ("[parameters]\nphi_deg = { prior = 1" + 400 * "0" + " }", "parameters.phi_deg.prior: a whole number of 1329 bits"),
+        (
+            "[parameters]\nphi_deg = { prior = 1" + 400 * "0" + " }",
+            "parameters.phi_deg.prior: a whole number of 1329 bits",
+        ),
         (
             "[parameters]\nleft.phi_deg = 'free'\n'left.phi_deg' = 'fixed'",
             "model.toml: parameters: left.phi_deg stands there twice; want it once",
