@@ -34,9 +34,10 @@ SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(FIRST_EXTRA, FIRST_EXTRA + 6
 
 # Rows of the scratch table: normal in b; what turns of boresight and of the body do, in b; turns of the body in e;
 # along the beam, by scan angle, by tilt; the share of the later knot; f; M; θ; speed along the normal; place in the
-# plane; variance of the range; what of f is likely to be an error of the range, and of the encoder
+# plane; variance of the range; what of f is likely to be an error of the range, and of the encoder; variance of what
+# the attitude does between knots, which the rows of a run have in common
 NORMAL, BORE, BODY, BODY_E, ALONG, BY_ANGLE, BY_TILT, SHARE, MISCLOSURE, VARIANCE = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
-SPEED, TURNED, PLACE, RANGING, LONGER, AHEAD, ROWS = 18, 19, 20, 23, 24, 25, 26
+SPEED, TURNED, PLACE, RANGING, LONGER, AHEAD, COMMON, ROWS = 18, 19, 20, 23, 24, 25, 26, 27
 
 
 @kernel
@@ -287,6 +288,14 @@ def states_now(
 
 
 @kernel
+def walked(cells: FloatArray, n: int, walk: float) -> None:
+    """Variance of f by what the attitude does between knots: a bridge's, from one to the other."""
+    for i in range(n):
+        by, share = (cells[BODY_E, i], cells[BODY_E + 1, i], cells[BODY_E + 2, i]), cells[SHARE, i]
+        cells[COMMON, i] = share * (1.0 - share) * walk * dot(by, by) if walk > 0.0 else 0.0
+
+
+@kernel
 def of_states(cells: FloatArray, n: int, panel: FloatArray, c: int) -> None:
     """The eight columns of the states, from column c on."""
     for i in range(n):
@@ -326,6 +335,7 @@ def fill(
     if states:
         states_now(cells, n, k, beam, knots, before, after, normal)
     adjust_observations(cells, n, k, beam, head, planes, at)
+    walked(cells, n, knots.walk[before] if states else 0.0)
     for c in range(len(active)):
         column(cells, n, k, beam, head, head.kind[active[c]], head.argument[active[c]], panel[c])
     c = len(active)

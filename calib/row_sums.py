@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.row_kernels import ALONG, AZIMUTH, MISCLOSURE, ROWS, SPEED, VARIANCE, fill
+from calib.row_kernels import ALONG, AZIMUTH, COMMON, MISCLOSURE, ROWS, SPEED, VARIANCE, fill
 from calib.row_tables import OF_PLANE, STATES, Groups, Head, Knots, Looks, Sums, Task
 from georef.compiled import kept, kernel, whole
 from georef.kernels.rotations import vector_at
@@ -19,12 +19,15 @@ MODE_SUM, MODE_LOOK, MODE_GIVE = whole(0), whole(1), whole(2)
 
 
 @kernel
-def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float) -> tuple[float, int]:
-    """Rows times √(weight / M); Huber's weight by f / √M where asked for (> 0). Returns Σ p f², how many count."""
+def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, together: int) -> tuple[float, int]:
+    """Rows times √(weight / M); Huber's weight by f / √M where asked for (> 0). Returns Σ p f², how many count.
+
+    An error c that so many rows have in common counts to each as often: their mean then has the variance M / n + c.
+    """
     n, last, total, count = panel.shape[1], len(panel) - 1, 0.0, 0
     for i in range(n):
-        root = math.sqrt(cells[VARIANCE, i])
-        size = abs(cells[MISCLOSURE, i]) / root
+        size = abs(cells[MISCLOSURE, i]) / math.sqrt(cells[VARIANCE, i])
+        root = math.sqrt(cells[VARIANCE, i] + together * cells[COMMON, i])
         share = math.sqrt(weight[i] * (huber / size if huber > 0.0 and size > huber else 1.0)) / root
         cells[SPEED, i] = share if math.isfinite(share) else 0.0
         count += 1 if cells[SPEED, i] > 0.0 else 0
@@ -133,7 +136,7 @@ def go_over(mode: int, task: Task, weight: FloatArray, huber: float, sums: Sums,
             panel = room[: width * n].reshape(width, n)
             fill(cells, panel, k, task, active, plane, before, groups.after[g])
             if mode == MODE_SUM:
-                square, count = weigh(cells, panel, weight[k : k + n], huber)
+                square, count = weigh(cells, panel, weight[k : k + n], huber, groups.end[g] - groups.begin[g])
                 sums.square[0] += square
                 sums.counts[0] += count
                 add_up(total, np.dot(panel, panel.T))

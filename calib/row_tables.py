@@ -69,11 +69,14 @@ class Planes(NamedTuple):
 
 
 class Knots(NamedTuple):
-    """Trajectory states: (k,) times; (k, 6) shift and turn in e; where the first stands among all unknowns."""
+    """Trajectory states: (k,) times; (k, 6) shift and turn in e; where the first stands among all unknowns; (k,) rad²
+    that the attitude walks to the next knot.
+    """
 
     time_ns: Int64Array
     state: FloatArray
     first: int
+    walk: FloatArray
 
 
 class Sigmas(NamedTuple):

@@ -256,9 +256,10 @@ class Rows:
         at = np.concatenate([run.at for run in batch.runs])
         rows = swath.rows.take(at)  # many times quicker than by index
         beam = beam_table(rows, rays_of(self.flight, swath, model, rows, at))
-        knots = KnotTable(np.zeros(0, np.int64), state.knots, len(self.unknowns))
+        knots = KnotTable(np.zeros(0, np.int64), state.knots, len(self.unknowns), np.zeros(0))
         if self.prior is not None:
-            knots = knots._replace(time_ns=contiguous(self.prior.time_ns))
+            walk = self.prior.walk_rad2 if len(self.prior.walk_rad2) else np.zeros(len(self.prior))
+            knots = knots._replace(time_ns=contiguous(self.prior.time_ns), walk=walk)
         sigmas = self._sigmas[swath.flown] if self.prior is None else _NO_SIGMAS
         middle = trajectory.position_e[int(beam.epoch[len(at) // 2])]
         lat, lon, _ = geodetic_from_e(middle)

@@ -11,7 +11,7 @@ and make the calibration's sigmas five to ten times too small.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -87,6 +87,8 @@ class TrajectoryPrior:
         strip: (k,) number of the strip.
         covariance: (6k, 6k); a knot has north, east, down (m), then small turns of the body about n, e, d (rad).
         notes: for people: where the covariance is from, and what was done to it.
+        walk_rad2: (k,) variance of what the attitude walks from a knot to the next, about each axis: all returns of a
+            moment share that. Empty: it is not known, and counts as nothing.
     """
 
     flown: Int64Array
@@ -94,6 +96,7 @@ class TrajectoryPrior:
     strip: Int64Array
     covariance: FloatArray
     notes: tuple[str, ...] = ()
+    walk_rad2: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         """Number of knots."""
@@ -255,7 +258,25 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
         part_of = slice(begin, begin + len(block))
         covariance[part_of, part_of] = block
         begin = part_of.stop
-    return _prior(joined, covariance, "the smoother's own joint covariance")
+    prior = _prior(joined, covariance, "the smoother's own joint covariance")
+    return replace(prior, walk_rad2=_walked(prior))
+
+
+def _walked(prior: TrajectoryPrior) -> FloatArray:
+    """(k,) as of `TrajectoryPrior.walk_rad2`, at the rate of a middling interval; of a strip's last knot 0.
+
+    In a turn errors of scale make turns differ by far more, and steadily: knots follow that, it is no walk.
+    """
+    count = len(prior)
+    joint, at = prior.covariance.reshape(count, ERRORS, count, ERRORS), np.arange(count - 1)
+    apart_s = np.where(np.diff(prior.strip) == 0, np.diff(prior.time_ns), 0) / SECOND_NS
+    differ = sum(
+        joint[at, axis, at, axis] + joint[at + 1, axis, at + 1, axis] - 2.0 * joint[at, axis, at + 1, axis]
+        for axis in range(3, ERRORS)
+    )
+    near = apart_s > 0.0
+    rate = float(np.median(np.maximum(differ[near] / 3.0, 0.0) / apart_s[near])) if near.any() else 0.0
+    return np.append(rate * apart_s, 0.0)
 
 
 def _strip_at(time_ns: Int64Array, knots: Knots, at: Int64Array, name: str) -> Int64Array:

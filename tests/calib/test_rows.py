@@ -238,6 +238,37 @@ def test_columns_of_the_trajectory_are_differences_of_the_model() -> None:
             np.testing.assert_allclose(column, expected, atol=1e-4 * max(1.0, np.abs(expected).max()))
 
 
+def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> None:
+    """Rows of a run count like their mean: of the variance M / n + c, c that of a bridge between the run's knots."""
+    flight, planes, _ = line_flight()
+    flight = replace(flight, swaths=flight.swaths[:1])
+    planes = tuple(replace(plane, patches=plane.patches[:1]) for plane in planes)
+    times, walk = START_NS + np.array([16, 21, 70, 120]) * 100_000_000, (2e-4) ** 2
+    prior = TrajectoryPrior(np.zeros(4, np.int64), times, np.ones(4, np.int64), np.eye(24))
+    seen = Rows(flight, planes, unknowns(flight, Wish()), replace(prior, walk_rad2=np.full(4, walk)))
+    found = seen.summed(seen.start(), np.ones(seen.count, np.float32), 0.0)
+    expected, grown = np.zeros((4, 4)), []
+    for batch, looks in seen.looks(seen.start()):
+        begin = 0
+        for run in batch.runs:
+            mine = slice(begin, begin + len(run.at))
+            begin = mine.stop
+            columns = looks.design[mine, :4]
+            states = looks.design[mine, 4:12]
+            lever = states[:, 2:5] + states[:, 5:8]  # metres a radian about each axis, shared out to both knots
+            share = states[:, 1]
+            common = share * (1.0 - share) * walk * (lever**2).sum(axis=1)
+            variance = looks.variance[mine] + len(run.at) * common
+            expected += columns.T @ (columns / variance[:, np.newaxis])
+            grown.append(variance.mean() / looks.variance[mine].mean())
+    np.testing.assert_allclose(found.normal[:4, :4], expected, rtol=1e-9)
+    assert max(grown) > 2.0
+    free = Rows(flight, planes, unknowns(flight, Wish()), prior).summed(
+        seen.start(), np.ones(seen.count, np.float32), 0.0
+    )
+    assert np.diag(free.normal)[3] > 1.2 * np.diag(found.normal)[3]
+
+
 def test_rows_are_those_of_the_observations_as_adjusted() -> None:
     """Where only ranges err, ranges as adjusted are the true ones, and so are all coefficients made of them."""
     normal = np.array([0.5, -0.3, 0.81])

@@ -15,7 +15,7 @@ from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, from_smo
 from georef.beams import LineGeometry
 from georef.calibration import nominal
 from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.cross_covariance import error_chain
+from georef.navigation.cross_covariance import ErrorChain, error_chain
 from georef.navigation.error_model import E_ATTITUDE, MOVED
 from georef.navigation.filter import FilterRun, run_filter
 from georef.navigation.inputs import GRADES
@@ -161,10 +161,27 @@ def test_the_prior_of_a_smoothed_run_has_its_strips_and_is_positive() -> None:
     assert 26.9 < t.max() < 29.0
     assert np.linalg.eigvalsh(prior.covariance).min() > -1e-12 * np.linalg.eigvalsh(prior.covariance).max()
     np.testing.assert_allclose(prior.covariance, chain.at(prior.time_ns).covariance(), atol=1e-15)
+    walk_is_that_of_the_nodes_between(prior, chain)
     with pytest.raises(FlightError, match=r"says nothing near GPS week .*; want the run of all strips"):
         from_smoother(made([(0, 1, 5, 9), (0, 2, 46, 49)], [path], begin=int(ns(0.0))), [chain.at(chain.time_ns[:-12])])
     with pytest.raises(FlightError, match="0 runs of 1 trajectories; want all"):
         from_smoother(flight, [])
+
+
+def walk_is_that_of_the_nodes_between(prior: TrajectoryPrior, chain: ErrorChain) -> None:
+    """A turn half way less the mean of those at both knots: a quarter of the walk's variance, as a bridge has it."""
+    seen = []
+    for knot in np.flatnonzero((np.diff(prior.strip) == 0) & (np.diff(prior.time_ns) > 0.8 * SECOND)):
+        ends = prior.time_ns[knot : knot + 2]
+        inside = chain.time_ns[(chain.time_ns > ends[0]) & (chain.time_ns < ends[1])]
+        middle = inside[np.argmin(np.abs(inside - ends.mean()))]
+        share = (middle - ends[0]) / (ends[1] - ends[0])
+        of = chain.at(np.array([ends[0], middle, ends[1]])).covariance().reshape(3, 6, 3, 6)
+        weights = np.array([share - 1.0, 1.0, -share])
+        variance = np.mean([weights @ of[:, axis, :, axis] @ weights for axis in (3, 4, 5)])
+        seen.append(variance / (share * (1.0 - share) * prior.walk_rad2[knot]))
+    assert len(seen) > 5
+    assert 0.8 < np.median(seen) < 1.2
 
 
 # ---------------------------------------------------------------------- from sigmas
