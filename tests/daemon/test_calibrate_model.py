@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,9 +45,9 @@ def file(folder: Path, text: str) -> str:
     return str(path)
 
 
-def refused(*given: object) -> str:
+def refused(*given: Any) -> str:
     with pytest.raises(UserError) as ended:
-        model_of(*given)  # type: ignore[arg-type]
+        model_of(*given)
     assert "\n" not in ended.value.message
     return ended.value.message
 

@@ -116,9 +116,8 @@ def _trajectories() -> Target:
     words = (*NUMBERS, *OF_CSV, *OF_TIMES)
 
     def run(data: bytes) -> Iterator[str]:
-        seen: set[str] = set()
-        for settings in ({"span_ns": SPAN_NS}, {"week": WEEK, "leap_seconds": 18}):
-            seen |= told(lambda: _used(read_trajectory(data, "file", **settings)), TrajectoryError)  # noqa: B023
+        seen = told(lambda: _used(read_trajectory(data, "file", span_ns=SPAN_NS)), TrajectoryError)
+        seen |= told(lambda: _used(read_trajectory(data, "file", week=WEEK, leap_seconds=18)), TrajectoryError)
         seen |= told(lambda: [read_trajectory(data, "file", needs_attitude=False).name], TrajectoryError)
         return iter(seen)
 

@@ -6,16 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.named_only import is_asked_for, limit
+
 HERE = Path(__file__).resolve().parent
 HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    asked = [Path(config.invocation_params.dir, argument.partition("::")[0]).resolve() for argument in config.args]
-    return None if any(path.is_relative_to(HERE) for path in asked) else True
+    return None if is_asked_for(HERE, config) else True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.path.is_relative_to(HERE) and item.get_closest_marker("timeout") is None:
-            item.add_marker(pytest.mark.timeout(HANGS_S))
+    limit(HERE, items, HANGS_S)
