@@ -1,7 +1,8 @@
-"""In the machine: an IMU on CAN, a sender by raw AF_CAN sockets, and what can befall an interface."""
+"""In the machine: an IMU on CAN, a sender by raw AF_CAN sockets, and what can befall an interface or a controller."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -58,14 +59,18 @@ class Bus:
 
     def send_frame(self, frame: bytes) -> None:
         """A frame of 16 or 72 bytes; waits while a controller's queue is full."""
-        while True:
-            try:
-                self._socket.send(frame)
-                return
-            except OSError as error:
-                if error.errno != 105:  # ENOBUFS
-                    raise
-                time.sleep(0.001)
+        while not self.try_frame(frame):
+            time.sleep(0.001)
+
+    def try_frame(self, frame: bytes) -> bool:
+        """The same; False where no queue takes it."""
+        try:
+            self._socket.send(frame)
+        except OSError as error:
+            if error.errno != errno.ENOBUFS:
+                raise
+            return False
+        return True
 
 
 def sample_frames(number: int, period_us: int) -> list[bytes]:
@@ -184,6 +189,53 @@ def trouble() -> None:
     keep("sent", {"frames": [frame.hex() for frame in frames]})
 
 
+def set_state(state: str) -> None:
+    """What the counters of errors of `guest/can_sim.c` mean from now on."""
+    numbers = {"ERROR-ACTIVE": 0, "ERROR-WARNING": 1, "ERROR-PASSIVE": 2, "BUS-OFF": 3}
+    Path("/sys/module/can_sim/parameters/state").write_text(str(numbers[state]))
+    wait_state(state)
+
+
+def wait_state(state: str) -> None:
+    """Until the kernel says this of the controller."""
+    wait_until(lambda: f" state {state} " in sh("ip -details link show can0"), state)
+
+
+def send_numbers(bus: Bus, identifier: int) -> list[bytes]:
+    """A hundred frames."""
+    return [bus.send(identifier, struct.pack("<Q", number)) for number in range(100)]
+
+
+def bus_off(module: str) -> None:
+    """A controller goes off the bus and comes back after its restart-ms; without one, when it is told to."""
+    sh(f"modprobe -a can_dev can_raw; insmod {module}; ip link set can0 up type can bitrate 500000 restart-ms 2000")
+    with recording(session() + imu("main", "can0", 1000, "?bitrate=500000")) as recorder:
+        listening(recorder)
+        bus = Bus("can0")
+        frames = send_numbers(bus, 0x300)
+        set_state("ERROR-PASSIVE")
+        frames += send_numbers(bus, 0x301)
+        set_state("BUS-OFF")
+        bus.try_frame(FRAME.pack(0x7FF, 8, b"bus-off!"))
+        recorder.wait_said("can_bus_off")
+        wait_state("ERROR-ACTIVE")
+        frames += send_numbers(bus, 0x302)
+        time.sleep(0.5)
+        sh("ip link set can0 down")
+        recorder.wait_said("can0 is down")
+        sh("ip link set can0 up type can restart-ms 0")
+        listening(recorder, 2)
+        frames += send_numbers(bus, 0x303)
+        set_state("BUS-OFF")
+        time.sleep(3.0)
+        wait_state("BUS-OFF")
+        sh("ip link set can0 type can restart")
+        wait_state("ERROR-ACTIVE")
+        frames += send_numbers(bus, 0x304)
+        time.sleep(1.5)
+    keep("sent", {"frames": [frame.hex() for frame in frames]})
+
+
 def controllers(seconds: str) -> None:
     """Two emulated controllers on one bus, 200 Hz; each sends what the other receives."""
     sh("modprobe -a kvaser_pci can_raw")
@@ -206,4 +258,4 @@ def controllers(seconds: str) -> None:
 
 
 if __name__ == "__main__":
-    main({"rate": rate, "overrun": overrun, "trouble": trouble, "controllers": controllers})
+    main({"rate": rate, "overrun": overrun, "trouble": trouble, "bus_off": bus_off, "controllers": controllers})

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +14,7 @@ from tests.named_only import is_asked_for, limit
 
 HERE = Path(__file__).resolve().parent
 HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
+STEP_S = 0.05
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -18,3 +23,23 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     limit(HERE, items, HANGS_S)
+
+
+@pytest.fixture(autouse=True)
+def _own_stalls() -> Iterator[None]:
+    """Beside a failure stands how long this computer did not come to its work: the machine stood as long."""
+    stopped, longest_s = threading.Event(), 0.0
+
+    def watch() -> None:
+        nonlocal longest_s
+        before_s = time.monotonic()
+        while not stopped.wait(STEP_S):
+            now_s = time.monotonic()
+            longest_s, before_s = max(longest_s, now_s - before_s - STEP_S), now_s
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    yield
+    stopped.set()
+    thread.join()
+    sys.stdout.write(f"this computer stood still for up to {longest_s:.2f} s\n")

@@ -1,11 +1,12 @@
 #!/bin/bash
 # What the tests in a virtual machine need: packages, Debian's kernel (unpacked, never installed), an initramfs, the
-# module of a simulated PPS, udev for the machine. All of it lies in .cache beside this file; done again only when asked
+# modules of a simulated PPS and CAN controller, udev for the machine. All of it lies in .cache beside this file; done again only when asked
 # for something new.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 cache=$here/.cache
 packages=(qemu-system-x86 busybox-static cpio kmod iproute2 systemd e2fsprogs gcc-12 make xz-utils bc python3-venv)
+modules=(pps_sim can_sim)
 
 fail() { echo "swath: $*" >&2; exit 1; }
 download() { (mkdir -p "$1" && cd "$1" && shift && apt-get -qq -o APT::Sandbox::User=root download "$@"); }
@@ -50,18 +51,25 @@ PY
 }
 
 build_modules() {
-    [ "$cache/modules/pps_sim.ko" -nt "$here/guest/pps_sim.c" ] && [ "$cache/modules/pps_sim.ko" -nt "$cache/kernel/boot/vmlinux" ] && return
+    stale=
+    for name in "${modules[@]}"; do
+        module=$cache/modules/$name.ko
+        [ "$module" -nt "$here/guest/$name.c" ] && [ "$module" -nt "$cache/kernel/boot/vmlinux" ] || stale=1
+    done
+    [ -n "$stale" ] || return 0
     release=$(ls "$cache/kernel/lib/modules")
     headers=$cache/headers
-    echo "building pps_sim for $release"
+    echo "building ${modules[*]} for $release"
     rm -rf "$headers" "$cache/modules"
     download "$headers/deb" "linux-headers-$release" "linux-headers-${release%-*}-common" "linux-kbuild-$(echo "$release" | cut -d. -f1,2)"
     for package in "$headers"/deb/*.deb; do dpkg -x "$package" "$headers"; done
     rm -r "$headers/deb"
     sed -i "s#/usr/src/#$headers/usr/src/#" "$headers/usr/src/linux-headers-$release/Makefile"
     mkdir -p "$cache/modules"
-    cp "$here/guest/pps_sim.c" "$cache/modules/"
-    echo "obj-m := pps_sim.o" >"$cache/modules/Makefile"
+    for name in "${modules[@]}"; do
+        cp "$here/guest/$name.c" "$cache/modules/"
+        echo "obj-m += $name.o" >>"$cache/modules/Makefile"
+    done
     make -s -C "$headers/usr/src/linux-headers-$release" M="$cache/modules" modules
 }
 

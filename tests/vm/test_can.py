@@ -1,4 +1,4 @@
-"""SocketCAN: real vcan and two emulated controllers."""
+"""SocketCAN: real vcan, two emulated controllers, and one whose errors are steered."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from daemon.log.reader import open_logs
 from daemon.log_parsers import stored_parsers
 from georef.records import ChunkBatch, ImuSamples
 from tests.daemon.log_check import LogContent, read_log
-from tests.vm.aboard_can import BUS_OFF, ERROR, sample_frames
+from tests.vm.aboard_can import BUS_OFF, CONTROLLER, ERROR, RESTARTED, sample_frames
 from tests.vm.crew import aboard, facts
+from tests.vm.machine import MODULES
 
 CLOCKS_NS = 50_000  # REALTIME and MONOTONIC are read one after the other, and only a change beyond this is a step
 KVASER = ["-object", "can-bus,id=bus", *["-device", "kvaser_pci,canbus=bus"] * 2]
@@ -84,7 +85,7 @@ def test_can_overrun_is_counted_exactly(tmp_path: Path) -> None:
     assert content.events("lost_kernel")
 
 
-def test_can_fd_error_frames_bus_off_restart_and_interface_down_and_up(tmp_path: Path) -> None:
+def test_can_fd_error_frames_and_interface_down_and_up(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_can", "trouble", seconds=35)
     content = read_log(tmp_path / "logs")
     sent = [bytes.fromhex(frame) for frame in facts(tmp_path, "sent")["frames"]]
@@ -102,6 +103,22 @@ def test_can_fd_error_frames_bus_off_restart_and_interface_down_and_up(tmp_path:
 
 def _without_flags(frame: bytes) -> bytes:
     return frame if len(frame) == 16 else frame[:5] + b"\0" + frame[6:]
+
+
+def test_can_controller_goes_off_the_bus_and_comes_back_by_itself_and_when_it_is_told_to(tmp_path: Path) -> None:
+    aboard(tmp_path, "aboard_can", "bus_off", MODULES / "can_sim.ko", seconds=30)
+    content = read_log(tmp_path / "logs")
+    recorded = units(content, "imu/main")
+    identifiers = [int.from_bytes(frame[:4], "little") for frame in recorded]
+    data = [frame for frame, identifier in zip(recorded, identifiers, strict=True) if not identifier & ERROR]
+    # nothing that was sent while it was off
+    assert [frame.hex() for frame in data] == facts(tmp_path, "sent")["frames"]
+    told = [identifier & ~ERROR for identifier in identifiers if identifier & ERROR]
+    assert told == [CONTROLLER, BUS_OFF, RESTARTED, BUS_OFF, RESTARTED]
+    assert_nothing_lost(content, "imu/main")
+    assert last_status(content, "imu/main")["bus_off"] == 2
+    assert content.events("can_bus_off")
+    assert len(content.events("device_lost")) == 1
 
 
 def test_can_two_controllers_200_hz(tmp_path: Path) -> None:
