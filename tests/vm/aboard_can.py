@@ -225,6 +225,7 @@ def bus_off(module: str) -> None:
         recorder.wait_said("can0 is down")
         sh("ip link set can0 up type can restart-ms 0")
         listening(recorder, 2)
+        bus = Bus("can0")
         frames += send_numbers(bus, 0x303)
         set_state("BUS-OFF")
         time.sleep(3.0)
