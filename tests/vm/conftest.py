@@ -43,3 +43,18 @@ def _own_stalls() -> Iterator[None]:
     stopped.set()
     thread.join()
     sys.stdout.write(f"this computer stood still for up to {longest_s:.2f} s\n")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What the proofs measured, below which of them passed."""
+    reports = [report for outcome in ("passed", "failed") for report in terminalreporter.getreports(outcome)]
+    measured = [report for report in reports if report.when == "call" and report.user_properties]
+    if measured:
+        terminalreporter.section("figures")
+    for report in measured:
+        told = ", ".join(f"{name} {_short(value)}" for name, value in report.user_properties)
+        terminalreporter.write_line(f"{report.nodeid.removeprefix('tests/vm/')}  {told}")
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -239,12 +239,17 @@ def test_flight_from_the_wires_to_points(
     las = laspy.read(next(out.glob("*.laz")))
     truth = np.load(again / "truth.npz")
     record_property("pulses_per_s", PRF_HZ)
+    record_property("points", len(las))
     # returns before the first or after the last sample of the IMU have no pose
     assert len(las) > 0.99 * len(truth["left.gps_ns"]) > PRF_HZ * seconds / 2
     time_ns = np.rint(np.asarray(las.gps_time) * 1e9).astype(np.int64) + 10**18
     sigma = np.stack([np.asarray(las[f"sigma_{name}"]) for name in ("easting", "northing", "height")], axis=1)
     recorded = Recorded(logs, np.empty(0, POINT_DTYPE), truth)
-    judged(recorded.missed(time_ns, np.asarray(las.return_number), np.asarray(las.xyz)), sigma)
+    missed = recorded.missed(time_ns, np.asarray(las.return_number), np.asarray(las.xyz))
+    for axis, axis_missed, axis_sigma in zip(("east", "north", "height"), missed.T, sigma.T, strict=True):
+        record_property(f"rms_{axis}_m", float(np.sqrt((axis_missed**2).mean())))
+        record_property(f"sigma_{axis}_m", float(np.sqrt((axis_sigma**2).mean())))
+    judged(missed, sigma)
 
 
 def assert_complete(logs: Path, again: Path) -> None:
