@@ -41,7 +41,8 @@ class Monitor:
         self._reserve_bytes = 0
         self._damaged = 0
         self._newest_ns = 0
-        self._advanced_s = time.monotonic()  # when a newer message was seen
+        self._began_s = time.monotonic()
+        self._grown_s: float | None = None  # when a newer message was seen than was there at the beginning
 
     def close(self) -> None:
         """Close the log."""
@@ -51,10 +52,13 @@ class Monitor:
 
     def poll(self) -> None:
         """Take what has been recorded since the last call; where nothing ever was since, the end of what was."""
+        begun, newest_ns = self._part is not None, self._newest_ns
         for batch in self._follower.poll():
             if self._follower.part is not self._part:
                 self._begin_part(self._follower.part)
             self._take(batch)
+        if begun and self._newest_ns != newest_ns:
+            self._grown_s = time.monotonic()
         if self._part is None and self._follower.part is None:
             self._read_latest()
 
@@ -83,8 +87,7 @@ class Monitor:
 
     def _take(self, batch: LogBatch) -> None:
         topic = batch.channel.topic
-        if (newest_ns := int(batch.log_time_ns[-1])) > self._newest_ns:
-            self._newest_ns, self._advanced_s = newest_ns, time.monotonic()
+        self._newest_ns = max(self._newest_ns, int(batch.log_time_ns[-1]))
         source = source_of_topic(topic)
         if source is not None:
             self._watch(source).add_units(batch)
@@ -116,6 +119,12 @@ class Monitor:
 
     # ------------------------------------------------------------------ saying
 
+    @property
+    def is_undecided(self) -> bool:
+        """Whether growth would still show that a log is recorded whose recorder cannot be asked."""
+        waiting = self._grown_s is None and time.monotonic() - self._began_s < STALE_S
+        return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
+
     def snapshot(self) -> dict[str, Any]:
         """How things are now, as plain values: the form of ``--json``."""
         now_ns = None if self._part is None else self._now_ns(self._part.info)
@@ -142,7 +151,7 @@ class Monitor:
 
     def _now_ns(self, session: SessionInfo) -> int:
         """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
-        own = session.boot_id == read_boot_id()
+        own = _is_of_this_boot(session.boot_id)
         return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns if own else self._newest_ns
 
     def _plain_sources(self, now_ns: int) -> dict[str, dict[str, Any]]:
@@ -173,10 +182,16 @@ class Monitor:
             return f"nothing is being recorded in {self._directory}{told}"
         if self._part is None or now_ns is None:
             return f"{sign.path.name} should grow and cannot be read (yet)"
-        own = sign.boot_id == read_boot_id()  # locks of another computer need not be seen here
+        own = _is_of_this_boot(sign.boot_id)  # locks of another computer need not be seen here
         if own and sign.path == self._part.path and not is_being_written(sign.path):
             return f"the recorder of {sign.path.name} is gone, and its log has no end"
-        age_s = (now_ns - self._newest_ns) * 1e-9 if own else time.monotonic() - self._advanced_s
+        if own:
+            age_s = (now_ns - self._newest_ns) * 1e-9
+        elif self._grown_s is not None:
+            age_s = time.monotonic() - self._grown_s
+        else:
+            looked_s = time.monotonic() - self._began_s
+            return f"{sign.path.name}, of another computer or of before a restart, has not grown for {looked_s:.0f} s"
         if self._newest_ns and age_s > STALE_S:
             return f"nothing has been written for {age_s:.0f} s"
         return None
@@ -193,6 +208,10 @@ class Monitor:
         if hours is not None and hours * 3600 < LITTLE_LEFT_S:
             troubles.append(f"room for {duration_text(hours * 3600)} only")
         return list(filter(None, troubles))
+
+
+def _is_of_this_boot(boot_id: str) -> bool:
+    return boot_id == read_boot_id()
 
 
 def _modified(path: Path) -> float:

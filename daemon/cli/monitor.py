@@ -66,7 +66,9 @@ def _once(monitor: Monitor, as_json: bool) -> str:
     deadline_s = time.monotonic() + FIRST_STATUS_S
     monitor.poll()
     found = monitor.snapshot()
-    while found["verdict"] != "not recording" and not found["sources"] and time.monotonic() < deadline_s:
+    while monitor.is_undecided or (
+        found["verdict"] != "not recording" and not found["sources"] and time.monotonic() < deadline_s
+    ):
         time.sleep(0.1)
         monitor.poll()
         found = monitor.snapshot()

@@ -28,6 +28,7 @@ from daemon.log.follow import LogFollower, PartFollower
 from daemon.log.reader import open_logs
 from daemon.monitor import Monitor
 from daemon.monitor_source import Decoding
+from daemon.run import read_boot_id
 from drivers.core.parser import PacketParser
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from georef.records import ByteRows, Int64Array, Record
@@ -269,7 +270,12 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
         time.sleep(2.5)
         monitor = Monitor(logs)
         monitor.poll()
+        assert monitor.snapshot()["verdict"] == "not recording"
+        assert monitor.is_undecided
+        time.sleep(1.0)
+        monitor.poll()
         found = monitor.snapshot()
+        assert not monitor.is_undecided
         assert found["verdict"] == "recording"
         assert found["sources"]["scanner/left"]["age_s"] < 1.0
         recorder.kill()
@@ -279,6 +285,20 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
     found = monitor.snapshot()
     monitor.close()
     assert (found["verdict"], found["sentence"][:33]) == ("not recording", "NOT RECORDING: nothing has been w")
+
+
+def test_the_log_of_a_power_cut_is_not_called_recording_after_the_restart(tmp_path: Path, logs: Path) -> None:
+    """The sign of what is recorded outlives the recorder; the recorder of another boot has no lock to be seen."""
+    with Recorder(tmp_path, session_table(logs)) as recorder:
+        recorder.wait_said("session_started")
+        time.sleep(1.5)
+        recorder.kill()
+    sign = logs / "recording.json"
+    sign.write_text(sign.read_text().replace(read_boot_id(), str(uuid.UUID(int=7))))
+    code, found = once(logs)
+    assert code == 2
+    assert found["sentence"].startswith("NOT RECORDING: ")
+    assert "of another computer or of before a restart, has not grown for 5 s" in found["sentence"]
 
 
 @pytest.mark.parametrize("seed", range(40))
