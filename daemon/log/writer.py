@@ -40,6 +40,7 @@ from daemon.log.summary import ChunkPieces, SchemaTable, Summary, record_bytes
 
 _OP_CHUNK, _OP_FOOTER = 6, 2
 WRITE_OUT_BYTES = 8 << 20  # that the disk is given to write at once; a second's worth is too much to wait for
+CHUNK_SPAN_NS = 2 * CHUNK_OPEN_NS  # of log time: a writer that stood still lays seconds at once
 _FIXED_CHUNK_FIELDS = 40  # start u64, end u64, size u64, crc u32, compression length u32, records length u64
 
 
@@ -52,6 +53,7 @@ class _OpenChunk:
     """Blocks that wait to be written together."""
 
     opened_ns: int
+    first_log_ns: int
     pieces: list[memoryview | bytes] = field(default_factory=list)
     size: int = 0
     schemas: set[str] = field(default_factory=set)
@@ -150,23 +152,26 @@ class PartWriter:
     # ------------------------------------------------------------------ messages
 
     def add(self, block: EncodedBlock) -> None:
-        """Lay a block into the open chunk of its class; close the chunk when it is full.
+        """Lay a block into the open chunk of its class; close the chunk when it is full, and any that is long past.
 
         Raises:
             LogWriteError: the chunk could not be written; its messages are counted in ``lost``.
         """
         if not block.count:
             return
+        first_log_ns = int(block.log_time_ns[0])
         spec = self._specs[block.channel_id]
         chunk = self._chunks.get(spec.chunk_class)
         if chunk is None:
-            chunk = self._chunks[spec.chunk_class] = _OpenChunk(time.monotonic_ns())
+            chunk = self._chunks[spec.chunk_class] = _OpenChunk(time.monotonic_ns(), first_log_ns)
         if block.channel_id not in chunk.blocks:
             self._introduce(chunk, block.channel_id, spec)
         chunk.blocks[block.channel_id].append((chunk.size, block))
         chunk.append(block.data)
         if chunk.size >= CHUNK_BYTES:
             self._close_chunk(spec.chunk_class)
+        for late in [name for name, open_ in self._chunks.items() if first_log_ns - open_.first_log_ns > CHUNK_SPAN_NS]:
+            self._close_chunk(late)
 
     def close_due(self, now_ns: int) -> None:
         """Close chunks that have been open for 250 ms (CLOCK_MONOTONIC); raises `LogWriteError`."""

@@ -357,6 +357,22 @@ def test_parts_are_ordered_and_a_missing_one_is_named(tmp_path: Path) -> None:
         open_logs([tmp_path])
 
 
+def test_what_a_writer_lays_at_once_after_a_stall_is_read_in_order_of_time(tmp_path: Path) -> None:
+    writer = PartWriter(tmp_path / "stalled.mcap", INFO, 0)
+    writer.add_channel(1, SCANNER)
+    writer.add_channel(2, ROVER)
+    units = np.zeros((100, 1206), np.uint8)
+    for number in range(300):  # 3 s of log time
+        base_ns = START_NS + number * 10_000_000
+        writer.add(encode_block(2, number, np.array([base_ns], dtype=np.int64), units[:1, :40]))
+        writer.add(encode_block(1, number * 100, base_ns + np.arange(100, dtype=np.int64) * 100_000, units))
+    writer.finish()
+    (session,) = open_logs([tmp_path])
+    times = np.concatenate([batch.log_time_ns for batch in session.batches_by_time()])
+    assert len(times) == 300 * 101
+    assert (np.diff(times) >= 0).all()
+
+
 # ------------------------------------------------------------------ a disk that refuses
 
 
