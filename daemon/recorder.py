@@ -117,7 +117,9 @@ class Recorder(threading.Thread):
         """Open part 0, or stop at the reserve at once; raises OSError when the directory cannot be written."""
         self.health.free_bytes = self._free_bytes() or 0
         if self.health.free_bytes < self._settings.reserve_bytes:
-            self._stop_writing(Writing.RESERVE, self._reserve_text())
+            text = self._reserve_text()
+            self._stop_writing(Writing.RESERVE, text)
+            self._events.post(Severity.CRITICAL, "disk", "disk_reserve", text)
             return
         self._parts.open_next(self._clock.now_ns())
 

@@ -174,12 +174,14 @@ def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
     logs = small_disk / "logs"
     with Recorder(small_disk.parent / "rig", config_of(logs, port, 8), watchdog_s=1.0) as recorder:
         assert "NOT RECORDING" in recorder.notify.last("STATUS")
+        recorder.wait_said("disk disk_reserve")
         fed = recorder.notify.count("WATCHDOG")
         time.sleep(4)
         assert recorder.notify.count("WATCHDOG") > fed + 5
         (small_disk / "filler").unlink()
         recorder.wait_said("disk recording_resumed")
         assert recorder.stop() == 0
+    assert len(read_log(logs).events("disk_reserve")) == 1
 
 
 def test_directory_that_cannot_be_written(tmp_path: Path) -> None:
