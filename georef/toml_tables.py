@@ -10,6 +10,7 @@ from typing import Any
 DEEPEST = 32  # tables in tables; no file of ours has more than 5
 LEAST, MOST = -(1 << 63), (1 << 63) - 1  # TOML 1.0.0, Integer: 64 bits are expected, and what is lost is an error
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+_NOT_SHOWN = re.compile(r"[\x7f-\x9f\u2028\u2029]")  # JSON lets them stand; TOML not the first, a line not the others
 
 
 class TomlError(ValueError):
@@ -48,4 +49,6 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 def key_text(key: str) -> str:
     """A key as TOML writes it: bare, or in quotes on one line."""
-    return key if _BARE.fullmatch(key) else json.dumps(key)
+    if _BARE.fullmatch(key):
+        return key
+    return _NOT_SHOWN.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(key, ensure_ascii=False))
