@@ -26,6 +26,10 @@ _EXTENDED = struct.Struct("<QI")  # where extended records begin, and how many
 _SIZES_AT, _MINOR_AT, _EXTENDED_AT = 94, 25, 235
 _POINT, _POINT_AT = struct.Struct("<BH"), 104  # format with the bit of LAZ, bytes of a point
 _COMPRESSED, _MOST_POINT_BYTES = 0x80, 2048
+_VLR = struct.Struct("<2x16sHH32x")  # user, number and length of a record before the points
+_LASZIP = (b"laszip encoded", 22204)
+_CHUNK_POINTS, _CHUNK_POINTS_AT, _VARYING = struct.Struct("<I"), 12, 0xFFFF_FFFF  # in that record
+_MOST_CHUNK_BYTES = 1 << 30  # of points as read; lazrs has room made for a whole chunk. LASzip's own have 50,000 points
 
 
 def open_points(path: Path, selection: Selection | None = None) -> laspy.LasReader:
@@ -54,7 +58,7 @@ def _refuse_records(head: bytes, size: int) -> None:
 
 
 def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
-    """Points of a size that none has, or a table of more chunks than there are bytes: lazrs would end the process."""
+    """Points or chunks of a size that none has, or more chunks than there are bytes: lazrs would end the process."""
     if len(head) < _POINT_AT + _POINT.size:
         return
     kind, point_bytes = _POINT.unpack_from(head, _POINT_AT)
@@ -62,6 +66,9 @@ def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
         raise ValueError(f"points of {point_bytes} bytes")
     if not kind & _COMPRESSED:
         return
+    (chunk_points,) = _CHUNK_POINTS.unpack(_laszip_record(file, head)[_CHUNK_POINTS_AT:][:4].ljust(4, b"\0"))
+    if chunk_points != _VARYING and chunk_points * point_bytes > _MOST_CHUNK_BYTES:
+        raise ValueError(f"chunks of {chunk_points} points")
     points_at = _SIZES.unpack_from(head, _SIZES_AT)[1]
     if points_at > size - 8:
         return
@@ -76,6 +83,18 @@ def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
     _, count = struct.unpack("<II", file.read(8))
     if count > size:
         raise ValueError(f"{count} chunks in {size} bytes")
+
+
+def _laszip_record(file: BinaryIO, head: bytes) -> bytes:
+    """The record that says how points were compressed; empty: there is none."""
+    at, _, count = _SIZES.unpack_from(head, _SIZES_AT)
+    for _ in range(count):
+        file.seek(at)
+        user, number, length = _VLR.unpack(file.read(_VLR_BYTES).ljust(_VLR_BYTES, b"\0"))
+        if (user.rstrip(b"\0"), number) == _LASZIP:
+            return file.read(length)
+        at += _VLR_BYTES + length
+    return b""
 
 
 @contextmanager
