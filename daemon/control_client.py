@@ -16,27 +16,54 @@ from daemon.places import CONTROL_LINK
 
 ANSWER_S = 5.0
 ANSWER_BYTES = 1 << 16
+SHOWN_CHARACTERS = 1000  # of a text in it
+LATEST_NS = 1 << 63
 NEW_PART_S = 15.0  # the next one is tried again after 10 s
 
 
-def ask(directory: Path, request: Mapping[str, object]) -> dict[str, Any]:
-    """A request and its answer.
+_OF_ALL: dict[str, type] = {"session_id": str, "part": int, "recording": bool, "reason": str}
+_OF_COMMAND: dict[str, dict[str, type]] = {"mark": {"time_ns": int, "text": str}}
+
+
+def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
+    """A request and its answer, which has every key that the command's answer has, its texts in one line.
 
     Raises:
-        UserError: no recorder runs there, it may not be asked, it does not answer, or it refuses.
+        UserError: no recorder runs there, it may not be asked, it does not answer or not as one, or it refuses.
     """
     try:
-        answer = json.loads(_exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n"))
+        said = _exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n")
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise UserError(f"{directory}: no recorder is running there", ExitCode.IO) from error
     except PermissionError as error:
         text = f"{directory}: not permitted; only the recorder's own user and root may, such as with sudo"
         raise UserError(text, ExitCode.IO) from error
-    except (OSError, ValueError) as error:  # a time-out is one, no JSON the other
+    except OSError as error:  # a time-out is one
         raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO) from error
-    if not answer.get("ok"):
-        raise UserError(f"{directory}: {one_line(str(answer.get('error', 'refused')))}", ExitCode.PROBLEM)
-    return dict(answer)
+    if not said:
+        raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO)
+    try:
+        answer = _understood(said, _OF_ALL | _OF_COMMAND.get(request["command"], {}))
+    except (ValueError, RecursionError) as error:
+        text = f"{directory}: what answers there is no recorder of this version; start it anew after an update"
+        raise UserError(text, ExitCode.IO) from error
+    if not answer["ok"]:
+        raise UserError(f"{directory}: {answer['error']}", ExitCode.PROBLEM)
+    return answer
+
+
+def _understood(said: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
+    """An answer or a refusal; raises ValueError, RecursionError where it is neither."""
+    answer = json.loads(said)
+    refused = isinstance(answer, dict) and answer.get("ok") is False
+    wanted = {"ok": bool} | ({"error": str} if refused else dict(wanted))
+    if not isinstance(answer, dict) or not all(type(answer.get(key)) is kind for key, kind in wanted.items()):
+        raise ValueError(f"want {', '.join(wanted)}")
+    if "time_ns" in wanted and not 0 <= answer["time_ns"] < LATEST_NS:
+        raise ValueError("want a time of this age")
+    return {
+        key: one_line(answer[key])[:SHOWN_CHARACTERS] if kind is str else answer[key] for key, kind in wanted.items()
+    }
 
 
 def _exchange(place: Path, line: bytes) -> bytes:

@@ -10,6 +10,7 @@ import base64
 import errno
 import math
 import os
+import re
 import socket
 import threading
 import time
@@ -32,6 +33,8 @@ MOST_TABLE_BYTES = 1 << 18
 MOST_NAMED = 8  # mountpoints, of a table that has not the one asked for
 GGA_S = 10.0
 SEND_TIMEOUT_S = 2.0
+_STATUS = re.compile(r"[0-9]{3}")  # RFC 9112, 4
+_CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; more than 64 bits nobody sends
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 _REFUSALS = {
     401: "the caster refuses user or password",
@@ -94,7 +97,7 @@ class NtripTransport(DescriptorTransport):
         lines = head.decode("latin-1").split("\r\n")
         fields = {name.strip().lower(): value.strip().lower() for name, _, value in (x.partition(":") for x in lines)}
         words = lines[0].split(maxsplit=2)
-        code = int(words[1]) if len(words) > 1 and words[1].isdecimal() else 0
+        code = int(words[1]) if len(words) > 1 and _STATUS.fullmatch(words[1]) else 0
         if words[:1] == ["SOURCETABLE"] or (code == 200 and "sourcetable" in fields.get("content-type", "")):
             raise TransportError(f"{self.name}: {self._not_in_table(sock)}")
         if code in _REFUSALS:
@@ -305,11 +308,10 @@ class _Chunks:
                 line, found, rest = held.partition(b"\r\n")
                 if not found and len(held) < 64:
                     break
-                try:
-                    self._left = int(line.split(b";")[0], 16) + 2
-                except ValueError:
-                    raise ValueError(f"a chunk's length is {_printable(line[:20].decode('latin-1'))}") from None
-                held = rest
+                length = _CHUNK_LENGTH.fullmatch(line.split(b";")[0].strip())
+                if length is None:
+                    raise ValueError(f"a chunk's length is {_printable(line[:20].decode('latin-1'))}")
+                self._left, held = int(length[0], 16) + 2, rest
         self._held = held
         return b"".join(out)
 

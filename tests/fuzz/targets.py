@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from tests.fuzz.asked import asked_targets
 from tests.fuzz.engine import Target
 from tests.fuzz.files import file_targets
 from tests.fuzz.logs import log_targets
@@ -13,11 +14,12 @@ from tests.fuzz.parsers import parser_targets
 
 
 def all_targets() -> dict[str, Callable[[], Target]]:
-    """What builds each: parsers of every driver there is, readers of logs, captures, configuration, office files."""
+    """What builds each: parsers of every driver there is, readers of everything else that comes from outside."""
     return {
         **dict(parser_targets()),
         **dict(log_targets()),
         **dict(file_targets()),
+        **dict(asked_targets()),
         **dict(office_targets()),
         **dict(office_file_targets()),
     }

@@ -74,7 +74,7 @@ def told(read: Callable[[], Iterable[str]], *refusals: type[Exception], begins: 
     lines = message.splitlines()
     if len(lines) != 1 and not (lines and begins and all(line.startswith(begins) for line in lines)):
         raise FindingError(f"not a line a mistake: {message!r}")
-    return {" ".join(_VARYING.sub("", line.removeprefix(begins)).split())[:60] for line in lines}
+    return {" ".join(_VARYING.sub("", line.removeprefix(begins)[:300]).split())[:60] for line in lines}
 
 
 def text_target(
