@@ -18,6 +18,10 @@ DECODE_SHARE = 0.05  # of a processor for each source's parser
 DECODE_AT_ONCE_S = 0.5  # and so much beyond, for the beginning and for bursts
 DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
 _LOST = ("lost_kernel", "lost_queue", "lost_write")
+_COUNTS = ("units", "bytes", *_LOST)
+_WORDS = ("state", "time_state")
+_MEASURED = ("last_unit_age_s", "time_sigma_ns")
+_MOST = 1 << 63  # of a count, and of what is measured
 
 
 @dataclass(slots=True)
@@ -118,6 +122,19 @@ class Decoding:
         }
 
 
+def usable_status(said: dict[str, Any]) -> dict[str, Any]:
+    """A status with what can be shown of it: a log that is no recorder's may say anything there."""
+    status: dict[str, Any] = {key: _number(said.get(key), int) or 0 for key in _COUNTS}
+    status |= {key: _number(said[key], int, float) for key in _MEASURED if key in said}
+    status |= {key: str(said[key])[:64] for key in _WORDS if key in said}
+    return {"state": "opening", "last_unit_age_s": None} | status
+
+
+def _number(value: Any, *kinds: type) -> Any:
+    """The value, if it is a number that can be; else None."""
+    return value if type(value) in kinds and -_MOST < value < _MOST else None
+
+
 class SourceWatch:
     """Takes a source's statuses and units as the log gives them."""
 
@@ -140,7 +157,7 @@ class SourceWatch:
 
     def add_status(self, time_ns: int, status: dict[str, Any]) -> None:
         """A status of it."""
-        self._statuses.append((time_ns, status))
+        self._statuses.append((time_ns, usable_status(status)))
 
     def plain(self, now_ns: int) -> dict[str, Any]:
         """For ``--json``; ``now_ns`` is host time."""
@@ -167,7 +184,7 @@ class SourceWatch:
     def _age_s(self, now_ns: int, status: dict[str, Any]) -> float | None:
         last_ns = self._last_ns
         told_s = status.get("last_unit_age_s")
-        if last_ns is None and isinstance(told_s, (int, float)):
+        if last_ns is None and told_s is not None:
             last_ns = self._statuses[-1][0] - round(told_s * 1e9)
         return None if last_ns is None else max(0.0, round((now_ns - last_ns) * 1e-9, 2))
 

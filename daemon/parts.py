@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -14,11 +15,13 @@ from pathlib import Path, PurePath
 from daemon.channels import ChannelTable
 from daemon.log.durable import sync_directory
 from daemon.log.encode import EncodedBlock
-from daemon.log.format import SessionInfo
+from daemon.log.format import MAX_PART, SessionInfo
 from daemon.log.writer import PartWriter
 from daemon.places import keep_directory
 
 RECORDING_SIGN = "recording.json"
+_MOST_SIGN_BYTES = 4096
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,200}")  # of a session or a part, as the recorder makes them
 _DROP_CACHE_AFTER_S = 60.0
 
 
@@ -44,11 +47,17 @@ class Sign:
 def read_sign(directory: Path) -> Sign | None:
     """The sign of a directory; None where nothing is being recorded, or it is none of ours."""
     try:
-        said = json.loads((directory / RECORDING_SIGN).read_text())
-        name = PurePath(said["path"]).name
-        return Sign(str(said["session_id"]), int(said["part"]), directory / name, str(said["boot_id"]))
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        with (directory / RECORDING_SIGN).open("rb") as file:
+            said = json.loads(file.read(_MOST_SIGN_BYTES))
+        sign = Sign(said["session_id"], said["part"], directory / PurePath(said["path"]).name, str(said["boot_id"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
+    names = isinstance(sign.session_id, str) and _NAME.fullmatch(sign.session_id) and _NAME.fullmatch(sign.path.stem)
+    return (
+        sign
+        if names and sign.path.suffix == ".mcap" and type(sign.part) is int and 0 <= sign.part <= MAX_PART
+        else None
+    )
 
 
 @dataclass(slots=True)

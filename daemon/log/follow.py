@@ -208,7 +208,7 @@ class LogFollower:
     def _go_on(self, part: PartFollower, sign: Sign) -> Iterator[LogBatch]:
         """The session's next part, where it is wanted and there; else what is growing now."""
         following = self._directory / f"{part.info.session_id}_{part.number + 1}.mcap"
-        if sign.path == following or (self._every_part and part.ended and following.exists()):
+        if sign.path == following or (self._every_part and part.ended and os.path.exists(following)):
             yield from self._open(following, tail=False)
         else:
             yield from self._open(sign.path, tail=not self._every_part)

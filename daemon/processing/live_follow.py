@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import struct
 import time
 from collections import deque
@@ -30,6 +31,7 @@ _CACHE_STEP = 8 << 20
 _CACHE_LIMIT = 4 << 30
 _HEAD = struct.Struct("<BQ")
 _PEEK_BYTES = _HEAD.size + 16
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,5}")  # of a part
 _PAGE = os.sysconf("SC_PAGESIZE")
 
 
@@ -229,9 +231,9 @@ class LiveFollower:
             return False
         session_id = part.info.session_id
         following = self._directory / f"{session_id}_{part.number + 1}.mcap"
-        if not following.exists() and sign is not None and sign.session_id == session_id:
+        if not os.path.exists(following) and sign is not None and sign.session_id == session_id:
             following = sign.path  # a name that was taken is passed over
-        if following.exists() and following != part.path:
+        if os.path.exists(following) and following != part.path:
             return self._open(following) is not None
         self.ended = "the recording has ended" if part.is_read else "the recorder is gone, and its log has no end"
         return False
@@ -257,10 +259,10 @@ def _opened(path: Path) -> LivePart | None:
 
 def _parts_before(directory: Path, sign: Sign) -> Iterator[Path]:
     """Parts of the session that is recorded, the first one first."""
-    for number in range(sign.part):
-        path = directory / f"{sign.session_id}_{number}.mcap"
-        if path.exists():
-            yield path
+    names = (path.stem.rpartition("_")[2] for path in directory.glob(f"{sign.session_id}_*.mcap"))
+    for number in sorted(int(name) for name in names if _NUMBER.fullmatch(name)):
+        if number < sign.part:
+            yield directory / f"{sign.session_id}_{number}.mcap"
 
 
 # ---------------------------------------------------------------------------------------------- page cache

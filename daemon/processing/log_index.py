@@ -209,18 +209,19 @@ def _from_summary(file: BinaryIO, size: int, part: int) -> tuple[PartChannels, l
                 indexes.append(parse_record(records.ChunkIndex, record.body))
     except LogError:
         return None
-    if not indexes or not _follow_each_other(indexes):
+    if not indexes or not _follow_each_other(indexes, size):
         return None
     return known, [_place(index, part, known) for index in indexes]
 
 
-def _follow_each_other(indexes: Sequence[records.ChunkIndex]) -> bool:
+def _follow_each_other(indexes: Sequence[records.ChunkIndex], size: int) -> bool:
+    """And lie in a file of so many bytes."""
     at = 0
     for index in indexes:
         if index.chunk_start_offset < at or not index.message_index_offsets:
             return False
         at = index.chunk_start_offset + index.chunk_length
-    return True
+    return at <= size
 
 
 def _place(index: records.ChunkIndex, part: int, known: PartChannels) -> ChunkPlace:

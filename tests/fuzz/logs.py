@@ -59,13 +59,13 @@ BATCHES = 4000  # read of one input; a log has no bound, a test has
 
 def log_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """The one there is."""
-    yield "log", lambda: Target("log", _seeds(), mutate_log, run, None, lambda size: (48 << 20) + 200 * size)
+    yield "log", lambda: Target("log", log_seeds(), mutate_log, run, None, lambda size: (48 << 20) + 200 * size)
 
 
 # --- seeds ----------------------------------------------------------------------------------------------------------
 
 
-def _seeds() -> list[bytes]:
+def log_seeds() -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         made = []
         for number, (compression, finish) in enumerate(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from tests.fuzz.asked import asked_targets
 from tests.fuzz.engine import Target
 from tests.fuzz.files import file_targets
+from tests.fuzz.followed import followed_targets
 from tests.fuzz.logs import log_targets
 from tests.fuzz.office import office_targets
 from tests.fuzz.office_files import office_file_targets
@@ -18,6 +19,7 @@ def all_targets() -> dict[str, Callable[[], Target]]:
     return {
         **dict(parser_targets()),
         **dict(log_targets()),
+        **dict(followed_targets()),
         **dict(file_targets()),
         **dict(asked_targets()),
         **dict(office_targets()),

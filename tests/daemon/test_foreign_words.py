@@ -1,0 +1,91 @@
+"""What others say to the recorder's commands: an answer, a sign, a status, a text from anywhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon import control_client
+from daemon.control_client import ask
+from daemon.errors import ExitCode, UserError, one_line
+from daemon.monitor_source import usable_status
+from daemon.parts import RECORDING_SIGN, read_sign
+from daemon.processing.live_follow import _parts_before
+
+ANSWER = {"ok": True, "session_id": "a", "part": 3, "recording": True, "reason": "", "time_ns": 5, "text": "x"}
+SIGN = {"session_id": "a-20261121T100000Z-ab12", "part": 1, "path": "a_1.mcap", "boot_id": "b"}
+
+
+def test_a_line_from_anywhere_can_be_written_anywhere() -> None:
+    assert one_line("a\nb\x1b[2J\u2028σ") == "a b [2J σ"
+    assert one_line("/mnt/\udcff.mcap").encode() == rb"/mnt/\udcff.mcap"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [],
+        {},
+        {"ok": 1},
+        {**ANSWER, "part": True},
+        {**ANSWER, "time_ns": 1e300},
+        {**ANSWER, "time_ns": -1},
+        {"ok": False},
+    ],
+)
+def test_what_is_no_answer_of_a_recorder_is_told(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control_client, "_exchange", lambda *_: json.dumps(answer).encode())
+    with pytest.raises(UserError, match="no recorder of this version; start it anew after an update") as refused:
+        ask(Path("/logs"), {"command": "mark", "text": "x"})
+    assert refused.value.exit_code == ExitCode.IO
+
+
+def test_an_answer_has_what_was_asked_for_in_texts_of_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = json.dumps({**ANSWER, "text": "a\x1b\nb", "more": 1}).encode()
+    monkeypatch.setattr(control_client, "_exchange", lambda *_: said)
+    assert ask(Path("/logs"), {"command": "mark"}) == {**ANSWER, "text": "a b"}
+    assert "time_ns" not in ask(Path("/logs"), {"command": "split"})
+
+
+def test_a_connection_that_ends_without_a_word_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control_client, "_exchange", lambda *_: b"")
+    with pytest.raises(UserError, match="the recorder there does not answer"):
+        ask(Path("/logs"), {"command": "split"})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"part": value} for value in (-1, 1_000_000, True, 1.0, "1", None)),
+        *({"path": value} for value in ("a_1.txt", "a\0.mcap", "\ud800.mcap", "..", "", 3)),
+        *({"session_id": value} for value in ("../a", "a/b", "", "a\0", 5, "a" * 300)),
+    ],
+)
+def test_a_sign_that_no_recorder_made_is_none(changes: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN))
+    assert read_sign(tmp_path) is not None
+    (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN | changes))
+    assert read_sign(tmp_path) is None
+
+
+def test_parts_before_are_those_that_are_there(tmp_path: Path) -> None:
+    """However high a number the sign names, each file is looked at once."""
+    (tmp_path / RECORDING_SIGN).write_text(json.dumps(SIGN | {"part": 999_999}))
+    sign = read_sign(tmp_path)
+    assert sign is not None
+    names = [f"{sign.session_id}_{number}.mcap" for number in (0, 2, 10, 999_999, "01", "x")]
+    for name in [*names, "other_0.mcap"]:
+        (tmp_path / name).touch()
+    assert [path.name for path in _parts_before(tmp_path, sign)] == names[:3]
+
+
+def test_of_a_status_stays_what_can_be_shown() -> None:
+    good = {"units": 5, "bytes": 7, "lost_kernel": 1, "lost_queue": 0, "lost_write": 0, "state": "receiving"}
+    assert usable_status({**good, "time_sigma_ns": 5.5}) == {**good, "last_unit_age_s": None, "time_sigma_ns": 5.5}
+    strange = usable_status(
+        {"units": "5", "bytes": True, "lost_write": 1 << 70, "last_unit_age_s": float("nan"), "state": []}
+    )
+    assert strange == dict.fromkeys(good, 0) | {"state": "[]", "last_unit_age_s": None}
