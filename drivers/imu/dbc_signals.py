@@ -9,6 +9,7 @@ and bits go on downwards into the next byte.
 from __future__ import annotations
 
 import difflib
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,6 +161,7 @@ def load_database(contents: bytes, key: str = "dbc") -> Any:
     import cantools.database as dbc  # heavy, and needed only where a DBC is
     from cantools.database import errors
 
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # of a message there twice `find_signal` tells, if it matters
     try:
         text = contents.decode("utf-8")
     except UnicodeDecodeError:
@@ -167,7 +169,7 @@ def load_database(contents: bytes, key: str = "dbc") -> Any:
     try:
         return dbc.load_string(text, database_format="dbc", strict=False)
     except (errors.Error, ValueError) as error:
-        raise DriverSettingsError(f"{key}: not a DBC file ({error})") from error
+        raise DriverSettingsError(f"{key}: not a DBC file ({' '.join(str(error).split())})") from error
 
 
 def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
@@ -180,6 +182,8 @@ def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
     if not dot or not signal_name:
         raise DriverSettingsError(f"signal {path!r} is not of the form MESSAGE.signal")
     messages = {message.name: message for message in database.messages}
+    if sum(message.name == message_name for message in database.messages) > 1:
+        raise DriverSettingsError(f"message {message_name} stands in {file_name} more than once; want it once")
     if message_name not in messages:
         raise DriverSettingsError(f"no message {message_name} in {file_name}{_instead(message_name, messages, 'it')}")
     message = messages[message_name]

@@ -18,6 +18,7 @@ from drivers.core.parser import DriverSettingsError
 from drivers.scanner.beams import BeamTable, beam_table
 from drivers.scanner.velodyne_heads import SpinningHead
 
+_MOST_BYTES = 256 * 1024  # ten times the file of 128 lasers
 _KEYS = (  # in the XML without its trailing underscore, in the YAML, the XML's unit
     ("vertCorrection", "vert_correction", math.pi / 180),
     ("rotCorrection", "rot_correction", math.pi / 180),
@@ -35,6 +36,10 @@ def read_calibration(data: bytes, head: SpinningHead) -> BeamTable:
     Raises:
         DriverSettingsError: it is none, or not this model's; two-point corrections (of an HDL-64E) are not known here.
     """
+    if len(data) > _MOST_BYTES:
+        raise DriverSettingsError(
+            f"geometry.file: of {len(data)} bytes; a Velodyne head's has fewer than {_MOST_BYTES}"
+        )
     try:
         resolution_m, lasers = _read_xml(data) if data.lstrip()[:1] == b"<" else _read_yaml(data)
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError, ElementTree.ParseError) as error:
@@ -74,8 +79,16 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
     """Distance resolution in metres, and corrections by laser id."""
     import yaml  # only where a head has such a file
 
+    class Plain(yaml.SafeLoader):  # type: ignore[misc]
+        """Without aliases: by them a file of a few lines can mean more values than memory holds."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError("has an alias; want every value where it belongs")
+            return super().compose_node(parent, index)
+
     try:
-        table = yaml.safe_load(data)
+        table = yaml.load(data, Plain)
     except yaml.YAMLError as error:
         raise ValueError(str(error).replace("\n", " ")) from error
     lasers: dict[int, dict[str, float]] = {}

@@ -138,3 +138,14 @@ def test_nested_multiplexing_is_refused() -> None:
     )
     with pytest.raises(DriverSettingsError, match=r"M.C: nested multiplexing"):
         find_signal(load_database(text.encode()), "M.C", "imu.dbc")
+
+
+def test_a_message_that_stands_twice_is_refused_where_it_is_needed(caplog: pytest.LogCaptureFixture) -> None:
+    """Which of the two a frame means nobody can say; of others nothing is said at all."""
+    message = IMU_DBC[IMU_DBC.index("BO_ ") :].split("\n\n")[0]
+    name = message.split()[2].rstrip(":")
+    database = load_database(f"{IMU_DBC}\n\n{message}\n".encode())
+    assert not caplog.records
+    signal = message.split("SG_ ")[1].split()[0]
+    with pytest.raises(DriverSettingsError, match=rf"^message {name} stands in imu.dbc more than once; want it once$"):
+        find_signal(database, f"{name}.{signal}", "imu.dbc")

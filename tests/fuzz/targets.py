@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tests.fuzz.asked import asked_targets
+from tests.fuzz.device_files import device_file_targets
 from tests.fuzz.engine import Target
 from tests.fuzz.files import file_targets
 from tests.fuzz.followed import followed_targets
@@ -21,6 +22,7 @@ def all_targets() -> dict[str, Callable[[], Target]]:
         **dict(log_targets()),
         **dict(followed_targets()),
         **dict(file_targets()),
+        **dict(device_file_targets()),
         **dict(asked_targets()),
         **dict(office_targets()),
         **dict(office_file_targets()),
