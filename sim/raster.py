@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,9 @@ FloatArray = NDArray[np.float64]
 Place = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 
 KEY = "terrain.raster"
+MOST_PIXELS = 100_000_000  # 800 MB of heights
+FARTHEST = 1e9  # units of the coordinates, of any map there is
+FARTHEST_HEIGHT_M = 100_000.0
 _CORNERS = ("south-west", "south-east", "north-west", "north-east")
 
 
@@ -151,28 +155,57 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
     """The pixels under the corners (4, 2) of the grid."""
     try:
         import rasterio
-        from rasterio.windows import Window
     except ImportError:
         raise PlanError(KEY, "rasters need rasterio; want pip install 'swath[raster]', or no raster") from None
     path = plan.folder / plan.tables.terrain.raster
     if not path.is_file():
         raise PlanError(KEY, f"there is no file {path}; want a GeoTIFF, its path relative to the plan")
     try:
-        with rasterio.open(path) as source:
-            _check_crs(source.crs, to_crs.crs, path)
-            easting, northing = to_crs(corners[:, 0], corners[:, 1], np.full(4, height_m))
-            edges = _Edges(source.transform)
-            column, row = edges(easting, northing)
-            _check_cover(np.stack([column, row], axis=1), (source.width, source.height), easting, northing, path)
-            first = np.floor([min(column), min(row)]).astype(int) - 2
-            last = np.ceil([max(column), max(row)]).astype(int) + 2
-            first, last = np.maximum(first, 0), np.minimum(last, [source.width, source.height])
-            window = Window(*map(int, first), *map(int, last - first))
-            values = source.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
-            return _Pixels(values, first, edges)
-    except rasterio.errors.RasterioError as error:
-        reason = str(error).splitlines()[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                _check_crs(source.crs, to_crs.crs, path)
+                _check_pixels(source, path)
+                easting, northing = to_crs(corners[:, 0], corners[:, 1], np.full(4, height_m))
+                edges = _Edges(source.transform)
+                column, row = edges(easting, northing)
+                _check_cover(np.stack([column, row], axis=1), (source.width, source.height), easting, northing, path)
+                first = np.floor([min(column), min(row)]).astype(int) - 2
+                last = np.ceil([max(column), max(row)]).astype(int) + 2
+                first, last = np.maximum(first, 0), np.minimum(last, [source.width, source.height])
+                return _Pixels(_window(source, first, last - first, path), first, edges)
+    except PlanError:
+        raise
+    except rasterio.errors.NotGeoreferencedWarning:
+        raise PlanError(KEY, f"{path} does not say where it lies; want a GeoTIFF of heights") from None
+    except (rasterio.errors.RasterioError, CRSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise PlanError(KEY, f"{path} cannot be read: {reason}; want a GeoTIFF of heights") from None
+
+
+def _window(source: Any, first: NDArray[np.int64], size: NDArray[np.int64], path: Path) -> FloatArray:
+    """(rows, columns) of the first band, nan where it has none, or none of this Earth: a mark that it does not name."""
+    from rasterio.windows import Window
+
+    columns, rows = map(int, size)
+    if columns * rows > MOST_PIXELS:
+        raise PlanError(KEY, f"{path} has {columns} × {rows} pixels under the swaths; want at most {MOST_PIXELS}")
+    window = Window(*map(int, first), columns, rows)
+    with np.errstate(invalid="ignore"):  # a NaN of any kind is none
+        values: FloatArray = source.read(1, window=window, out_dtype="float64")
+    values[(source.read_masks(1, window=window) == 0) | ~(np.abs(values) < FARTHEST_HEIGHT_M)] = np.nan
+    return values
+
+
+def _check_pixels(source: Any, path: Path) -> None:
+    """Whether they can be heights of places on a map."""
+    place = source.transform
+    steps, corner = np.abs([place.a, place.b, place.d, place.e]), np.abs([place.c, place.f])
+    area = abs(place.a * place.e - place.b * place.d) if steps.max() < FARTHEST else 0.0
+    if not (1 / FARTHEST < area and corner.max() < FARTHEST):
+        raise PlanError(KEY, f"{path} has pixels that lie nowhere: {tuple(place)[:6]}; want a GeoTIFF of heights")
+    if not source.dtypes[0].startswith(("int", "uint", "float")):
+        raise PlanError(KEY, f"{path} has pixels of type {source.dtypes[0]}; want a GeoTIFF of heights")
 
 
 def _check_crs(found: Any, wanted: CRS, path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,8 @@ from georef.coarse_terrain import CoarseTerrain
 
 FloatArray = NDArray[np.float64]
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer
+FARTHEST = 1e9  # units of the coordinates, of any map there is
+FARTHEST_HEIGHT_M = 100_000.0
 KEY = "mta.terrain"
 
 
@@ -48,25 +52,46 @@ def read_terrain(path: Path) -> CoarseTerrain:
     """A terrain model of a raster's first band, its nodes at the pixels' centres.
 
     Raises:
-        ConfigError: ``mta.terrain``, one line: no rasterio, no raster, no CRS, turned, or too large.
+        ConfigError: ``mta.terrain``, one line: no rasterio, no heights, no CRS, no place, turned, or too large.
     """
     try:
         import rasterio
     except ImportError as error:
         raise ConfigError(f"{KEY}: reading {path} needs rasterio: pip install 'swath[raster]'") from error
     try:
-        with rasterio.open(path) as raster:
-            if raster.crs is None:
-                raise ConfigError(f"{KEY}: {path} has no CRS; want a GeoTIFF that says its own")
-            if raster.transform.b or raster.transform.d:
-                raise ConfigError(f"{KEY}: {path} is turned against its axes; want columns east and rows north")
-            if raster.width * raster.height > MAX_NODES:
-                raise ConfigError(f"{KEY}: {path} has {raster.width} × {raster.height} pixels; want a coarse model")
-            height_m = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            transform, wkt = raster.transform, raster.crs.to_wkt()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path) as raster:
+                _check(raster, path)
+                transform, wkt = raster.transform, raster.crs.to_wkt()
+                height_m = _heights(raster)
         first = (transform.c + 0.5 * transform.a, transform.f + 0.5 * transform.e)
         return CoarseTerrain(height_m, first, (transform.a, transform.e), ToGrid(wkt))
+    except rasterio.errors.NotGeoreferencedWarning as error:
+        raise ConfigError(f"{KEY}: {path} does not say where it lies; want a GeoTIFF that does") from error
     except (rasterio.errors.RasterioError, CRSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{KEY}: {path} cannot be read: {str(error).splitlines()[0]}") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"{KEY}: {path} cannot be read: {reason}") from error
+
+
+def _check(raster: Any, path: Path) -> None:
+    """Whether it can be a grid of heights in a map; raises ConfigError."""
+    place = raster.transform
+    if raster.crs is None:
+        raise ConfigError(f"{KEY}: {path} has no CRS; want a GeoTIFF that says its own")
+    if place.b or place.d:
+        raise ConfigError(f"{KEY}: {path} is turned against its axes; want columns east and rows north")
+    if not (max(abs(place.c), abs(place.f)) < FARTHEST and all(1 / FARTHEST < abs(x) < FARTHEST for x in place[:5:4])):
+        raise ConfigError(f"{KEY}: {path} has pixels of {place.a:g} × {place.e:g} from {place.c:g}, {place.f:g} on")
+    if raster.width * raster.height > MAX_NODES:
+        raise ConfigError(f"{KEY}: {path} has {raster.width} × {raster.height} pixels; want a coarse model")
+    if not raster.dtypes[0].startswith(("int", "uint", "float")):
+        raise ConfigError(f"{KEY}: {path} has pixels of type {raster.dtypes[0]}; want heights")
+
+
+def _heights(raster: Any) -> FloatArray:
+    """(rows, columns) of its first band, nan where it has none, or none of this Earth: a mark that it does not name."""
+    with np.errstate(invalid="ignore"):  # a NaN of any kind is none
+        height_m: FloatArray = raster.read(1, out_dtype="float64")
+    height_m[(raster.read_masks(1) == 0) | ~(np.abs(height_m) < FARTHEST_HEIGHT_M)] = np.nan
+    return height_m

@@ -54,12 +54,18 @@ def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> 
     [
         ({"crs": None}, "has no CRS; want a GeoTIFF that says its own"),
         ({"transform": Affine(20.0, 10.0, 0.0, 10.0, -20.0, 0.0)}, "is turned against its axes"),
+        ({"transform": Affine(1e300, 0.0, 0.0, 0.0, -1.0, 0.0)}, r"has pixels of 1e\+300 × -1 from 0, 0 on"),
     ],
 )
 def test_what_is_no_terrain_is_refused(tmp_path: Path, others: dict[str, Any], words: str) -> None:
     write(tmp_path / "dem.tif", **others)
     with pytest.raises(ConfigError, match=words):
         read_terrain(tmp_path / "dem.tif")
+
+
+def test_a_raster_that_lies_nowhere_is_refused() -> None:
+    with pytest.raises(ConfigError, match="does not say where it lies; want a GeoTIFF that does"):
+        read_terrain(Path(__file__).parents[1] / "fuzz/seeds/terrain/nowhere")
 
 
 def test_what_is_no_raster_is_one_line(tmp_path: Path) -> None:

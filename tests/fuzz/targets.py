@@ -13,6 +13,7 @@ from tests.fuzz.logs import log_targets
 from tests.fuzz.office import office_targets
 from tests.fuzz.office_files import office_file_targets
 from tests.fuzz.parsers import parser_targets
+from tests.fuzz.rasters import raster_targets
 
 
 def all_targets() -> dict[str, Callable[[], Target]]:
@@ -26,4 +27,5 @@ def all_targets() -> dict[str, Callable[[], Target]]:
         **dict(asked_targets()),
         **dict(office_targets()),
         **dict(office_file_targets()),
+        **dict(raster_targets()),
     }
