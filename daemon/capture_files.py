@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import Any
 
 from daemon.capture_routes import Port, Routes
 from daemon.captures import Capture, has_times
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 from daemon.exporting import MANIFEST
 from daemon.log.format import LogError, safe_attachment_path
 from daemon.sidecar import SUFFIX
@@ -61,7 +62,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
                 source = capture.port.source if capture.port is not None else ""
                 found[capture.path, source, capture.selector] = capture
         except (UserError, TransportError) as error:
-            wrong += str(error).splitlines()
+            wrong.append(one_line(str(error)))
     if not found and not wrong:
         wrong.append("nothing to import: give captures, or the folder of an export")
     if wrong:
@@ -176,7 +177,7 @@ def _exported(routes: Routes, folder: Path, name: str, entry: dict[str, Any]) ->
         path = safe_attachment_path(folder, name)
     except LogError as error:
         raise UserError(f"{folder / MANIFEST}: names {name!r}, which is not in its folder") from error
-    if not path.is_file() or name.endswith(SUFFIX):
+    if not os.path.isfile(path) or name.endswith(SUFFIX):
         raise UserError(f"{path}: {MANIFEST} names it and it is not there")
     if kind == "pcap":
         return Capture(path, "pcap")

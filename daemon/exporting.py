@@ -6,6 +6,7 @@ that `swath import` makes the same units of it again.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -27,6 +28,8 @@ from daemon.replay import source_of_topic
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"
 _UNFINISHED = ".part"
+_MOST_NAME_BYTES = 200  # what is made of it is longer, and no file system takes more than 255
+_NO_PLACE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR)  # a stranger's name, or two that collide
 
 
 @dataclass(slots=True)
@@ -60,6 +63,8 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
         OSError: it cannot be written; nothing is left of it.
     """
     target = safe_attachment_path(directory, session.session_id)
+    if target.parent != directory or len(os.fsencode(target.name)) > _MOST_NAME_BYTES:
+        raise LogError(f"session {session.session_id[:60]!r}: is no name of a folder; nothing is written for it")
     unfinished = target.with_name(target.name + _UNFINISHED)
     for path in (target, unfinished):
         if os.path.lexists(path):
@@ -165,6 +170,8 @@ class _Export:
             written = [self._write_attachment(place, data) for place in reversed(places[name])]
             if not all(written[:-1]):
                 self._report.notes.append(f"config.toml names {name} elsewhere: change it before `swath import`")
+            if not written[-1]:
+                self._report.notes.append(f"attachment {name[:60]!r} is left out: no file can be called so here")
 
     def _write_attachment(self, place: str, data: bytes) -> bool:
         """Below the folder only; whether it is there now."""
@@ -172,7 +179,12 @@ class _Export:
             path = safe_attachment_path(self._folder / CONFIG_FOLDER, place)
         except LogError:
             return False
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            path.write_bytes(data)
-        return True
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not path.exists():
+                path.write_bytes(data)
+        except OSError as error:
+            if error.errno not in _NO_PLACE:
+                raise
+            return False
+        return path.is_file()

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from tests.fuzz.asked import asked_targets
 from tests.fuzz.device_files import device_file_targets
 from tests.fuzz.engine import Target
+from tests.fuzz.exports import export_targets
 from tests.fuzz.files import file_targets
 from tests.fuzz.followed import followed_targets
 from tests.fuzz.logs import log_targets
@@ -23,6 +24,7 @@ def all_targets() -> dict[str, Callable[[], Target]]:
         **dict(log_targets()),
         **dict(followed_targets()),
         **dict(file_targets()),
+        **dict(export_targets()),
         **dict(device_file_targets()),
         **dict(asked_targets()),
         **dict(office_targets()),
