@@ -1,6 +1,8 @@
 """Inputs nobody would send: everything that reads bytes of others is run on what a seed and a mutation make.
 
 `parsers` (every driver, found by what it declares), `logs` (reader and recovery), `files` (captures, configuration),
-`office` and `office_files` (what people bring to the office's commands);
+`followed` (a log that grows, and its sign), `exports` (a log as other people's files, and back), `asked` (operators,
+casters, receivers that answer), `device_files` and `rasters` (files that configurations name), `office` and
+`office_files` (what people bring to the office's commands);
 `engine` runs them. ``python -m tests.fuzz`` is the long run, `test_fuzz` the short one of the suite.
 """

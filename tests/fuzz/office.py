@@ -23,6 +23,7 @@ from calib.record_values import Matrix, Value
 from daemon.processing.calibrate_inputs import PolygonError, read_polygons, text_of
 from daemon.processing.calibrate_record import facts_of
 from daemon.processing.flights import _given_strips
+from daemon.processing.model_file import read_model
 from daemon.processing.validate_run import _entry, read_file
 from daemon.sim_plans import Wish
 from georef.beams import GeometryError, read_fibres
@@ -46,6 +47,7 @@ def office_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     yield "calibration", _calibration
     yield "calibration-history", _histories
     yield "calibration-facts", _facts
+    yield "model", _model
     yield "calibration-record", _record
     yield "plan", _plan
 
@@ -184,6 +186,22 @@ def _histories() -> Target:
             yield f"{len(one.entries)} of {one.installation[:8]}, {'moved' if one.moved else 'not moved'}"
 
     return text_target("calibration-history", seeds, TOML, read, HistoryError, mistakes_a_line=True)
+
+
+def _model() -> Target:
+    """What `--model` says is to be estimated."""
+    text = (
+        'model = "full"\n[parameters]\nomega_deg = "free"\nleft.phi_deg = "fixed"\n"left.kappa_deg" = { prior = 0.1 }\n'
+        "[ibrc]\nknots = [0.0, 100.0, 200.5]\nreference = 100\n[range_offset]\nreturn_slots = [2]\nmta_zones = [0, 1]\n"
+        '[beam]\nestimate = ["azimuth_deg", "range_m"]\n'
+    )
+
+    def read(path: Path) -> Iterator[str]:
+        tables = read_model(path)
+        yield f"{tables.model}, {len(tables.parameters)} parameters"
+        yield from (f"{tables.ibrc is None} {tables.range_offset is None} {tables.beam is None}",)
+
+    return text_target("model", [text.encode()], TOML, read, mistakes_a_line=True)
 
 
 # --- what is told of them -------------------------------------------------------------------------------------------
