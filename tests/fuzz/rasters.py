@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rasterio
@@ -62,7 +62,7 @@ def _raster(**kind: Any) -> bytes:
 
 def _changed(rng: random.Random, base: bytes) -> bytes:
     """Mostly an entry of the directory, or what stands right behind it; TIFF 6.0, section 2."""
-    order = "little" if base[:2] == b"II" else "big"
+    order: Literal["little", "big"] = "little" if base[:2] == b"II" else "big"
     at = int.from_bytes(base[4:8], order)
     count = int.from_bytes(base[at : at + 2], order)
     if rng.random() < 0.3 or not 0 < count < 60 or at + 2 + 12 * count > len(base):
