@@ -29,6 +29,7 @@ MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"
 _UNFINISHED = ".part"
 _MOST_NAME_BYTES = 200  # what is made of it is longer, and no file system takes more than 255
+_MOST_PLACE = 500  # characters of a name with its folders, which are made one in the other
 _NO_PLACE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR)  # a stranger's name, or two that collide
 
 
@@ -178,6 +179,8 @@ class _Export:
         try:
             path = safe_attachment_path(self._folder / CONFIG_FOLDER, place)
         except LogError:
+            return False
+        if len(place) > _MOST_PLACE:
             return False
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
