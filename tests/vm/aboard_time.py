@@ -11,7 +11,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.vm.aboard import keep, main, recording, say, session, sh, wait_until
+from tests.vm.aboard import SHARED, keep, main, recording, say, session, sh, wait_until
 
 PARAMETERS = Path("/sys/module/pps_sim/parameters")
 DELAY_S = 0.15  # of a message after its edge
@@ -141,6 +141,18 @@ def edges(module: str) -> None:
     keep("told", {"utc_minus_monotonic_ns": offset_ns, **times})
 
 
+def ahead_of_outside_ns() -> int:
+    """This machine's wall clock less that of the computer outside, whose file system stamps what is written there."""
+    place, found = SHARED / "stamped", []
+    for number in range(50):
+        before_ns = time.time_ns()
+        place.write_text(str(number))
+        stamp_ns = place.stat().st_mtime_ns
+        after_ns = time.time_ns()
+        found.append((after_ns - before_ns, (before_ns + after_ns) // 2 - stamp_ns))
+    return min(found)[1]
+
+
 def serial(kind: str, seconds: str) -> None:
     """The receiver stands outside, at /dev/ttyS1: NMEA, and its pulse on DCD."""
     line = None
@@ -153,6 +165,7 @@ def serial(kind: str, seconds: str) -> None:
         with recording(session() + DEVICES.format(pps=pps, port="/dev/ttyS1")):
             say("recording")
             time.sleep(float(seconds))
+            keep("told", {"ahead_ns": ahead_of_outside_ns()})
     finally:
         if line is not None:
             line.terminate()

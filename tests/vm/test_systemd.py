@@ -148,6 +148,15 @@ def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
     assert shown(service, "NRestarts") == "0"
 
 
+@pytest.fixture
+def without_live(service: Machine) -> Iterator[None]:
+    """The live service compiles for a quarter of an hour here, beside which a repair takes minutes."""
+    service.told("systemctl mask --runtime --now swath-live", COMES_BACK_S)
+    yield
+    service.told("systemctl unmask --runtime swath-live; systemctl start --no-block swath-live")
+
+
+@pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
 def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place: Path, thread: str) -> None:
     """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
