@@ -9,12 +9,17 @@ set -eu
 
 DESTDIR=${DESTDIR-}
 PREFIX=${PREFIX:-/opt/swath}
+PREFIX=${PREFIX%/}
 PYTHON=${PYTHON:-/usr/bin/python3}
 EXTRAS=${EXTRAS-process,live}
 cache=/var/cache/swath-live
 source=$(cd "$(dirname "$0")/.." && pwd)
 
+program=$DESTDIR$PREFIX
+building=$program.building # beside it: on the same disk, so that a rename puts it in place
+
 fail() { echo "swath: $*" >&2; exit 1; }
+case $PREFIX in /?*) ;; *) fail "PREFIX must be the absolute path of a folder of its own, as /opt/swath" ;; esac
 
 # file in this folder -> place on the computer; uninstall removes exactly these
 placed() {
@@ -42,34 +47,60 @@ check_python() {
     esac
 }
 
-# The project is copied before it is built, so that nothing is left in the source tree.
+# Also when it fails or is interrupted: the program that was there is in its place.
+leave_whole() {
+    [ -e "$program" ] || [ ! -e "$program.old" ] || mv "$program.old" "$program"
+    rm -rf "$work" "$building"
+}
+
+# The project is copied before it is built, so that nothing is left in the source tree. The program that is there stays
+# until the other one is whole, so that the aircraft is never without one.
 install_program() {
-    echo "installing the program into $DESTDIR$PREFIX"
+    echo "installing the program into $program"
+    if [ -d "$program" ] && [ ! -e "$program/pyvenv.cfg" ] && [ -n "$(ls -A "$program")" ]; then
+        fail "$program holds something else; give PREFIX a folder of its own, as /opt/swath"
+    fi
     work=$(mktemp -d)
-    trap 'rm -rf "$work"' EXIT
+    trap leave_whole EXIT
+    trap 'exit 129' HUP
+    trap 'exit 130' INT
+    trap 'exit 143' TERM
     mkdir "$work/swath"
     for item in pyproject.toml README.md LICENSE calib daemon drivers georef sim; do
         cp -R "$source/$item" "$work/swath/"
     done
-    if [ -d "$DESTDIR$PREFIX" ] && [ ! -e "$DESTDIR$PREFIX/pyvenv.cfg" ] && [ -n "$(ls -A "$DESTDIR$PREFIX")" ]; then
-        fail "$DESTDIR$PREFIX holds something else; give PREFIX a folder of its own, as /opt/swath"
-    fi
-    rm -rf "$DESTDIR$PREFIX"
-    mkdir -p "$DESTDIR$PREFIX"
-    chmod 0755 "$DESTDIR$PREFIX"
+    build_program
+    put_in_place
+}
+
+build_program() {
+    rm -rf "$building"
+    mkdir -p "$building"
+    chmod 0755 "$building"
     {
-        "$PYTHON" -m venv "$DESTDIR$PREFIX" &&
+        "$PYTHON" -m venv "$building" --prompt swath &&
             PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore \
-                "$DESTDIR$PREFIX/bin/python" -m pip install -q "$work/swath${EXTRAS:+[$EXTRAS]}"
-    } >"$work/log" 2>&1 </dev/null || { cat "$work/log" >&2; fail "the program could not be installed; pip's words are above"; }
-    if [ -n "$DESTDIR" ]; then # its scripts must name the place where they will be
-        grep -rlIF "$DESTDIR$PREFIX" "$DESTDIR$PREFIX/bin" "$DESTDIR$PREFIX/pyvenv.cfg" | while read -r file; do
-            [ -L "$file" ] || sed -i "s#$DESTDIR$PREFIX#$PREFIX#g" "$file"
-        done
-    fi
-    documents="$DESTDIR$PREFIX/share/doc/swath"
+                "$building/bin/python" -m pip install -q "$work/swath${EXTRAS:+[$EXTRAS]}"
+    } >"$work/log" 2>&1 </dev/null || {
+        cat "$work/log" >&2
+        [ ! -e "$program/pyvenv.cfg" ] || echo "swath: the program in $program stays as it was" >&2
+        fail "the program could not be installed; pip's words are above"
+    }
+    # its scripts must name the place where they will be
+    grep -rlIF "$building" "$building/bin" "$building/pyvenv.cfg" | while read -r file; do
+        [ -L "$file" ] || sed -i "s#$building#$PREFIX#g" "$file"
+    done
+    documents="$building/share/doc/swath"
     mkdir -p "$documents"
     cp -R "$source/README.md" "$source/LICENSE" "$source/docs" "$documents/"
+}
+
+put_in_place() {
+    rm -rf "$program.old"
+    [ -n "$DESTDIR" ] || sync -f "$building" # a power cut must not find half of it on the disk
+    [ ! -d "$program" ] || mv "$program" "$program.old"
+    mv "$building" "$program"
+    rm -rf "$program.old"
 }
 
 install_files() {
@@ -97,6 +128,11 @@ activate() {
     echo "edit /etc/swath/swath.toml, then: swath check /etc/swath/swath.toml && systemctl enable --now swathd"
 }
 
+tell_what_runs() {
+    ! systemctl is-active --quiet swathd ||
+        echo "swathd runs the program that was there before; when nothing is recorded: systemctl restart swathd"
+}
+
 # What swath-live.service needs compiled, into the cache that it uses; without, it does this when it first starts.
 warm_up() {
     [ -z "$DESTDIR" ] && [ -n "$EXTRAS" ] || return 0
@@ -115,6 +151,7 @@ install_all() {
         activate /usr/lib/tmpfiles.d/swath.conf /usr/lib/sysctl.d/90-swath.conf
         warm_up
         echo "points while you record: systemctl enable --now swath-live"
+        tell_what_runs
     else
         warm_up
         echo "installed; users, directories and kernel settings come with the next start of systemd"
@@ -130,8 +167,8 @@ uninstall_all() {
         rm -f "$DESTDIR$to"
     done
     [ "$(readlink "$DESTDIR/usr/local/bin/swath" || true)" != "$PREFIX/bin/swath" ] || rm -f "$DESTDIR/usr/local/bin/swath"
-    [ ! -e "$DESTDIR$PREFIX/pyvenv.cfg" ] || rm -rf "$DESTDIR$PREFIX"
-    rm -rf "$DESTDIR$cache"
+    [ ! -e "$program/pyvenv.cfg" ] || rm -rf "$program"
+    rm -rf "$DESTDIR$cache" "$building" "$program.old"
     if on_this_computer; then
         systemctl daemon-reload
     fi

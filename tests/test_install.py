@@ -83,6 +83,7 @@ def test_nothing_installed_names_the_packagers_folder(installed: Path) -> None:
     for path in texts:
         if not path.is_symlink():
             assert str(installed).encode() not in path.read_bytes(), path
+            assert b"swath.building" not in path.read_bytes(), path
 
 
 def test_scripts_start_with_the_python_beside_them(installed: Path) -> None:
@@ -198,3 +199,104 @@ def test_a_folder_with_other_things_is_not_overwritten(tmp_path: Path) -> None:
     assert done.returncode != 0
     assert "holds something else" in done.stderr
     assert files_below(tmp_path) == set()
+
+
+# A Python that makes a program of a script and a file, at once; $1 to $3 are -m venv FOLDER.
+PYTHON_OF_SCRIPTS = """#!/bin/sh
+[ "$1 $2" = "-m venv" ] || exit 0
+{venv}
+mkdir -p "$3/bin"
+echo "command = $0 -m venv $3" >"$3/pyvenv.cfg"
+cat >"$3/bin/python" <<SCRIPT
+{pip}
+echo "#!$3/bin/python" >"$3/bin/swath"
+SCRIPT
+chmod 755 "$3/bin/python"
+"""
+BEFORE = {"opt/swath/pyvenv.cfg", "opt/swath/bin/swath", "opt/swath/lib/only_before.py"}
+
+
+@pytest.fixture
+def root_before(tmp_path: Path) -> Path:
+    """A root with an installed program, and what a power cut left of building another."""
+    root = tmp_path / "root"
+    for name in BEFORE | {"opt/swath.building/bin/python"}:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text("before\n")
+    return root
+
+
+def install_with(root: Path, prefix: str = "/opt/swath", venv: str = ":", pip: str = ":") -> tuple[int, str]:
+    """`install` with a Python that does as told; its exit status and all it said."""
+    python = root.parent / "python"
+    python.write_text(PYTHON_OF_SCRIPTS.format(venv=venv, pip=pip))
+    python.chmod(0o755)
+    environment = os.environ | {"DESTDIR": str(root), "PREFIX": prefix, "PYTHON": str(python)}
+    command = ["sh", str(ROOT / "systemd/install.sh"), "install"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANGS_S, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+def all_below(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if not path.is_dir()}
+
+
+@pytest.mark.parametrize(
+    ("venv", "pip", "status"),
+    [
+        ("echo no room >&2; exit 1", ":", 1),
+        (":", "echo no network >&2; exit 1", 1),
+        ("kill -TERM $PPID; sleep 0.2", ":", 143),
+        (":", "kill -INT $PPID; sleep 0.2", 130),
+    ],
+)
+def test_a_program_that_cannot_be_built_leaves_the_one_that_is_there(
+    root_before: Path, venv: str, pip: str, status: int
+) -> None:
+    told = install_with(root_before, venv=venv, pip=pip)
+    assert told[0] == status, told[1]
+    assert all_below(root_before) == BEFORE
+    assert all((root_before / name).read_text() == "before\n" for name in BEFORE)
+    if status == 1:
+        assert told[1].splitlines()[1:] == [
+            "no room" if venv != ":" else "no network",
+            f"swath: the program in {root_before}/opt/swath stays as it was",
+            "swath: the program could not be installed; pip's words are above",
+        ]
+
+
+def test_a_program_takes_the_place_of_the_one_before_it_whole(root_before: Path) -> None:
+    in_place = f'[ -e "{root_before}/opt/swath/lib/only_before.py" ] || exit 1'
+    status, told = install_with(root_before, venv=in_place, pip=in_place, prefix="/opt/swath/")
+    assert status == 0, told
+    assert sorted(path.name for path in (root_before / "opt").iterdir()) == ["swath"]
+    assert not (root_before / "opt/swath/lib").exists()
+    assert (root_before / "opt/swath/bin/swath").read_text() == "#!/opt/swath/bin/python\n"
+    assert (root_before / "opt/swath/pyvenv.cfg").read_text().endswith("-m venv /opt/swath\n")
+
+
+def test_a_power_cut_between_two_renames_is_mended_by_the_next_run(root_before: Path) -> None:
+    (root_before / "opt/swath").rename(root_before / "opt/swath.old")
+    assert install_with(root_before, pip="exit 1")[0] == 1
+    assert all_below(root_before) == BEFORE
+
+
+@pytest.mark.parametrize("prefix", ["/", "swath"])
+def test_a_prefix_is_an_absolute_path(tmp_path: Path, prefix: str) -> None:
+    status, told = install_with(tmp_path / "root", prefix)
+    assert (status, told.count("\n")) == (1, 1)
+    assert "absolute path" in told
+    assert not (tmp_path / "root").exists()
+
+
+@pytest.mark.parametrize(("active", "told"), [("true", True), ("false", False)])
+def test_a_recorder_that_runs_is_said_to_need_a_restart(tmp_path: Path, active: str, told: bool) -> None:
+    (tmp_path / "systemctl").write_text(f'#!/bin/sh\n[ "$*" = "is-active --quiet swathd" ] && {active}\n')
+    (tmp_path / "systemctl").chmod(0o755)
+    script = "set -- files; . ./install.sh; tell_what_runs"
+    environment = os.environ | {"DESTDIR": str(tmp_path / "root"), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["sh", "-c", script], cwd=ROOT / "systemd", env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert ("systemctl restart swathd" in done.stdout) is told
