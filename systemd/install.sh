@@ -26,6 +26,7 @@ placed() {
     cat <<LIST
 swathd.service /usr/lib/systemd/system/swathd.service
 swath-live.service /usr/lib/systemd/system/swath-live.service
+swath-pps@.service /usr/lib/systemd/system/swath-pps@.service
 sysctl/90-swath.conf /usr/lib/sysctl.d/90-swath.conf
 network/80-swath-can.network /usr/lib/systemd/network/80-swath-can.network
 udev/90-swath.rules /usr/lib/udev/rules.d/90-swath.rules
@@ -162,6 +163,7 @@ uninstall_all() {
     [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make uninstall needs root: sudo make uninstall"
     if on_this_computer; then
         systemctl disable --now swath-live.service swathd.service 2>/dev/null || true
+        systemctl stop 'swath-pps@*.service' 2>/dev/null || true
     fi
     placed | while read -r _ to; do
         rm -f "$DESTDIR$to"

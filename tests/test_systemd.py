@@ -15,6 +15,14 @@ from tests.daemon.rig import HANGS_S
 SYSTEMD = Path(__file__).resolve().parent.parent / "systemd"
 UNIT = SYSTEMD / "swathd.service"
 LIVE = SYSTEMD / "swath-live.service"
+PPS = SYSTEMD / "swath-pps@.service"
+HARDENING = [
+    "CapabilityBoundingSet", "AmbientCapabilities", "NoNewPrivileges", "ProtectSystem", "ProtectHome",
+    "PrivateTmp", "PrivateMounts", "ProtectKernelTunables", "ProtectKernelModules", "ProtectKernelLogs",
+    "ProtectControlGroups", "ProtectHostname", "ProtectProc", "ProcSubset", "PrivateUsers",
+    "RestrictNamespaces", "RestrictSUIDSGID", "LockPersonality", "RemoveIPC", "KeyringMode", "DevicePolicy",
+    "SystemCallArchitectures", "SystemCallErrorNumber", "RestrictRealtime", "UMask", "User", "Group",
+]  # fmt: skip
 
 
 def run_tool(*command: str | Path) -> subprocess.CompletedProcess[str]:
@@ -99,14 +107,7 @@ class TestLive:
 
     def test_hardened_like_the_recorder_but_for_what_it_does_not_need(self) -> None:
         """Every restriction of the recorder's unit is one of this unit too, as strict or stricter."""
-        names = [
-            "CapabilityBoundingSet", "AmbientCapabilities", "NoNewPrivileges", "ProtectSystem", "ProtectHome",
-            "PrivateTmp", "PrivateMounts", "ProtectKernelTunables", "ProtectKernelModules", "ProtectKernelLogs",
-            "ProtectControlGroups", "ProtectHostname", "ProtectProc", "ProcSubset", "PrivateUsers",
-            "RestrictNamespaces", "RestrictSUIDSGID", "LockPersonality", "RemoveIPC", "KeyringMode", "DevicePolicy",
-            "SystemCallArchitectures", "SystemCallErrorNumber", "RestrictRealtime", "UMask", "User", "Group",
-        ]  # fmt: skip
-        for name in names:
+        for name in HARDENING:
             assert unit_values(name, LIVE) == unit_values(name) != [], name
         assert unit_values("DeviceAllow", LIVE) == []
         assert unit_values("PrivateNetwork", LIVE) == ["yes"]
@@ -123,6 +124,54 @@ class TestLive:
                 listed = run_tool("systemd-analyze", "--no-pager", "syscall-filter", name).stdout.splitlines()[1:]
                 waiting += [line.strip() for line in listed if line.strip() and not line.strip().startswith("#")]
         assert {"mincore", "mmap", "pread64", "statx"} <= allowed
+
+
+class TestPps:
+    """The unit that holds the kernel's PPS line discipline on a serial port."""
+
+    def test_is_without_fault(self, tmp_path: Path) -> None:
+        program = tmp_path / "ldattach"
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+        unit = tmp_path / "swath-pps@ttyS0.service"
+        unit.write_text(PPS.read_text().replace("/usr/sbin/ldattach", str(program)))
+        found = run_tool("systemd-analyze", "verify", "--man=no", unit)
+        assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
+
+    def test_exposure_is_at_most_one_half(self, tmp_path: Path) -> None:
+        unit = tmp_path / "swath-pps@ttyS0.service"
+        unit.write_text(PPS.read_text())
+        found = run_tool("systemd-analyze", "security", "--offline=true", "--threshold=5", "--no-pager", unit)
+        assert "Overall exposure level for swath-pps@ttyS0.service" in found.stdout, found.stderr
+        assert "/dev/ttyS0:rw" in found.stdout
+        assert found.returncode == 0, found.stdout
+
+    def test_stays_in_the_foreground_as_long_as_its_port_is_there(self) -> None:
+        """Of ldattach's options only --debug does not go into the background."""
+        assert unit_values("ExecStart", PPS) == ["/usr/sbin/ldattach --debug PPS /dev/%I"]
+        assert unit_values("Type", PPS) == ["exec"]
+        assert unit_values("BindsTo", PPS) == ["dev-%i.device"]
+        assert unit_values("Restart", PPS) == ["always"]
+
+    def test_hardened_like_the_recorder(self) -> None:
+        for name in HARDENING:
+            assert unit_values(name, PPS) == unit_values(name) != [], name
+        assert unit_values("DeviceAllow", PPS) == ["/dev/%I rw"]
+        assert unit_values("SystemCallFilter", PPS) == unit_values("SystemCallFilter")[:2]
+        (module,) = unit_values("Wants", PPS)
+        assert module == "modprobe@pps_ldisc.service"
+        assert module in unit_values("After", PPS)[0].split()
+
+    def test_is_pulled_in_by_the_example_rule(self) -> None:
+        (rule,) = [line for line in _udev_examples() if "ttyS0" in line]
+        (wanted,) = re.findall(r'ENV\{SYSTEMD_WANTS\}\+="([^"]*)"', rule)
+        assert wanted == PPS.name.replace("@", "@ttyS0")
+        assert 'TAG+="systemd"' in rule
+
+
+def test_no_rule_starts_a_program() -> None:
+    """udev(7): what RUN starts is killed when the event is through, in the background or not."""
+    assert not [line for line in _udev_rules() + _udev_examples() if "RUN" in line]
 
 
 def test_no_capability_and_no_root() -> None:
@@ -193,7 +242,7 @@ def test_the_wall_clock_is_stepped_at_start_only() -> None:
 
 # man udev: KEY op "value", the operators each key takes
 _UDEV_TERM = re.compile(
-    r'(?P<key>(?:SUBSYSTEM|KERNEL|DRIVER|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|TAG|RUN))(?P<op>==|!=|\+=|=)"[^"]*"'
+    r'(?P<key>(?:SUBSYSTEM|KERNEL|DRIVER|ATTRS?\{\w+\}|ENV\{\w+\}|GROUP|MODE|SYMLINK|TAG))(?P<op>==|!=|\+=|=)"[^"]*"'
 )
 
 
@@ -212,8 +261,12 @@ def test_udev_rule_matches_and_assigns(rule: str) -> None:
     assert any(op in ("=", "+=") for op in operators), "a rule that does nothing"
 
 
-def test_example_rules_are_as_good_as_working_ones() -> None:
+def _udev_examples() -> list[str]:
     lines = (SYSTEMD / "udev/90-swath.rules").read_text().splitlines()
-    examples = [line[1:] for line in lines if line.startswith("#SUBSYSTEM")]
+    return [line[1:] for line in lines if line.startswith("#SUBSYSTEM")]
+
+
+def test_example_rules_are_as_good_as_working_ones() -> None:
+    examples = _udev_examples()
     assert len(examples) == 2
     assert all(_UDEV_TERM.fullmatch(term) for line in examples for term in line.split(", "))

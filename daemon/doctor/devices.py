@@ -129,7 +129,10 @@ def pps_device(tree: Tree, path: str, edge: str, now_s: float | None = None) -> 
     check = "PPS"
     folder = tree.at("/sys/class/pps") / tree.at(path).resolve().name
     if not folder.exists():
-        mend = "sudo ldattach PPS /dev/ttyS0  # or: sudo modprobe pps-gpio, with the board's overlay"
+        mend = (
+            "sudo systemctl start swath-pps@ttyS0  # the port's; for good: a udev rule as in 90-swath.rules; "
+            "or: sudo modprobe pps-gpio, with the board's overlay"
+        )
         yield Finding(check, Verdict.WRONG, f"{path}: the kernel knows no such PPS source", mend)
         return
     if read_text(folder / "name") in TEST_PPS:

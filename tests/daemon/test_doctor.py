@@ -254,7 +254,7 @@ def test_what_is_not_there_is_said(tree: Tree) -> None:
     (network,) = devices.network_interface(tree, "eth7")
     assert {one.verdict for one in (device, pps, can, network)} == {Verdict.WRONG}
     assert device.text == "/dev/ttyUSB7 is not there"
-    assert "ldattach" in pps.mend
+    assert pps.mend.startswith("sudo systemctl start swath-pps@ttyS0 ")
 
 
 def test_another_bit_rate_is_mended_by_ip_link(tree: Tree) -> None:
