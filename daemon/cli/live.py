@@ -50,8 +50,8 @@ def command(
     """Georeference what is being recorded, and show it.
 
     Follows the growing log until the recording ends. Writes live.mcap (opens in Foxglove), coverage.png, coverage.json
-    and live.json under live/ in the log directory. Positions are the device's own INS solution. The recorder does not
-    notice: not even when this is killed.
+    and live.json under live/ in the log directory. Positions are the device's own INS solution; where there is none,
+    they are navigated from IMU and GNSS. The recorder does not notice: not even when this is killed.
     """
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)

@@ -80,6 +80,11 @@ class TestHelp:
             assert result.exit_code == 0, listed.name
             assert "Usage:" in result.output
 
+    @pytest.mark.parametrize("name", ["georef", "live"])
+    def test_says_where_positions_come_from_without_an_ins(self, name: str) -> None:
+        text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "300"}).output
+        assert "IMU and GNSS" in " ".join(text.split())
+
     def test_the_help_loads_no_heavy_module(self) -> None:
         run = run_python(
             "code = cli.run_app(['--help'])\n"

@@ -24,6 +24,7 @@ from daemon.log.reader import Session, open_logs
 from daemon.parts import RECORDING_SIGN
 from daemon.processing import live as live_module
 from daemon.processing import live_follow
+from daemon.processing.feed import TICK_BYTES, TICK_NS
 from daemon.processing.live import Live, Told, replay
 from daemon.processing.live_points import POINT_DTYPE
 from daemon.processing.live_status import LiveStatus, sentence
@@ -34,6 +35,7 @@ from georef.stream_clocks import DevicePlan
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight
 from sim.plan import parse_plan
+from tests.daemon.commands import ROOT
 from tests.daemon.test_cli import swath
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -318,3 +320,11 @@ class TestCommand:
         told = capfd.readouterr()
         assert told.out == ""
         assert told.err == WarmUp(12, 3.25, None).text() + "\n"
+
+
+def test_the_pages_say_how_often_is_decided() -> None:
+    tick = f"{TICK_NS // 1_000_000} ms"
+    assert f"decisions fall every {tick}" in (ROOT / "docs/live.md").read_text()
+    decision = (ROOT / "docs/decisions/0012-ticks-make-live-equal-replay.md").read_text()
+    assert f"a multiple of\n  {tick}, or where {TICK_BYTES >> 20} MiB" in decision
+    assert f"comes up to {tick} later" in decision
