@@ -168,6 +168,11 @@ def unit_is_there(_: Path) -> None:
     assert (ROOT / "systemd/swathd.service").read_text().count("[Install]\nWantedBy=multi-user.target") == 1
 
 
+def group_may_read(_: Path) -> None:
+    """usermod would act on a user of this computer; that users and folders are made so is proven in test_systemd.py."""
+    assert "d /var/lib/swath 0750 swath swath -" in (ROOT / "systemd/tmpfiles/swath.conf").read_text()
+
+
 EXERCISED: dict[str, Callable[[Path], None]] = {
     "make demo": make_target("demo", "-m demo"),
     "make test": make_target("test", "ruff check", "mypy", "lint-imports", "-m pytest"),
@@ -175,17 +180,18 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "sudo make uninstall": make_target("uninstall", "install.sh uninstall"),
     "swath devices": run_devices,
     "swath check --offline /etc/swath/swath.toml": run_check_offline,
-    "swath check /etc/swath/swath.toml": run_check,
+    "sudo swath check /etc/swath/swath.toml": run_check,
     "swath setup /etc/swath/swath.toml": run_setup,
-    "swath setup --apply": run_setup,
-    "swath doctor /etc/swath/swath.toml": run_doctor,
+    "sudo swath setup --apply": run_setup,
+    "sudo swath doctor /etc/swath/swath.toml": run_doctor,
     "swath monitor": run_beside_a_recorder,
-    'swath mark "line 4 start"': run_beside_a_recorder,
+    'sudo swath mark "line 4 start"': run_beside_a_recorder,
     "swath import": point_to_the_page,
     "swath export": point_to_the_page,
     "swath offload /var/lib/swath /mnt/usb": run_offload,
     "swath info /var/lib/swath": run_info,
-    "swath recover /var/lib/swath": run_recover,
+    "sudo -u swath swath recover /var/lib/swath": run_recover,
+    "sudo usermod -aG swath $USER": group_may_read,
     "pip install 'swath[process]'": extra_is_there,
     "swath georef /mnt/usb -o thurgau-north --crs EPSG:32632": run_points,
     "swath view thurgau-north": runs_with_georef,
@@ -204,6 +210,17 @@ def test_command_of_the_readme(line: str, tmp_path: Path) -> None:
 
 def test_the_table_holds_no_command_that_the_readme_lost() -> None:
     assert set(EXERCISED) - set(commands()) == set()
+
+
+def test_what_wants_more_than_the_group_is_typed_with_sudo() -> None:
+    """Root opens devices and the control socket; only the logs' owner makes a copy that the group may read."""
+    for page in (ROOT / "README.md", ROOT / "docs/installation.md", ROOT / "docs/recording.md"):
+        for line in re.findall(
+            r"^\$ (.*\bswath (?:mark|split|recover|doctor|setup|check)\b.*)", page.read_text(), re.M
+        ):
+            if "--offline" in line or (line.startswith("swath setup") and "--apply" not in line):
+                continue
+            assert line.startswith("sudo -u swath swath" if " recover " in line else "sudo swath"), page.name
 
 
 def test_first_commands_are_the_two_that_set_everything_up() -> None:
