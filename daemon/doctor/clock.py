@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import re
+import glob
+import shlex
 import time
 from collections.abc import Iterator
+from pathlib import PurePosixPath
 
 from daemon.doctor.finding import Finding, Tree, Verdict
 from daemon.host_clock import STEP_NOTICED_NS, ClockDiscipline, read_clock_pair, read_clock_sample
@@ -14,7 +16,9 @@ STEPPERS = ("systemd-timesyncd", "openntpd", "ntpd")  # step whenever they find 
 SLEWED_PPM = 150.0  # beyond an oscillator's own error and chrony's drop-in of 100
 WATCH_S = 0.5
 _CHRONY = "sudo apt-get install chrony  # with /etc/chrony/conf.d/swath.conf it steps at its start only"
-_MAKESTEP = re.compile(r"^\s*makestep\s+\S+\s+(-?\d+)", re.MULTILINE)
+_CONFIGURATIONS = ("/etc/chrony/chrony.conf", "/etc/chrony.conf")  # of Debian, of others
+_INCLUDE_LEVELS = 10  # chrony follows no more
+_COMMENT = ("!", ";", "#", "%")
 
 
 def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
@@ -41,13 +45,52 @@ def keepers(tree: Tree, discipline: ClockDiscipline) -> Iterator[Finding]:
 
 def chrony_steps(tree: Tree) -> Iterator[Finding]:
     """Whether chrony's configuration lets it step the clock at any time (``makestep … -1``); the last line holds."""
-    files = [tree.at("/etc/chrony/chrony.conf"), tree.at("/etc/chrony.conf")]
-    files += sorted(tree.at("/etc/chrony/conf.d").glob("*.conf"))
-    said = [(file, int(limit)) for file in files if file.exists() for limit in _MAKESTEP.findall(file.read_text())]
-    if said and said[-1][1] < 0:
-        text = f"{said[-1][0].name} lets chrony step the clock at any time (makestep … -1)"
-        mend = "echo 'makestep 1 3' | sudo tee /etc/chrony/conf.d/swath.conf && sudo systemctl restart chrony"
-        yield Finding("wall clock", Verdict.WRONG, text, mend)
+    said = [(file, words) for file, words in _chrony_lines(tree) if words[0].lower() == "makestep"]
+    file, words = said[-1] if said else ("", [])
+    if len(words) > 2 and words[2].startswith("-"):
+        text = f"{file} lets chrony step the clock at any time (makestep … -1)"
+        anew = f"sudo sed -Ei 's/^\\s*makestep\\s.*/makestep 1 3/I' {shlex.quote(file)}"
+        yield Finding("wall clock", Verdict.WRONG, text, f"{anew} && sudo systemctl restart chrony")
+
+
+def _chrony_lines(tree: Tree) -> Iterator[tuple[str, list[str]]]:
+    """Lines of chrony's configuration in words, each with its file, in the order in which chrony reads them."""
+    configuration = next((path for path in _CONFIGURATIONS if tree.at(path).exists()), None)
+    if configuration is not None:
+        yield from _lines_of(tree, configuration, _INCLUDE_LEVELS)
+
+
+def _lines_of(tree: Tree, file: str, levels: int) -> Iterator[tuple[str, list[str]]]:
+    for line in (tree.read(file) or "").splitlines():
+        words = line.split()
+        if not words or words[0].startswith(_COMMENT):
+            continue
+        yield file, words
+        for included in _included(tree, words) if levels else ():
+            yield from _lines_of(tree, included, levels - 1)
+
+
+def _included(tree: Tree, words: list[str]) -> list[str]:
+    """The files that a line has chrony read there: by ``include`` a pattern's, by ``confdir`` some folders' ``*.conf``.
+
+    Of folders the files come by name, of a name the first folder's only (chrony.conf(5)). ``sourcedir`` holds sources.
+    """
+    directive, *places = words
+    match directive.lower():
+        case "include" if places:
+            return _files(tree, places[0])
+        case "confdir":
+            by_name: dict[str, str] = {}
+            for place in places:
+                for file in _files(tree, f"{glob.escape(place)}/*.conf"):
+                    by_name.setdefault(PurePosixPath(file).name, file)
+            return [by_name[name] for name in sorted(by_name)]
+        case _:
+            return []
+
+
+def _files(tree: Tree, pattern: str) -> list[str]:
+    return [f"/{path}" for path in sorted(glob.glob(pattern.lstrip("/"), root_dir=tree.root))]
 
 
 def movement(step_ns: int, slew_ppm: float) -> Iterator[Finding]:

@@ -18,6 +18,7 @@ from daemon.doctor.finding import Finding, Tree, Verdict
 from daemon.host_clock import STA_UNSYNC, ClockDiscipline
 from tests.daemon.rig import session_table
 from tests.daemon.test_cli import ROOT, swath
+from tests.daemon.test_doctor_chrony import DEBIAN_CHRONY
 from tests.test_systemd import SYSTEMD
 
 KEPT = ClockDiscipline(12.0, 0, 0.002)
@@ -35,7 +36,7 @@ GOOD = {
     "/proc/300/comm": "chronyd\n",
     "/lib/modules/6.1.0-test/modules.builtin": "kernel/drivers/pps/pps_core.ko\n",
     "/lib/modules/6.1.0-test/modules.dep": "kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz\n",
-    "/etc/chrony/chrony.conf": "pool 2.debian.pool.ntp.org iburst\nmakestep 1 -1\n",
+    "/etc/chrony/chrony.conf": DEBIAN_CHRONY,
     "/etc/passwd": "root:x:0:0:::\nswath:x:990:990:Swath recorder:/var/lib/swath:/usr/sbin/nologin\n",
     "/etc/group": "root:x:0:\ndialout:x:20:pilot,swath\nswath:x:990:\n",
     f"{CPU}/cpufreq/scaling_governor": "performance\n",
@@ -162,7 +163,7 @@ def test_nothing_is_wrong_with_a_good_computer(tree: Tree, question: str) -> Non
         ("modules", "/lib/modules/6.1.0-test/modules.builtin", "", "wrong", "pps_core is not part", "kernel"),
         ("clock", "/proc/301/comm", "systemd-timesyn\n", "wrong", "both keep", "disable --now systemd-timesyncd"),
         ("clock", "/proc/300/comm", "systemd-timesyn\n", "wrong", "may step", "install chrony"),
-        ("clock", "/etc/chrony/conf.d/swath.conf", "makestep 0.1 -1\n", "wrong", "at any time", "makestep 1 3"),
+        ("clock", "/etc/chrony/chrony.conf", "makestep 0.1 -1\n", "wrong", "at any time", "makestep 1 3"),
         ("file system", "/proc/mounts", "none /var/lib/swath tmpfs rw 0 0", "wrong", "in memory", "ext4"),
         ("file system", "/proc/mounts", "a:/b /var/lib nfs4 rw 0 0", "wrong", "another computer", "ext4"),
         ("file system", "/proc/mounts", "/dev/sdb1 /var/lib vfat rw 0 0", "wrong", "no journal", "ext4"),

@@ -1,0 +1,87 @@
+"""Which line of chrony's configuration says whether the clock may be stepped in flight, and what changes it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from daemon.doctor.clock import chrony_steps
+from daemon.doctor.finding import Tree
+from tests.test_systemd import SYSTEMD
+
+# what Debian's and Ubuntu's chrony.conf says beside sources of time: conf.d comes before its own makestep
+DEBIAN_CHRONY = """# Include configuration files found in /etc/chrony/conf.d.
+confdir /etc/chrony/conf.d
+pool 2.debian.pool.ntp.org iburst
+sourcedir /run/chrony-dhcp
+sourcedir /etc/chrony/sources.d
+maxupdateskew 100.0
+rtcsync
+# Step the system clock instead of slewing it if the adjustment is larger than
+# one second, but only in the first three clock updates.
+makestep 1 3
+"""
+MAIN, DROP_IN = "/etc/chrony/chrony.conf", "/etc/chrony/conf.d/swath.conf"
+ALWAYS = "makestep 0.1 -1\n"
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Tree:
+    """chrony as Debian has it, with the installed drop-in."""
+    made = Tree(tmp_path)
+    write(made, MAIN, DEBIAN_CHRONY)
+    write(made, DROP_IN, (SYSTEMD / "chrony/swath.conf").read_text())
+    return made
+
+
+def write(tree: Tree, path: str, text: str) -> None:
+    tree.at(path).parent.mkdir(parents=True, exist_ok=True)
+    tree.at(path).write_text(text)
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        {DROP_IN: ALWAYS},
+        {MAIN: "confdir /etc/chrony/conf.d\n", "/etc/chrony/conf.d/a.conf": ALWAYS},
+        {MAIN: "sourcedir /etc/mine\n", "/etc/mine/a.sources": ALWAYS},
+        {MAIN: "confdir /etc/chrony/conf.d /etc/last\n", "/etc/last/swath.conf": ALWAYS},
+        {MAIN: f"include {MAIN}\n! makestep 1 -1\n#makestep 1 -1\nmakestep 1\nconfdir\ninclude\n"},
+    ],
+)
+def test_what_is_not_read_last_does_not_hold(tree: Tree, files: dict[str, str]) -> None:
+    """chrony.conf(5): of a directive that stands there twice the last is effective."""
+    for path, text in files.items():
+        write(tree, path, text)
+    assert list(chrony_steps(tree)) == []
+
+
+@pytest.mark.parametrize(
+    ("files", "winner"),
+    [
+        ({MAIN: DEBIAN_CHRONY.replace("makestep 1 3", "makestep 1 -1")}, MAIN),
+        ({MAIN: "makestep 1 3\n  MakeStep  1 -1\nrtcsync\n"}, MAIN),
+        ({MAIN: "makestep 1 3\nConfDir /etc/chrony/conf.d\n", DROP_IN: ALWAYS + "maxslewrate 100\n"}, DROP_IN),
+        ({MAIN: "confdir /etc/first /etc/chrony/conf.d\n", "/etc/first/swath.conf": ALWAYS}, "/etc/first/swath.conf"),
+        ({MAIN: "include /m/*.inc\n", "/m/a.inc": "makestep 1 3\n", "/m/b c.inc": ALWAYS}, "/m/b c.inc"),
+    ],
+)
+def test_the_file_that_holds_is_named_and_its_mend_loses_nothing(
+    tree: Tree, files: dict[str, str], winner: str
+) -> None:
+    for path, text in files.items():
+        write(tree, path, text)
+    before = {path: path.read_text() for path in tree.root.rglob("*") if path.is_file()}
+    (found,) = chrony_steps(tree)
+    assert found.text.startswith(f"{winner} lets chrony step the clock at any time")
+    edit, restart = found.mend.split(" && ")
+    assert restart == "sudo systemctl restart chrony"
+    subprocess.run(["sh", "-c", edit.removeprefix("sudo ").replace(winner, str(tree.at(winner)))], check=True)
+    assert list(chrony_steps(tree)) == []
+    mended = re.sub(r"(?im)^ *makestep .*$", "makestep 1 3", before[tree.at(winner)])
+    after = {path: path.read_text() for path in before}
+    assert after == before | {tree.at(winner): mended}
