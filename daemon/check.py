@@ -5,6 +5,7 @@ Nothing is written, nothing is sent. Every wire has its own thread, so all are h
 
 from __future__ import annotations
 
+import os
 import tempfile
 import threading
 import time
@@ -21,6 +22,7 @@ import numpy as np
 
 from daemon.config import Config, DeviceEntry
 from daemon.identify import Heard, describe_time, not_understood
+from daemon.places import nearest_there
 from drivers.core.registry import find_driver
 from drivers.session import Session
 from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
@@ -206,7 +208,13 @@ def _run(jobs: list[Callable[[], None]], span: Span) -> None:
 def check_directory(directory: Path, reserve_mb: float) -> Report:
     """Whether logs can be written there, and how much room is left."""
     report = Report("log")
-    existing = next(path for path in (directory, *directory.parents) if path.exists())
+    existing, permitted = nearest_there(directory)
+    if not permitted:
+        report.problems.append(
+            f"session.directory {directory}: user {os.geteuid()} may not enter {existing}; ask as root, or as the user "
+            f"that records, or give a directory that he may enter"
+        )
+        return report
     try:
         with tempfile.TemporaryFile(dir=existing):
             report.opens = True

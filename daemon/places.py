@@ -36,6 +36,21 @@ def log_directory(where: Path) -> Path:
     return directory.absolute()
 
 
+def nearest_there(directory: Path) -> tuple[Path, bool]:
+    """Of a directory and its parents the nearest that is there, and whether this user may see what lies in it."""
+    permitted = True
+    for path in (directory, *directory.parents):
+        try:
+            path.stat()
+        except PermissionError:
+            permitted = False
+        except OSError:
+            continue
+        else:
+            return path, permitted
+    return Path("/"), permitted
+
+
 def take_directory(directory: Path, key: str = "session.directory") -> int:
     """Create the log directory if need be and lock it; returns the lock's descriptor, which must stay open.
 

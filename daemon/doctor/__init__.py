@@ -15,6 +15,7 @@ from daemon.doctor.finding import Finding, Tree, Verdict
 from daemon.host_clock import read_clock_discipline
 from daemon.log.claim import is_being_written
 from daemon.parts import read_sign
+from daemon.places import nearest_there
 from drivers.transports.can_link import interface_bitrate
 from drivers.transports.udp_socket import DEFAULT_BUFFER_MB
 from drivers.transports.uri import TransportSpec
@@ -81,7 +82,11 @@ def _disk(tree: Tree, config: Config | None, specs: list[TransportSpec], write: 
     split = DEFAULT_SPLIT_BYTES if config is None else config.session.split_size_mb * 1e6
     scanners = 1 if config is None else sum(spec.kind == "udp" for spec in specs)
     rate = scanners * disk.SCANNER_BYTES_PER_S + disk.OTHER_BYTES_PER_S
-    existing = next(path for path in (directory, *directory.parents) if path.is_dir())
+    there, permitted = nearest_there(directory)
+    if not permitted:
+        yield from disk.writable(tree, directory, devices.recording_user(tree))
+        return
+    existing = there if there.is_dir() else there.parent
     yield from disk.file_system(disk.mount_of(tree, existing.resolve()), split)
     yield from disk.writable(tree, directory, devices.recording_user(tree))
     free = disk_usage(existing).free

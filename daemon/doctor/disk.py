@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import tempfile
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 from daemon.doctor.devices import User
 from daemon.doctor.finding import Finding, Tree, Verdict
 from daemon.health import duration_text
+from daemon.places import nearest_there
 
 SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
 OTHER_BYTES_PER_S = 0.2e6
@@ -86,13 +88,23 @@ def room(free_bytes: float, reserve_bytes: float, bytes_per_s: float) -> Iterato
 
 
 def writable(tree: Tree, directory: Path, user: User) -> Iterator[Finding]:
-    """Whether logs can be made in a directory."""
-    existing = next(path for path in (directory, *directory.parents) if tree.at(path).exists())
-    if user.may(tree.at(existing).stat(), 3):
-        yield Finding("log directory", Verdict.OK, f"{user.name} may write to {existing}")
+    """Whether logs can be made in a directory: whether its user may enter all it lies in, and write to it."""
+    check = "log directory"
+    there, permitted = nearest_there(tree.at(directory))
+    existing = Path("/") / there.relative_to(tree.root)
+    way = [*reversed(existing.parents), *([] if permitted else [existing])]
+    closed = next((path for path in way if not user.may(tree.at(path).stat(), 1)), None)
+    if closed is not None:
+        mend = f"sudo chmod o+x {shlex.quote(str(closed))}  # or say another session.directory"
+        yield Finding(check, Verdict.WRONG, f"{user.name} may not enter {closed}, in which {directory} lies", mend)
+    elif not permitted:
+        text = f"not looked at: who asks may not enter {existing}, in which {directory} lies; {user.name} may"
+        yield Finding(check, Verdict.NOTE, text, "sudo swath doctor")
+    elif user.may(there.stat(), 3):
+        yield Finding(check, Verdict.OK, f"{user.name} may write to {existing}")
     else:
         mend = f"sudo install -d -o {user.name} -g {user.name} -m 0750 {directory}"
-        yield Finding("log directory", Verdict.WRONG, f"{user.name} may not write to {existing}", mend)
+        yield Finding(check, Verdict.WRONG, f"{user.name} may not write to {existing}", mend)
 
 
 def measure(folder: Path, size: int = TEST_BYTES) -> tuple[float, float]:

@@ -325,6 +325,13 @@ def test_a_directory_is_judged_by_the_folder_that_is_there(tree: Tree) -> None:
     assert found.mend == "sudo install -d -o swath -g swath -m 0750 /var/lib/swath"
 
 
+def test_a_directory_that_its_user_may_not_get_to(tree: Tree) -> None:
+    tree.at("/var/lib").chmod(0o750)
+    (found,) = disk.writable(tree, Path("/var/lib/swath"), SWATH)
+    assert (found.verdict, found.text) == (Verdict.WRONG, "swath may not enter /var/lib, in which /var/lib/swath lies")
+    assert found.mend.startswith("sudo chmod o+x /var/lib ")
+
+
 def test_the_mount_of_a_directory_is_the_longest_that_holds_it(tree: Tree) -> None:
     points = [disk.mount_of(tree, Path(path)) for path in ("/var/lib/swath/x", "/var/lib/swathy", "/home")]
     assert [point.point if point else None for point in points] == ["/var/lib/swath", "/", "/"]
