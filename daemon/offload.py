@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daemon.checksum_list import ChecksumList
+from daemon.checksum_list import NAME, ChecksumList
 from daemon.errors import ExitCode, UserError
 from daemon.log.claim import is_being_written
 from daemon.log.durable import sync_directory
@@ -112,7 +112,7 @@ def offload(
     """
     report = OffloadReport(directory, destination)
     with _taken(directory, destination):
-        sums = ChecksumList(destination)
+        sums = _sums_of(destination)
         for path in sorted(directory.glob("*.mcap")):
             if is_growing(path):
                 report.recording.append(path.name)
@@ -121,6 +121,14 @@ def offload(
             yield report
             if report.stopped:
                 return
+
+
+def _sums_of(destination: Path) -> ChecksumList:
+    try:
+        return ChecksumList(destination)
+    except OSError as error:
+        text = f"{destination / NAME}: {error.strerror}; want another folder, or to be the user who copied there before"
+        raise UserError(text, ExitCode.IO) from error
 
 
 def _nothing(name: str, done: int, total: int) -> None:

@@ -273,6 +273,15 @@ def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_pa
         assert said in run.stderr
 
 
+def test_a_list_of_sums_that_cannot_be_read_is_one_line(logs: Path, disk: Path) -> None:
+    write_part(logs / "flight_0.mcap")
+    (disk / "SHA256SUMS").mkdir()
+    run = swath("offload", str(logs), str(disk))
+    assert (run.returncode, run.stderr.count("\n")) == (3, 1)
+    assert run.stderr.startswith(f"swath: {disk}/SHA256SUMS: Is a directory; want another folder")
+    assert names(disk) == ["SHA256SUMS"]
+
+
 def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> None:
     for part in range(2):
         write_part(logs / f"flight_{part}.mcap", part=part)
