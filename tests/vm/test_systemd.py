@@ -21,7 +21,10 @@ DISK_MB = 256
 COMES_BACK_S = 400.0  # measures nothing
 KILLS = 20
 SESSION = "split_minutes = 1440\n"
-RULES = 'SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"\n'
+RULES = """\
+SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"
+SUBSYSTEM=="tty", KERNEL=="ttyS1", TAG+="systemd", ENV{SYSTEMD_WANTS}+="swath-pps@ttyS1.service"
+"""
 USB = [
     *("-device", "qemu-xhci", "-chardev", "null,id=ftdi"),
     *("-device", "usb-serial,chardev=ftdi,serial=FT4XYZ12,always-plugged=on"),
@@ -124,6 +127,15 @@ def test_devices_have_their_names_and_rights(service: Machine) -> None:
     service.told(command)
     service.until("ls /dev/gnss/ublox-UBX7")
     assert service.told("stat -Lc %G /dev/gnss/ublox-UBX7") == "dialout"
+
+
+def test_a_rule_makes_a_pulse_of_a_serial_port(service: Machine) -> None:
+    """By the line discipline that the unit holds; the recorder has the same port open."""
+    service.until("systemctl is-active swath-pps@ttyS1 && ls /dev/pps1")
+    service.told("sleep 5")  # what a rule itself starts does not live so long
+    assert service.told("stat -Lc '%G %a' /dev/pps1") == "dialout 660"
+    assert service.told("cat /sys/class/pps/pps1/path") == "/dev/ttyS1"
+    assert shown(service, "NRestarts", "swath-pps@ttyS1") == "0"
 
 
 @pytest.mark.parametrize("unit", SERVICES)
