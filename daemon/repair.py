@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from daemon.events import Events, Severity
+from daemon.log.claim import is_being_written
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _LOOK_AGAIN_S = 60.0
@@ -44,29 +45,43 @@ def _left_open_since(path: Path) -> float | None:
 async def repair_left_open(
     directory: Path, reserve_bytes: int, is_current: Callable[[Path], bool], events: Events
 ) -> None:
-    """Repair what a crash left open; waits while there is no room, ends when nothing is left to do."""
+    """Repair what a crash left open; waits while there is no room, ends when nothing is left to do.
+
+    What somebody recovers by hand meanwhile is looked at again later: it is done then, or was given up.
+    """
     tried: set[Path] = set()
-    told_room = False
+    told: set[str] = set()
     while True:
         candidates = await asyncio.to_thread(unfinished_logs, directory)
         waiting = [path for path in candidates if path not in tried and not is_current(path)]
         if not waiting:
             return
-        path = waiting[0]
+        path = next((path for path in waiting if not _is_being_recovered(path)), None)
+        if path is None:
+            await _wait(f"{waiting[0].name} is being recovered by another process", told, events)
+            continue
         try:
             room = shutil.disk_usage(directory).free > reserve_bytes + path.stat().st_size
         except OSError:  # moved away meanwhile
             tried.add(path)
             continue
         if not room:
-            if not told_room:
-                told_room = True
-                text = f"{path.name} was left open by a crash; no room to repair it now"
-                events.post(Severity.WARNING, "recorder", "repair_waits", text)
-            await asyncio.sleep(_LOOK_AGAIN_S)
+            await _wait(f"{path.name} was left open by a crash; no room to repair it now", told, events)
             continue
         await _repair(path, reserve_bytes, events)
         tried.add(path)
+
+
+def _is_being_recovered(path: Path) -> bool:
+    return is_being_written(path.with_suffix(".recovered.mcap.part"))
+
+
+async def _wait(text: str, told: set[str], events: Events) -> None:
+    """Say once why, and let some time pass."""
+    if text not in told:
+        told.add(text)
+        events.post(Severity.WARNING, "recorder", "repair_waits", text)
+    await asyncio.sleep(_LOOK_AGAIN_S)
 
 
 async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:

@@ -10,10 +10,11 @@ from pathlib import Path
 _TRIES, _PAUSE_S = 20, 0.001
 
 
-def claim(fd: int) -> None:
-    """Lock a file for as long as it is open. Where a file system has no locks, nobody can ask either.
+def claim(fd: int) -> bool:
+    """Lock a file for as long as it is open; False where somebody else holds it.
 
-    Somebody who asks at this moment holds it for an instant himself, so it is tried again, for 20 ms at most.
+    Where a file system has no locks, nobody can ask either. Somebody who asks at this moment holds it for an instant
+    himself, so it is tried again, for 20 ms at most.
     """
     for _ in range(_TRIES):
         try:
@@ -21,9 +22,19 @@ def claim(fd: int) -> None:
         except BlockingIOError:
             time.sleep(_PAUSE_S)
         except OSError:
-            return
+            return True
         else:
-            return
+            return True
+    return False
+
+
+def stands_at(fd: int, path: Path) -> bool:
+    """Whether a path names the very file that is open."""
+    try:
+        there, mine = os.stat(path), os.fstat(fd)
+    except OSError:
+        return False
+    return (there.st_dev, there.st_ino) == (mine.st_dev, mine.st_ino)
 
 
 def is_being_written(path: Path) -> bool:

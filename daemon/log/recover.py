@@ -6,8 +6,11 @@ and told. The copy has index and footer, so that every MCAP reader opens it.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -15,7 +18,7 @@ from typing import BinaryIO
 from mcap import records
 
 from daemon.log.chunks import chunk_batches, damage_within, take_description
-from daemon.log.claim import is_being_written
+from daemon.log.claim import claim, is_being_written, stands_at
 from daemon.log.durable import sync_directory
 from daemon.log.encode import encode_raw
 from daemon.log.format import SCHEMAS, SESSION_METADATA, ChannelSpec, LogError
@@ -34,7 +37,9 @@ from daemon.log.scan import (
     scan,
     summary_records,
 )
-from daemon.log.writer import PartWriter
+from daemon.log.writer import PartWriter, create_exclusively
+
+UNFINISHED = ".part"  # behind the name of a copy that is not whole yet
 
 
 @dataclass(slots=True)
@@ -97,6 +102,7 @@ def examine(path: Path) -> RecoveryReport:
     Raises:
         LogError: it is no log.
     """
+    read_part_head(path)
     return _pass(path, None)
 
 
@@ -109,7 +115,8 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
         keep_free_bytes: the copy is given up when less would stay free.
 
     Raises:
-        LogError: it is no log, it is being recorded, the copy is there already, or there is no room for it.
+        LogError: it is no log, it is being recorded or recovered by another process, the copy is there already, or
+            there is no room for it.
         OSError: the copy cannot be written.
     """
     folder = path.parent if destination is None else destination
@@ -119,29 +126,83 @@ def recover(path: Path, destination: Path | None = None, *, keep_free_bytes: int
     report = examine(path)
     if report.whole:
         return report
-    if target.exists():
-        raise LogError(f"{target}: is there already; remove it to recover {path.name} again")
+    _refuse_existing(target, path)
     free = shutil.disk_usage(folder).free
     needed = path.stat().st_size + keep_free_bytes
     if free < needed:
         raise LogError(f"{folder}: {free / 1e6:.0f} MB free, {needed / 1e6:.0f} MB needed to recover {path.name}")
-    temporary = target.with_name(target.name + ".part")
-    temporary.unlink(missing_ok=True)
-    try:
-        report = _pass(path, temporary)
+    temporary = target.with_name(target.name + UNFINISHED)
+    with _taken(temporary, path) as fd:
+        _refuse_existing(target, path)  # another process may have put it there meanwhile
+        _give_to_owner_of(path, fd)
+        head = read_part_head(path)
+        report = _pass(path, PartWriter(temporary, head.info, head.number, fd=os.dup(fd)))
         temporary.rename(target)
         sync_directory(folder)
-    finally:
-        temporary.unlink(missing_ok=True)
     report.recovered = target
     return report
 
 
-def _pass(path: Path, copy: Path | None) -> RecoveryReport:
-    """Read all; write what is good to ``copy`` if there is one."""
-    head = read_part_head(path)
+def _refuse_existing(target: Path, path: Path) -> None:
+    if target.exists():
+        raise LogError(f"{target}: is there already; remove it to recover {path.name} again")
+
+
+@contextlib.contextmanager
+def _taken(temporary: Path, path: Path) -> Iterator[int]:
+    """The file of a copy, empty and claimed for as long as this lasts; gone afterwards where it was not renamed.
+
+    Who removes or renames a file of that name holds the claim on it and has seen that the name is still this file's.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        _remove_left_behind(temporary, path)
+    try:
+        fd = create_exclusively(temporary)
+    except FileExistsError:
+        raise _taken_by_another(path) from None
+    try:
+        if not claim(fd) or not stands_at(fd, temporary):
+            raise _taken_by_another(path)
+        try:
+            yield fd
+        finally:
+            if stands_at(fd, temporary):
+                temporary.unlink()
+    finally:
+        os.close(fd)
+
+
+def _remove_left_behind(temporary: Path, path: Path) -> None:
+    """Remove what an interrupted recovery left; LogError where the recovery goes on, FileNotFoundError for nothing."""
+    fd = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not claim(fd):
+            raise _taken_by_another(path)
+        if stands_at(fd, temporary):
+            temporary.unlink()
+    finally:
+        os.close(fd)
+
+
+def _taken_by_another(path: Path) -> LogError:
+    return LogError(f"{path}: is being recovered by another process")
+
+
+def _give_to_owner_of(path: Path, fd: int) -> None:
+    """Let the same users read the copy who may read the log: readers take it instead.
+
+    Root's copy would else be root's alone, and the recorder's user would have lost the log to it.
+    """
+    original = path.stat()
+    with contextlib.suppress(PermissionError):  # a file system without owners
+        if os.geteuid() == 0:
+            os.fchown(fd, original.st_uid, original.st_gid)
+        os.fchmod(fd, original.st_mode & 0o777)
+
+
+def _pass(path: Path, writer: PartWriter | None) -> RecoveryReport:
+    """Read all; write what is good to the copy if there is one, which is closed then."""
     report = RecoveryReport(path)
-    writer = None if copy is None else PartWriter(copy, head.info, head.number, compression="auto")
     channels: dict[int, ChannelSpec] = {}
     schemas: dict[int, records.Schema] = {}
     end: Record | None = None

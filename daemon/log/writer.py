@@ -21,7 +21,7 @@ import zstandard
 from fastcrc.crc32 import iso_hdlc as crc32
 from mcap import records
 
-from daemon.log.claim import claim
+from daemon.log.claim import claim, stands_at
 from daemon.log.durable import begin_writing_out, sync_directory
 from daemon.log.encode import EncodedBlock, message_index
 from daemon.log.format import (
@@ -68,6 +68,16 @@ class _OpenChunk:
         return Counter({id_: sum(block.count for _, block in blocks) for id_, blocks in self.blocks.items()})
 
 
+def create_exclusively(path: Path) -> int:
+    """A file for a part, open for writing.
+
+    Raises:
+        FileExistsError: something stands there.
+        OSError: it cannot be created.
+    """
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
+
+
 class PartWriter:
     """Writes one part. Belongs to one thread; nothing is buffered here but the open chunks.
 
@@ -76,8 +86,16 @@ class PartWriter:
         bytes_written: size of the file so far.
     """
 
-    def __init__(self, path: Path, session: SessionInfo, part: int, *, compression: str = "auto") -> None:
+    def __init__(
+        self, path: Path, session: SessionInfo, part: int, *, compression: str = "auto", fd: int | None = None
+    ) -> None:
         """Create the file exclusively, with header and session; both and the directory entry are made durable.
+
+        Args:
+            path: of the file.
+            session, part: what its head says.
+            compression: of the chunks; ``auto``: by their class.
+            fd: the file where it was created and claimed by the caller; it is closed with the part.
 
         Raises:
             OSError: it exists, or cannot be created or written.
@@ -92,7 +110,7 @@ class PartWriter:
         self._chunks: dict[ChunkClass, _OpenChunk] = {}
         self._summary = Summary()
         self._schemas = SchemaTable()
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
+        self._fd = create_exclusively(path) if fd is None else fd
         claim(self._fd)
         try:
             self._write([MAGIC, record_bytes(records.Header(profile=PROFILE, library=LIBRARY))])
@@ -105,11 +123,7 @@ class PartWriter:
 
     def stands_at(self, path: Path) -> bool:
         """Whether a path names this very file."""
-        try:
-            there, mine = os.stat(path), os.fstat(self._fd)
-        except OSError:
-            return False
-        return (there.st_dev, there.st_ino) == (mine.st_dev, mine.st_ino)
+        return stands_at(self._fd, path)
 
     def is_unlinked(self) -> bool:
         """Whether no directory names this file any more: what is written to it is gone with the process."""
