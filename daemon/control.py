@@ -240,6 +240,8 @@ class Control(threading.Thread):
         finally:
             for peer in self._peers:
                 peer.sock.close()
+            if self._sock is not None:  # who connects is refused at once, and does not wait for an answer
+                self._sock.close()
 
     # ------------------------------------------------------------------ one turn
 

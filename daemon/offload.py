@@ -97,21 +97,27 @@ class OffloadReport:
 
 
 def offload(
-    directory: Path, destination: Path, *, verify: bool = False, progress: Progress | None = None
+    directory: Path,
+    destination: Path,
+    *,
+    verify: bool = False,
+    same_disk: bool = False,
+    progress: Progress | None = None,
 ) -> Generator[OffloadReport, None, None]:
     """Copy log after log; gives the growing report after each.
 
     Args:
         directory: of the logs.
-        destination: a folder that is there.
+        destination: a folder that is there, on another disk.
         verify: read copies that are there already again.
+        same_disk: the destination may be on the logs' own disk.
         progress: is told how far a log is.
 
     Raises:
         UserError: the destination cannot be used, or another run is at work there.
     """
     report = OffloadReport(directory, destination)
-    with _taken(directory, destination):
+    with _taken(directory, destination, same_disk):
         sums = _sums_of(destination)
         for path in sorted(directory.glob("*.mcap")):
             if is_growing(path):
@@ -136,12 +142,16 @@ def _nothing(name: str, done: int, total: int) -> None:
 
 
 @contextlib.contextmanager
-def _taken(directory: Path, destination: Path) -> Iterator[None]:
+def _taken(directory: Path, destination: Path, same_disk: bool) -> Iterator[None]:
     """The destination, for one run at a time."""
     if not destination.is_dir():
         raise UserError(f"{destination}: no such directory; is the disk mounted?", ExitCode.IO)
     if destination.samefile(directory):
         raise UserError(f"{destination}: is where the logs are; give a folder on another disk", ExitCode.USAGE)
+    if not same_disk and destination.stat().st_dev == directory.stat().st_dev:
+        # the empty folder that another disk is mounted at looks like that disk
+        text = f"{destination}: is on the same disk as {directory}; is the other disk mounted?"
+        raise UserError(f"{text} --same-disk copies all the same", ExitCode.IO)
     if not os.access(destination, os.R_OK | os.W_OK | os.X_OK):
         raise UserError(f"{destination}: cannot be written: mounted read-only, or not permitted", ExitCode.IO)
     folder = os.open(destination, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -174,6 +184,7 @@ def _offload_one(path: Path, report: OffloadReport, sums: ChecksumList, verify: 
             _check_there(path, report, sums, verify, progress)
         else:
             _copy_new(path, report, sums, progress)
+        left_open = _is_left_open(path)
     except CopyDiffersError as error:
         report.differ.append(str(error))
     except NoRoomError as error:
@@ -182,7 +193,7 @@ def _offload_one(path: Path, report: OffloadReport, sums: ChecksumList, verify: 
         report.failed.append(f"{error.filename or path}: {error.strerror or error}")
     else:
         report.deletable.append(path)
-        if _is_left_open(path):
+        if left_open:
             report.left_open.append(path.name)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +28,7 @@ def command(
         Path, typer.Argument(metavar="DEST", help="A folder on another disk, which must be there.", readable=False)
     ],
     verify: Annotated[bool, typer.Option("--verify", help="Read copies that are there already once more.")] = False,
+    same_disk: Annotated[bool, typer.Option("--same-disk", help="DEST may be on the disk of the logs.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Copy finished logs to DEST, read each copy back, list their SHA-256 in DEST/SHA256SUMS, say what may be deleted.
@@ -47,7 +50,7 @@ def command(
         def tell(name: str, done: int, total: int) -> None:
             bar.update(task, description=one_line(name), completed=done, total=total)
 
-        for report in offload(directory, destination, verify=verify, progress=tell):
+        for report in offload(directory, destination, verify=verify, same_disk=same_disk, progress=tell):
             if not as_json and len(report.copied) > said:
                 said = len(report.copied)
                 copied = report.copied[-1]
@@ -72,8 +75,17 @@ def _print(report: OffloadReport, verify: bool) -> None:
         print(f"{one_line(name)}: is being recorded; not copied")
     for name in report.left_open:
         print(f"{one_line(name)}: was left open by a crash and is copied as it is; swath recover completes it")
-    if report.deletable:
-        size = sum(path.stat().st_size for path in report.deletable)
-        print(f"may be deleted, {len(report.deletable)} of the logs, {size / 1e6:,.1f} MB:")
-        for path in report.deletable:
+    sizes = _sizes(report.deletable)
+    if sizes:
+        print(f"may be deleted, {len(sizes)} of the logs, {sum(sizes.values()) / 1e6:,.1f} MB:")
+        for path in sizes:
             print(f"  rm {one_line(shlex.quote(str(path)))}")
+
+
+def _sizes(paths: Sequence[Path]) -> dict[Path, int]:
+    """Bytes of the files that are still there."""
+    sizes: dict[Path, int] = {}
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            sizes[path] = path.stat().st_size
+    return sizes

@@ -136,7 +136,7 @@ def _scan(file: BinaryIO, size: int, *, chunks: bool, wanted: ChannelFilter | No
             yield found
         offset += found.length
         if isinstance(found, Record) and found.opcode == OP_DATA_END:
-            if _end_is_whole(file, offset, size):
+            if end_is_whole(file, offset, size):
                 return
             resumed = next_chunk(file, offset, size)
             if resumed is None:
@@ -164,7 +164,7 @@ def summary_records(file: BinaryIO, offset: int, size: int) -> Iterator[Record]:
         offset += _HEAD.size + length
 
 
-def _end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
+def end_is_whole(file: BinaryIO, offset: int, size: int) -> bool:
     """Whether a summary that its CRC confirms, the footer and the magic stand from here to the end of the file."""
     footer_at = size - len(MAGIC) - _FOOTER_BYTES - _HEAD.size
     if footer_at < offset:

@@ -1,7 +1,7 @@
 """Where the chunks of a log stand, so that a job reads its own piece of it and nothing else.
 
-A finished part says so in its summary, which a CRC covers; one that was cut off is walked through. What is wrong with
-a chunk shows when it is read.
+A finished part says so in its summary, if its CRC confirms that; one that was cut off, or whose summary is damaged, is
+walked through. What is wrong with a chunk shows when it is read.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from daemon.log.scan import (
     OP_SCHEMA,
     Damage,
     Record,
+    end_is_whole,
     parse_record,
     scan,
     summary_records,
@@ -199,6 +200,8 @@ def _from_summary(file: BinaryIO, size: int, part: int) -> tuple[PartChannels, l
     opcode, length, summary_at, _, _, magic = _TAIL.unpack(tail)
     if (opcode, length, magic) != (2, 20, b"\x89MCAP0\r\n") or not 0 < summary_at < size:
         return None
+    if not end_is_whole(file, summary_at, size):
+        return None
     known = PartChannels({}, {})
     indexes: list[records.ChunkIndex] = []
     try:
@@ -238,7 +241,7 @@ def _place(index: records.ChunkIndex, part: int, known: PartChannels) -> ChunkPl
     )
 
 
-# ---------------------------------------------------------------------- a part that was cut off
+# ---------------------------------------------------------------------- a part without a whole summary
 
 
 def _from_walk(

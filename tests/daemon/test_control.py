@@ -15,15 +15,21 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE
+from daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE, Control
+from daemon.control_client import ANSWER_S
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
-from tests.daemon.rig import Recorder, free_udp_port, session_table
+from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recorder_faults import Numbers, scanner
+
+if TYPE_CHECKING:
+    from daemon.run import Assembly
 
 NOBODY = 65534
 CONNECT_AS = """
@@ -226,6 +232,22 @@ def test_what_is_no_socket_is_not_touched(tmp_path: Path, logs: Path) -> None:
         recorder.wait_said("control_absent")
         assert recorder.stop() == 0
     assert (logs / ".swath.control").read_text() == "a file of somebody's"
+
+
+def test_after_a_defect_nobody_waits_for_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    events = SimpleNamespace(post=lambda severity, source, code, text: said.append(code))
+    assembly = SimpleNamespace(parts=SimpleNamespace(directory=tmp_path), shared=SimpleNamespace(events=events))
+    monkeypatch.setattr(Control, "_turn", lambda self: 1 / 0)
+    control = Control(cast("Assembly", assembly))
+    control.open()
+    control.join(HANGS_S)
+    begin_s = time.monotonic()
+    assert "no recorder is running there" in swath("mark", "x", str(tmp_path)).stderr
+    assert time.monotonic() - begin_s < ANSWER_S
+    assert said == ["control_failed"]
+    control.close()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_path_longer_than_addresses_are(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from daemon.checksum_list import ChecksumList
+from daemon.cli.offload import _print as show
 from daemon.offload import BLOCK_BYTES, OffloadReport, offload
 from tests.daemon.commands import swath
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, session_table, wait_until
@@ -59,12 +60,12 @@ def coreutils_agree(folder: Path) -> int:
 
 
 def offload_json(logs: Path, disk: Path, *options: str) -> tuple[int, dict[str, Any], str]:
-    run = swath("offload", str(logs), str(disk), "--json", *options)
+    run = swath("offload", str(logs), str(disk), "--same-disk", "--json", *options)
     return run.returncode, json.loads(run.stdout), run.stderr
 
 
 def run_all(logs: Path, disk: Path, **options: Any) -> OffloadReport:
-    *_, report = offload(logs, disk, **options)
+    *_, report = offload(logs, disk, same_disk=True, **options)
     return report
 
 
@@ -87,7 +88,7 @@ def test_finished_parts_are_copied_and_the_growing_one_is_not(tmp_path: Path, lo
         time.sleep(0.5)
         finished = sorted(logs.glob("*.mcap"))[:2]
         before = state(logs)
-        run = swath("offload", str(recorder.config), str(disk))
+        run = swath("offload", str(recorder.config), str(disk), "--same-disk")
         assert run.returncode == 0, run.stderr
         assert {name: before[name] for name in before if not name.endswith("_2.mcap")} == {
             name: value for name, value in state(logs).items() if not name.endswith("_2.mcap")
@@ -113,7 +114,7 @@ def test_finished_parts_are_copied_and_the_growing_one_is_not(tmp_path: Path, lo
 def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
-    command = [sys.executable, "-m", "daemon.cli.main", "offload", str(logs), str(disk)]
+    command = [sys.executable, "-m", "daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.kill()
@@ -130,7 +131,7 @@ def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
 def test_ctrl_c_ends_it_quietly_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
-    command = [sys.executable, "-m", "daemon.cli.main", "offload", str(logs), str(disk)]
+    command = [sys.executable, "-m", "daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.send_signal(signal.SIGINT)
@@ -214,7 +215,7 @@ def test_verify_reads_again_and_finds_what_changed(logs: Path, disk: Path) -> No
 def test_a_log_that_a_crash_left_open_is_copied_and_said(logs: Path, disk: Path) -> None:
     path = logs / f"{INFO.session_id}_0.mcap"
     write_part(path, finish=False)
-    run = swath("offload", str(logs), str(disk))
+    run = swath("offload", str(logs), str(disk), "--same-disk")
     assert run.returncode == 0
     assert f"{path.name}: was left open by a crash and is copied as it is" in run.stdout
     assert (disk / path.name).read_bytes() == path.read_bytes()
@@ -268,7 +269,7 @@ def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_pa
         (logs, logs, 2, "is where the logs are"),
         (disk, tmp_path, 3, "no logs (*.mcap) there"),
     ):
-        run = swath("offload", str(where), str(to))
+        run = swath("offload", str(where), str(to), "--same-disk")
         assert (run.returncode, run.stderr.count("\n")) == (code, 1)
         assert said in run.stderr
 
@@ -276,10 +277,51 @@ def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_pa
 def test_a_list_of_sums_that_cannot_be_read_is_one_line(logs: Path, disk: Path) -> None:
     write_part(logs / "flight_0.mcap")
     (disk / "SHA256SUMS").mkdir()
-    run = swath("offload", str(logs), str(disk))
+    run = swath("offload", "--same-disk", str(logs), str(disk))
     assert (run.returncode, run.stderr.count("\n")) == (3, 1)
     assert run.stderr.startswith(f"swath: {disk}/SHA256SUMS: Is a directory; want another folder")
     assert names(disk) == ["SHA256SUMS"]
+
+
+def test_the_folder_of_a_disk_that_is_not_mounted_is_not_taken_for_it(
+    logs: Path, small_disk: Path, tmp_path: Path
+) -> None:
+    write_part(logs / "flight_0.mcap")
+    usb = tmp_path / "usb"
+    usb.mkdir()
+    run = swath("offload", str(logs), str(usb))
+    assert (run.returncode, run.stdout) == (3, "")
+    assert run.stderr == (
+        f"swath: {usb}: is on the same disk as {logs}; is the other disk mounted? --same-disk copies all the same\n"
+    )
+    assert names(usb) == []
+    run = swath("offload", str(logs), str(small_disk))
+    assert (run.returncode, names(small_disk)) == (0, ["SHA256SUMS", "flight_0.mcap"])
+
+
+def test_a_log_that_is_moved_away_meanwhile_hinders_no_other(logs: Path, disk: Path) -> None:
+    for part in range(2):
+        write_part(logs / f"flight_{part}.mcap", part=part)
+    run_all(logs, disk)
+
+    def move(name: str, done: int, total: int) -> None:
+        if done == total and name == "flight_0.mcap":
+            (logs / name).rename(logs / "moved")
+
+    report = run_all(logs, disk, verify=True, progress=move)
+    assert report.failed == [f"{logs / 'flight_0.mcap'}: No such file or directory"]
+    assert report.deletable == [logs / "flight_1.mcap"]
+
+
+def test_a_log_that_is_moved_away_when_it_may_be_deleted_is_not_listed(
+    logs: Path, disk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for part in range(2):
+        write_part(logs / f"flight_{part}.mcap", part=part)
+    report = run_all(logs, disk)
+    (logs / "flight_0.mcap").unlink()
+    show(report, verify=False)
+    assert [line for line in capsys.readouterr().out.splitlines() if "rm " in line] == [f"  rm {logs}/flight_1.mcap"]
 
 
 def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> None:
@@ -293,12 +335,12 @@ def test_a_disk_mounted_read_only_is_one_line(logs: Path, small_disk: Path) -> N
 
 def test_one_run_at_a_time(logs: Path, disk: Path) -> None:
     write_part(logs / "flight_0.mcap")
-    first = offload(logs, disk)
+    first = offload(logs, disk, same_disk=True)
     next(first)
-    run = swath("offload", str(logs), str(disk))
+    run = swath("offload", str(logs), str(disk), "--same-disk")
     assert (run.returncode, run.stderr) == (3, f"swath: {disk}: another swath offload is at work there\n")
     first.close()
-    assert swath("offload", str(logs), str(disk)).returncode == 0
+    assert swath("offload", str(logs), str(disk), "--same-disk").returncode == 0
 
 
 def test_the_list_keeps_other_lines_and_writes_odd_names_as_coreutils_do(disk: Path) -> None:

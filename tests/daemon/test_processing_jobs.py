@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import struct
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +13,10 @@ import pytest
 
 from daemon.cli.main import run_app
 from daemon.log.reader import open_logs
+from daemon.log.scan import summary_records
 from daemon.processing import products, workers
 from daemon.processing.jobs import Job, JobResult, SessionPlan, Tell, run_job
-from daemon.processing.log_index import index_log, read_chunks
+from daemon.processing.log_index import OP_CHUNK_INDEX, index_log, read_chunks
 from georef.strips import Segment
 from tests.daemon.one_line import Flown, fly
 
@@ -80,6 +82,19 @@ class TestIndex:
         assert cut.damage
         assert cut.chunks == whole.chunks
         assert whole.damage == []
+
+    def test_a_bit_of_the_summary_moves_no_chunk(self, flown: Flown, tmp_path: Path) -> None:
+        whole = index_log(open_logs([flown.log])[0])
+        log = flown.copy_of_log(tmp_path)
+        data = bytearray(log.read_bytes())
+        (summary_at,) = struct.unpack_from("<Q", data, len(data) - 28)
+        with log.open("rb") as file:
+            indexes = [one for one in summary_records(file, summary_at, len(data)) if one.opcode == OP_CHUNK_INDEX]
+        data[indexes[3].offset + 9 + 5] ^= 1  # of its first message's time: 18 minutes
+        log.write_bytes(data)
+        index = index_log(open_logs([log])[0])
+        assert index.chunks == whole.chunks
+        assert [one.damage.what for one in index.damage] == ["index and footer are missing, cut off or wrong"]
 
     def test_chunks_give_what_the_session_gives(self, flown: Flown) -> None:
         session = open_logs([flown.log])[0]
