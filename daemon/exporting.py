@@ -20,6 +20,7 @@ from typing import Any
 from daemon.errors import ExitCode, UserError
 from daemon.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
 from daemon.log.chunks import LogBatch
+from daemon.log.durable import sync_tree, try_sync_directory
 from daemon.log.format import LogError, safe_attachment_path
 from daemon.log.reader import Session
 from daemon.log_parsers import stored_config
@@ -74,10 +75,12 @@ def export_session(session: Session, directory: Path, progress: Callable[[int], 
     unfinished.mkdir()
     try:
         report = _Export(session, unfinished).run(progress)
+        sync_tree(unfinished)
         unfinished.rename(target)
     except BaseException:
         shutil.rmtree(unfinished, ignore_errors=True)
         raise
+    try_sync_directory(directory)
     report.folder = target
     return report
 

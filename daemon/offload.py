@@ -17,7 +17,7 @@ from typing import Any
 from daemon.checksum_list import NAME, ChecksumList
 from daemon.errors import ExitCode, UserError
 from daemon.log.claim import is_being_written
-from daemon.log.durable import sync_directory
+from daemon.log.durable import try_sync_directory
 from daemon.log.format import MAGIC
 from daemon.log.reader import RECOVERED
 from daemon.parts import read_sign
@@ -236,8 +236,7 @@ def _copy_new(path: Path, report: OffloadReport, sums: ChecksumList, progress: P
     times = path.stat()
     os.utime(partial, ns=(times.st_atime_ns, times.st_mtime_ns))
     partial.rename(copy)
-    with contextlib.suppress(OSError):  # not every file system syncs directories
-        sync_directory(report.destination)
+    try_sync_directory(report.destination)
     sums.add(path.name, digest)
     report.copied.append(Copied(path.name, size, digest, resumed))
 

@@ -16,13 +16,19 @@ from pathlib import Path
 
 from daemon.events import Events, Severity
 from daemon.log.claim import is_being_written
+from daemon.log.format import LogError
+from daemon.log.reader import read_part_head
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _LOOK_AGAIN_S = 60.0
+_HEAD_BYTES = 4096  # of a part at most: header and session
 
 
 def unfinished_logs(directory: Path) -> list[Path]:
-    """Logs of a directory without their end and without a repaired copy, oldest first."""
+    """Logs of a directory without their end and without a repaired copy, oldest first.
+
+    What a crash leaves at a part's very beginning is none: nothing is in it that could be repaired.
+    """
     found: list[tuple[float, Path]] = []
     with contextlib.suppress(FileNotFoundError):  # the directory itself
         for path in directory.glob("*.mcap"):
@@ -39,7 +45,17 @@ def _left_open_since(path: Path) -> float | None:
     with path.open("rb") as file:
         stat = os.fstat(file.fileno())
         file.seek(max(0, stat.st_size - len(MCAP_MAGIC)))
-        return None if file.read() == MCAP_MAGIC else stat.st_mtime
+        if file.read() == MCAP_MAGIC or (stat.st_size < _HEAD_BYTES and not _has_head(path)):
+            return None
+        return stat.st_mtime
+
+
+def _has_head(path: Path) -> bool:
+    try:
+        read_part_head(path)
+    except LogError:
+        return False
+    return True
 
 
 async def repair_left_open(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 from pathlib import Path
@@ -32,3 +33,32 @@ def sync_directory(directory: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+def try_sync_directory(directory: Path) -> None:
+    """As `sync_directory`, as far as the file system does it: not every one syncs directories."""
+    with contextlib.suppress(OSError):
+        sync_directory(directory)
+
+
+def sync_file(path: Path) -> None:
+    """Make durable what somebody wrote to a file.
+
+    Raises:
+        OSError: it cannot be opened or synced.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def sync_tree(folder: Path) -> None:
+    """Make durable all files below a folder, and their names; raises OSError."""
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            try_sync_directory(path)
+        else:
+            sync_file(path)
+    try_sync_directory(folder)

@@ -26,6 +26,7 @@ from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import Calibrated, CalibrateWish
 from daemon.processing.sidecar import sha256_of
+from daemon.processing.trajectory_files import write_whole
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 OUTCOME = "calibration.json"
@@ -86,17 +87,9 @@ def _paths(wish: CalibrateWish, headers: Mapping[str, Header]) -> dict[str, Path
 
 
 def _write(files: Mapping[Path, bytes]) -> None:
-    """Beside their places first, so that none is half there."""
-    partial = {path: path.with_name(path.name + ".partial") for path in files}
     try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial[path].write_bytes(data)
-        for path in files:
-            partial[path].replace(path)
+        write_whole(files)
     except OSError as error:
-        for path in partial.values():
-            path.unlink(missing_ok=True)
         raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
 
 

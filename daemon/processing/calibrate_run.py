@@ -188,7 +188,8 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
-    return Calibrated(kept, flight, features, prior, start, adjusted, points, checked, (*notes, *adjusted.notes))
+    told = (*kept.holes, *notes, *adjusted.notes)
+    return Calibrated(kept, flight, features, prior, start, adjusted, points, checked, told)
 
 
 def _aligned(flight: Flight) -> dict[str, Calibration]:

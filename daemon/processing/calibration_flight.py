@@ -66,6 +66,11 @@ class KeptFlight:
     logged: list[LoggedFlight]
     results: list[JobResult]
 
+    @property
+    def holes(self) -> list[str]:
+        """What is missing of what was asked for, a line each."""
+        return [line for flight in self.logged for line in flight.holes]
+
 
 def read_flight(wish: Wish, folder: Path, tell: Steps) -> KeptFlight:
     """Read logs.

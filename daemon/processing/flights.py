@@ -147,14 +147,15 @@ class Flight:
 
 
 def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
-    """The flights of a wish, with trajectories and strips.
+    """The flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
 
     Raises:
         UserError: they cannot be georeferenced, or not together.
         LogError, OSError: a log cannot be read.
         StripError, MappingError: in one line.
     """
-    sessions = open_logs(wish.logs)
+    passed_over: list[str] = []
+    sessions = open_logs(wish.logs, passed_over)
     setups = [_setup(wish, session) for session in sessions]
     logs = [session.parts[0].path for session in sessions]
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
@@ -163,6 +164,7 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
         flights.append(_read(session, setup))
+    flights[0].holes += [f"passed over: {line}" for line in passed_over]
     refusals.refuse_overlap({flight.log: flight.span for flight in flights})
     for flight in flights:
         _choose(wish, flight)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from daemon.errors import ExitCode, UserError
+from daemon.log.durable import sync_file, try_sync_directory
 from daemon.processing import refusals
 from daemon.processing.flights import EIGHT_BIT, INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
@@ -136,11 +137,14 @@ def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Call
     partial.mkdir()
 
     def into_place(files: list[Path]) -> None:
+        for file in files:
+            sync_file(file)
         sidecar.unlink(missing_ok=True)
         for old in [file for one in names for file in output.glob(f"{one}_strip*") if file.name.endswith(ENDINGS)]:
             old.unlink()
         for file in files:
             file.replace(output / file.name)
+        try_sync_directory(output)
 
     try:
         yield partial, into_place

@@ -6,7 +6,6 @@ import hashlib
 import importlib.metadata
 import json
 import math
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daemon.processing.models import air_of
+from daemon.processing.trajectory_files import write_whole
 from daemon.processing.unread import unread_lines
 from georef.calibration import PARAMETERS
 from georef.points import Fate
@@ -278,10 +278,4 @@ def utc_text(time_ns: int) -> str:
 
 def write_sidecar(path: Path, content: dict[str, Any]) -> None:
     """Write it whole or not at all; raises OSError."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", encoding="utf-8") as file:
-        json.dump(content, file, indent=2, ensure_ascii=False)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    write_whole({path: (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()})

@@ -21,7 +21,7 @@ from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, files_of
 from daemon.processing.strips_run import finite
-from daemon.processing.trajectory_files import put_in_place, remove, write_aside, write_trajectory
+from daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
 from daemon.processing.trajectory_summary import write_json
 from georef.trajectory import Trajectory
 
@@ -48,14 +48,14 @@ def write_adjustment(wish: AdjustWish, done: StripsCorrected, tell: Callable[[st
     written: list[tuple[Path, Path]] = []
     made = not wish.output.exists()
     try:
-        for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
-            written += write_trajectory(own, _as_given(flight, trajectory), None)
-        record = finite(_record(wish, done, written))
-        path = wish.output / RECORD
-        written.append((write_aside(path, partial(write_json, record)), path))
+        with gone_on_failure(written):
+            for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
+                written += write_trajectory(own, _as_given(flight, trajectory), None)
+            record = finite(_record(wish, done, written))
+            path = wish.output / RECORD
+            written.append((write_aside(path, partial(write_json, record)), path))
         put_in_place(written)
     except OSError as error:
-        remove(written)
         if made and wish.output.is_dir() and not any(wish.output.iterdir()):
             wish.output.rmdir()
         raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error

@@ -178,7 +178,7 @@ def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     adjusted = adjust_strips(flight, features, calibrations, wish.settings)
     tell("strips before and after", 0, 1)
     before, after = differences(flight), differences(moved(adjusted, "adjusted"))
-    notes += [*_notes(wish, flight, features, before), *adjusted.notes]
+    notes += [*kept.holes, *_notes(wish, flight, features, before), *adjusted.notes]
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 

@@ -125,7 +125,9 @@ def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> 
     folder.mkdir(parents=True, exist_ok=True)
     kept = read_flight(replace(wish.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
-    return strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules)
+    strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules)
+    strips.notes.extend(kept.holes)
+    return strips
 
 
 def refuse_installations(logged: Sequence[Any]) -> None:

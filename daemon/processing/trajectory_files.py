@@ -6,9 +6,10 @@ Epochs are written in blocks, so that five hours of them do not stand in memory 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import ExitCode, UserError
+from daemon.log.durable import try_sync_directory
 from georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
 from georef.formats.trajectory_csv import csv_text
 from georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
@@ -113,13 +115,10 @@ def write_trajectory(
         (files.smrmsg, lambda stream: _write(stream, _smrmsg_blocks(trajectory, velocity_sigma_l))),
         (files.csv, lambda stream: _write(stream, _csv_blocks(trajectory))),
     )
-    try:
+    with gone_on_failure(written):
         for path, write in wanted:
             if path is not None:
                 written.append((write_aside(path, write), path))
-    except OSError:
-        remove(written)
-        raise
     return written
 
 
@@ -132,16 +131,42 @@ def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
             write(stream)
             stream.flush()
             os.fsync(stream.fileno())
-    except OSError:
+    except BaseException:  # an interrupt too
         aside.unlink(missing_ok=True)
         raise
     return aside
 
 
 def put_in_place(written: list[tuple[Path, Path]]) -> None:
-    """Files to their names, in the order given."""
-    for aside, path in written:
-        aside.replace(path)
+    """Files to their names, in the order given, and the names to the disk; OSError: it cannot be, nothing is aside."""
+    with gone_on_failure(written):
+        for aside, path in written:
+            aside.replace(path)
+    for folder in dict.fromkeys(path.parent for _, path in written):
+        try_sync_directory(folder)
+
+
+def write_whole(files: Mapping[Path, bytes]) -> None:
+    """Write files, all of them aside before the first is put in its place; OSError: it cannot be, nothing is aside."""
+    written: list[tuple[Path, Path]] = []
+    with gone_on_failure(written):
+        for path, data in files.items():
+            written.append((write_aside(path, partial(_put, data)), path))
+    put_in_place(written)
+
+
+def _put(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)
+
+
+@contextmanager
+def gone_on_failure(written: list[tuple[Path, Path]]) -> Iterator[None]:
+    """What was written aside goes where it comes to nothing, by an interrupt too."""
+    try:
+        yield
+    except BaseException:
+        remove(written)
+        raise
 
 
 def remove(written: list[tuple[Path, Path]]) -> None:

@@ -71,13 +71,16 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
         UserError: there is no trajectory, a line each; no file is left then.
     """
     with told_in_a_line(wish.output, TrajectoryError):
-        sessions = open_logs(wish.logs)
+        passed_over: list[str] = []
+        sessions = open_logs(wish.logs, passed_over)
+        holes = [f"passed over: {line}" for line in passed_over]
         files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
         if not wish.overwrite:
             files.refuse_existing(wish.events)
         if wish.navigate.inputs.ins == AS_IS:
-            return _write_as_is(wish, files, _in_order(sessions))
+            return _write_as_is(wish, files, _in_order(sessions), holes)
         flights = [navigate_session(session, wish.navigate, tell) for session in _in_order(sessions)]
+        flights[0].holes.extend(holes)
         return _write(wish, files, flights, tell)
 
 
@@ -104,14 +107,16 @@ def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navig
     return TrajectoryReport(record, files.summary, [path for _, path in written])
 
 
-def _write_as_is(wish: TrajectoryWish, files: TrajectoryFiles, sessions: Sequence[Session]) -> TrajectoryReport:
+def _write_as_is(
+    wish: TrajectoryWish, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
+) -> TrajectoryReport:
     """The devices' own INS, without a page."""
     if wish.events is not None:
         raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
     found = [ins_as_is(session, wish.navigate.inputs.config) for session in sessions]
     _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in zip(sessions, found, strict=True)])
     trajectory = joined_trajectory([one.trajectory for one in found], found[0].trajectory.name)
-    record = summary_head(wish, AS_IS, sessions, [line for one in found for line in one.holes], [])
+    record = summary_head(wish, AS_IS, sessions, [*(line for one in found for line in one.holes), *holes], [])
     record["sessions"] = [
         {"session": session.session_id, "ins": one.source, "solutions": dict(sorted(one.solutions.items()))}
         for session, one in zip(sessions, found, strict=True)

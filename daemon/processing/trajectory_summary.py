@@ -13,11 +13,12 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from daemon.log.durable import sync_file
 from daemon.processing.navigation_figures import figures_of
 from daemon.processing.navigation_series import Flight, separation_of
 from daemon.processing.navigation_verdict import judge
 from daemon.processing.sidecar import sha256_of, utc_text
-from daemon.processing.trajectory_files import PARTIAL
+from daemon.processing.trajectory_files import PARTIAL, gone_on_failure
 
 if TYPE_CHECKING:
     from daemon.log.reader import Session
@@ -43,7 +44,9 @@ class Page:
         from daemon.processing.navigation_page import write_page  # matplotlib, which the rest does without
 
         aside = path.with_name(path.name + PARTIAL)
-        verdict, figures = write_page(aside, self.flight, self.findings)
+        with gone_on_failure([(aside, path)]):
+            verdict, figures = write_page(aside, self.flight, self.findings)
+            sync_file(aside)
         return verdict, figures, aside
 
     def judge(self) -> tuple[Any, Any]:

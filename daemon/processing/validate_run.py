@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from calib.control import ControlError
 from calib.features import ControlPoint
@@ -23,7 +22,7 @@ from daemon.processing.calibration_flight import KeptFlight, read_flight, replac
 from daemon.processing.flights import Wish
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strips_run import finite, refuse_installations
-from daemon.processing.trajectory_files import put_in_place, remove, write_aside
+from daemon.processing.trajectory_files import write_whole
 from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.validate_record import record_files, records_of
 from georef.calibration import Calibration, CalibrationError, read_calibration
@@ -146,7 +145,7 @@ def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -
     found.logs = [(path.name, sha256_of(path)) for path in paths]
     dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
     found.validation = replace(validation, dependent=dependent)
-    found.notes += notes
+    found.notes += [*kept.holes, *notes]
 
 
 def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
@@ -269,16 +268,8 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
 
         files[output / PICTURE] = history_png(found.histories)
     files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
-    written: list[tuple[Path, Path]] = []
     try:
-        for path, data in files.items():
-            written.append((write_aside(path, partial(_put, data)), path))
-        put_in_place(written)
+        write_whole(files)
     except OSError as error:
-        remove(written)
         raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
     return [str(path) for path in files]
-
-
-def _put(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)

@@ -60,9 +60,20 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     warm_calibration()
     warm = loops()
     assert len(warm) > 5
-    assert run_app(arguments(made, folder / "left.toml", *report)) == 0
+    logs = folder / "logs"
+    logs.mkdir()
+    (logs / made.flown.log.name).symlink_to(made.flown.log)
+    (logs / "begun_0.mcap").touch()  # as a power cut leaves it at a part's beginning
+    given = arguments(made, folder / "left.toml", *report)
+    given[given.index(str(made.flown.log))] = str(logs)
+    assert run_app(given) == 0
     (folder / "new_loops").write_text("\n".join(sorted(loops() - warm)))
     return folder
+
+
+def test_what_of_a_directory_is_no_log_is_passed_over_and_told(products: Path) -> None:
+    record = json.loads((products / "report" / "calibration.json").read_text())
+    assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is no MCAP file"
 
 
 def refused(capsys: pytest.CaptureFixture[str], output: Path, given: list[str]) -> str:

@@ -92,6 +92,27 @@ def test_damaged_datagrams_make_it_partial(flown: Flown, tmp_path: Path, capsys:
     assert missing > 1200  # a second of a laser of 1.5 kHz, and some
 
 
+def test_what_of_a_directory_is_no_log_is_passed_over(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a power cut leaves one at a part's beginning, and as somebody else's tool writes them."""
+    _, alone = georef(flown, tmp_path / "alone")
+    log = flown.copy_of_log(tmp_path / "logs")
+    begun, foreign = log.with_name("begun_0.mcap"), log.with_name("foreign.mcap")
+    begun.touch()
+    foreign.write_text("no log")
+    arguments = flown.arguments(tmp_path / "out", "--no-sigma", log=log.parent)
+    capsys.readouterr()
+    assert run_app(arguments) == 1
+    assert f"partial: passed over: {begun}: is no MCAP file; " in capsys.readouterr().err
+    told = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
+    assert told["holes"][:2] == [f"passed over: {path}: is no MCAP file" for path in (begun, foreign)]
+    assert told["holes"][2:] == [hole.replace(str(flown.log), str(log)) for hole in alone["holes"]]
+    assert told["counts"] == alone["counts"]
+    named = flown.arguments(tmp_path / "named", "--no-sigma", log=begun)
+    assert run_app(named) == 3
+
+
 def refused_alone(flown: Flown) -> dict[str, int]:
     """What a parser refuses that is given all of the log's datagrams at once."""
     (session,) = open_logs([flown.log])

@@ -26,6 +26,7 @@ from daemon.repair import MCAP_MAGIC, unfinished_logs
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until
+from tests.daemon.test_log import write_part
 
 SPECIAL = "tests.daemon.special_recorder"
 
@@ -208,9 +209,19 @@ def test_directory_removed_while_recording(tmp_path: Path, logs: Path, numbers: 
 def test_logs_that_vanish_while_they_are_looked_for_hinder_no_repair(tmp_path: Path) -> None:
     assert unfinished_logs(tmp_path / "gone") == []
     (tmp_path / "moved_0.mcap").symlink_to(tmp_path / "elsewhere.mcap")  # listed, and not there when it is opened
-    (tmp_path / "left_0.mcap").write_bytes(MCAP_MAGIC + b"begun")
+    write_part(tmp_path / "left_0.mcap", finish=False)
     (tmp_path / "whole_0.mcap").write_bytes(MCAP_MAGIC + b"and ended" + MCAP_MAGIC)
     assert unfinished_logs(tmp_path) == [tmp_path / "left_0.mcap"]
+
+
+def test_what_a_power_cut_leaves_of_a_parts_beginning_is_not_repaired_at_every_start(tmp_path: Path) -> None:
+    whole = tmp_path / "left_0.mcap"
+    write_part(whole, finish=False, blocks=0)
+    head = whole.read_bytes()
+    assert unfinished_logs(tmp_path) == [whole]
+    for number, left in enumerate((b"", head[:8], head[:60], bytes(len(head)))):
+        (tmp_path / f"begun_{number}.mcap").write_bytes(left)
+    assert unfinished_logs(tmp_path) == [whole]
 
 
 def test_lock_and_control_socket_come_back_with_the_directory(tmp_path: Path, logs: Path) -> None:

@@ -284,6 +284,18 @@ class TestRefusals:
         assert log.name in told["holes"][0]
         assert read(tmp_path, flown).span[1] > flown.truth().span[0] + 35 * S
 
+    def test_what_of_a_directory_is_no_log_is_passed_over(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        logs = tmp_path / "logs"
+        logs.mkdir()
+        (logs / flown.log.name).symlink_to(flown.log)
+        begun = logs / "begun_0.mcap"
+        begun.touch()
+        said = self.refused(capsys, str(logs), "-o", str(tmp_path / "a.sbet"), "--no-page")
+        assert said.endswith(f"a.json: partial: passed over: {begun}: is no MCAP file\n")
+        assert summary(tmp_path)["holes"] == [f"passed over: {begun}: is no MCAP file"]
+
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,nan", "200,0,0", "0,91,0", "0,0,400", ""])
 def test_an_attitude_that_cannot_be_is_refused(text: str) -> None:
