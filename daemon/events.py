@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
-from collections import deque
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
@@ -45,14 +43,12 @@ class Event:
 
 
 class Events:
-    """Takes events from every thread, logs them and hands them to the recorder; remembers the newest for people."""
+    """Takes events from every thread, logs them and hands them to the recorder."""
 
     def __init__(self, clock: HostClock, queue: BlockQueue, channels: ChannelTable) -> None:
         self._clock = clock
         self._queue = queue
         self._channel = JsonChannel(channels, "events", "/events", "swath.Event")
-        self._lock = threading.Lock()
-        self.recent: deque[Event] = deque(maxlen=100)
         self.channel_id = self._channel.channel_id
 
     def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
@@ -67,8 +63,6 @@ class Events:
 
     def _note(self, severity: Severity, source: str, code: str, text: str) -> Event:
         event = Event(self._clock.now_ns(), severity, source, code, text)
-        with self._lock:
-            self.recent.append(event)
         log.log(_LOG_LEVEL[severity], "%s %s: %s", source, code, text)
         return event
 

@@ -88,17 +88,14 @@ class StampConverter:
         self._previous_read_ns = clock.now_ns()
         self.ambiguous = 0
 
-    def convert(self, stamps_ns: Int64Array | None, count: int) -> Int64Array:
-        """Host times of the units of a batch that has just been read.
+    def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
+        """Host times of the units of a batch.
 
         Args:
             stamps_ns: (n,) CLOCK_REALTIME stamps, 0 where a unit came without; None where the transport has none.
             count: n.
+            pair: the clocks as they were read after the batch.
         """
-        return self.convert_at(stamps_ns, count, read_clock_pair())
-
-    def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
-        """As `convert`, with the clock reading taken after the batch given."""
         read_ns = pair.monotonic_ns + self._clock.offset_ns
         old_step = self._step_ns
         new_step = self._clock.step_ns(pair)

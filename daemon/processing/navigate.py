@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
-from daemon.log.reader import Session, open_logs
+from daemon.log.reader import Session
 from daemon.processing.ins_point import point_doubts
 from daemon.processing.mapped_storage import MappedStorage
 from daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
@@ -115,21 +113,6 @@ class Navigated:
     def velocity_sigma_l(self) -> FloatArray:
         """(n, 3) m/s of the trajectory's epochs."""
         return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
-
-
-def navigate_log(paths: Sequence[Path], wish: NavigateWish | None = None) -> Trajectory:
-    """The smoothed trajectory of the body in one session's log; the same log gives the same, bit for bit.
-
-    Raises:
-        UserError: it cannot be navigated, a line each.
-    """
-    try:
-        sessions = open_logs(paths)
-        if len(sessions) != 1:
-            raise UserError(f"{paths[0]}: {len(sessions)} sessions, want one", ExitCode.USAGE)
-        return navigate_session(sessions[0], wish or NavigateWish()).trajectory()
-    except LogError as error:
-        raise UserError(str(error), ExitCode.IO) from error
 
 
 def navigate_session(session: Session, wish: NavigateWish, tell: Tell = lambda what, done, total: None) -> Navigated:

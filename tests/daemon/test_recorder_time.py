@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from daemon.config import load_config
-from daemon.events import Event
 from daemon.host_clock import ClockDiscipline
 from daemon.run import Assembly, assemble
 from daemon.wire_player import TimedUnit
 from demo.captures import gnss_units, pps_units
 from drivers.transports.base import UnitBlock
 from georef.timescales import SECOND_NS, PpsClock
+from tests.daemon.journal import journal_of
 from tests.daemon.rig import session_table
 
 SECONDS = 40
@@ -123,40 +123,50 @@ def play_changing(assembly: Assembly, *, edges: bool, messages: bool) -> dict[st
     return states
 
 
-def told_of(assembly: Assembly, *codes: str) -> list[str]:
-    return [event.code for event in assembly.shared.events.recent if event.code in codes]
+def told_of(caplog: pytest.LogCaptureFixture, *codes: str) -> list[str]:
+    return [event.code for event in journal_of(caplog) if event.code in codes]
 
 
-def test_a_receiver_that_changes_its_messages_is_told_and_edges_carry_the_second_on(tmp_path: Path) -> None:
+def test_a_receiver_that_changes_its_messages_is_told_and_edges_carry_the_second_on(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    caplog.set_level("INFO", "swath")
     assembly = assembled(tmp_path / "x")
     states = play_changing(assembly, edges=True, messages=True)
     assert set(states["gnss/rover"][12:SECONDS]) == {"LOCKED"}
     assert set(states["gnss/rover"][SECONDS + 6 : SECONDS + 30]) == {"HOLDOVER"}  # then there are no edges any more
-    assert told_of(assembly, "time_messages_stopped", "time_messages_back", "second_ambiguous") == [
+    assert told_of(caplog, "time_messages_stopped", "time_messages_back", "second_ambiguous") == [
         "time_messages_stopped",
         "time_messages_back",
     ]
 
 
-def test_time_without_pps_is_coarse_and_lost_a_minute_after_its_last_message(tmp_path: Path) -> None:
+def test_time_without_pps_is_coarse_and_lost_a_minute_after_its_last_message(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    caplog.set_level("INFO", "swath")
     assembly = assembled(tmp_path / "x")
     states = play_changing(assembly, edges=False, messages=True)
     assert states["gnss/rover"][0] == "NO_TIME"
     assert set(states["gnss/rover"][8 : SECONDS + 59]) == {"COARSE"}
     assert states["gnss/rover"][SECONDS + 62 :] == ["LOST"] * 8
     assert states["pps/main"] == states["gnss/rover"]  # they share the clock
-    assert told_of(assembly, "time_messages_stopped") == ["time_messages_stopped"]  # at the end no data comes at all
+    assert told_of(caplog, "time_messages_stopped") == ["time_messages_stopped"]  # at the end no data comes at all
 
 
-def test_pps_without_time_says_no_second(tmp_path: Path) -> None:
+def test_pps_without_time_says_no_second(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    caplog.set_level("INFO", "swath")
     assembly = assembled(tmp_path / "x")
     states = play_changing(assembly, edges=True, messages=False)
     assert set(states["pps/main"]) == set(states["gnss/rover"]) == {"NO_TIME"}
-    assert told_of(assembly, "second_known", "time_messages_stopped") == []
+    assert told_of(caplog, "second_known", "time_messages_stopped") == []
 
 
 @pytest.mark.parametrize("broken", ["parser", "clock"])
-def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(tmp_path: Path, broken: str) -> None:
+def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path, broken: str
+) -> None:
+    caplog.set_level("INFO", "swath")
     assembly = assembled(tmp_path / "x")
     keeper = assembly.timekeeper
 
@@ -169,8 +179,7 @@ def test_a_defect_in_time_keeping_is_told_once_and_never_reaches_the_recording(t
         for method in ("add_edge", "status", "set_wall_clock"):
             setattr(keeper._clocks["pps/main"], method, defect)
     play(assembly)
-    told = [event for event in assembly.shared.events.recent if event.code == "time_parser_failed"]
+    told = [event for event in journal_of(caplog) if event.code == "time_parser_failed"]
     assert {event.source for event in told} == ({"gnss/rover"} if broken == "parser" else {"clock", "pps/main"})
     assert len(told) == len({event.source for event in told})
-    assert isinstance(told[0], Event)
     assert keeper.status("pps/main", assembly.clock.now_ns())["time_state"] == "NO_TIME"

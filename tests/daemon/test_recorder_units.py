@@ -30,6 +30,7 @@ from daemon.sd_notify import ServiceManager
 from daemon.wire_trouble import WireTrouble
 from drivers.session import Session
 from drivers.transports.base import PpsSource, RawEdge, TransportCounters
+from tests.daemon.journal import journal_of
 from tests.daemon.log_check import official_counts, read_log
 
 SOURCE = "gnss/rover"
@@ -113,7 +114,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         parts.current.close()
 
 
-def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench) -> None:
+def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     sign = bench.logs / "recording.json"
     sign.unlink()
     (sign / "in the way").mkdir(parents=True)
@@ -122,7 +123,7 @@ def test_a_failed_opening_leaves_nothing_and_recording_goes_on(bench: Bench) -> 
     bench.turn()
     assert [path.name for path in bench.logs.glob("*.mcap")] == ["unit_0.mcap"]
     assert bench.recorder.health.state is Writing.RECORDING
-    assert bench.events.recent[-1].code == "split_failed"
+    assert journal_of(caplog)[-1].code == "split_failed"
     (sign / "in the way").rmdir()
     sign.rmdir()
     bench.receive(5)
@@ -259,7 +260,7 @@ def test_edges_overwritten_in_the_kernel_are_units_lost(overwrites: bool, lost: 
 # --- a wire's own trouble --------------------------------------------------------------------------------------------
 
 
-def test_trouble_is_told_at_once_and_while_it_goes_on_every_half_minute() -> None:
+def test_trouble_is_told_at_once_and_while_it_goes_on_every_half_minute(caplog: pytest.LogCaptureFixture) -> None:
     clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
     events = Events(clock, queue, channels)
     now_s = 1000.0
@@ -274,7 +275,7 @@ def test_trouble_is_told_at_once_and_while_it_goes_on_every_half_minute() -> Non
     now_s += 60.0
     trouble.look(counters)
     trouble.look(counters)
-    told = [(event.code, event.severity, int(event.text.split()[0])) for event in events.recent]
+    told = [(event.code, event.severity, int(event.text.split()[0])) for event in journal_of(caplog)]
     errors = [("can_errors", Severity.WARNING, count) for count in (10, 300, 300, 300, 90)]
     assert told == [*errors[:2], ("can_bus_off", Severity.ERROR, 1), *errors[2:]]
 

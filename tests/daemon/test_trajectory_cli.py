@@ -15,8 +15,9 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from daemon.cli.main import run_app
+from daemon.log.reader import open_logs
 from daemon.processing.event_marks import PLACED
-from daemon.processing.navigate import attitude_of_text, navigate_log
+from daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
 from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory
 from tests.daemon.short_flight import MARK_AFTER_NS, Flown, fly_short
@@ -170,7 +171,8 @@ class TestSmoothed:
             assert float(row["height_m"]) == pytest.approx(np.interp(0.0, since, height), abs=0.1)
 
     def test_the_function_for_georeferencing_gives_the_same(self, flown: Flown, made: Path) -> None:
-        trajectory, again = read(made, flown), navigate_log([flown.log])
+        trajectory = read(made, flown)
+        again = navigate_session(open_logs([flown.log])[0], NavigateWish()).trajectory()
         assert np.abs(again.position_e - trajectory.position_e).max() < 1e-6
         assert np.abs(again.position_sigma_l - trajectory.position_sigma_l).max() < 1e-12
 
