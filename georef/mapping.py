@@ -177,7 +177,7 @@ class Mapping:
 
     def description(self) -> dict[str, Any]:
         """What a sidecar states of the frame: plain numbers and texts."""
-        target, (_, datum, epoch, _) = self._target, self._said
+        target, (_, datum, epoch, accuracy_m) = self._target, self._said
         stated: dict[str, Any] = {
             "crs": target.text,
             "name": str(target.crs.name),
@@ -185,7 +185,9 @@ class Mapping:
             "units": {"metres": self.unit_m.tolist(), "names": self._unit_names()},
             "heights": self._heights(),
             "datum": self._datum_text(datum),
+            "datum_said": datum,
             "epoch": epoch,
+            "accuracy_wanted_m": accuracy_m,
             "proj": pyproj.proj_version_str,
             "epsg": str(get_database_metadata("EPSG.VERSION")),
             "approximation_m": APPROXIMATION_M,

@@ -160,8 +160,7 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
     trajectories = _trajectories(look)
     if not trajectories or not all(sidecars):
         return None, lambda points: points
-    crs, options = sidecars[0]["crs"], sidecars[0].get("options", {})
-    mapping = Mapping(crs["crs"], datum=options.get("datum"), epoch=crs.get("epoch"))
+    mapping = _mapping_of(sidecars[0]["crs"])
     middle = trajectories[0].position_e[len(trajectories[0]) // 2]
     mapping.settle(middle[np.newaxis])
     frame = Tangent.at(middle)
@@ -172,6 +171,15 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
 
     flown = [_flown(look, number, trajectories) for number in range(len(look.names))]
     return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names)), place
+
+
+def _mapping_of(crs: dict[str, Any]) -> Mapping:
+    """The frame of a sidecar's points, by what was said of it, on the command line or in the configuration."""
+    if "datum_said" not in crs or "accuracy_wanted_m" not in crs:
+        raise MappingError(
+            "the sidecar beside the points does not say of which datum they are; want swath georef again"
+        )
+    return Mapping(crs["crs"], datum=crs["datum_said"], epoch=crs.get("epoch"), accuracy_m=crs["accuracy_wanted_m"])
 
 
 def _trajectories(look: Look) -> list[Trajectory]:

@@ -17,11 +17,13 @@ from calib.flight import Flight
 from calib.strip_cells import StripRules
 from daemon.cli import strips
 from daemon.errors import ExitCode, UserError
-from daemon.processing.strips_inputs import strips_of_flight
+from daemon.processing.setup import Options, Setup
+from daemon.processing.strips_inputs import strips_of_files, strips_of_flight
 from daemon.processing.strips_run import refuse_installations
 from georef.formats.trajectory_csv import csv_text
 from georef.mapping import Mapping
 from tests.calib.cast_flight import Cast, cast_flight
+from tests.daemon.standin import aircraft_config
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -52,10 +54,10 @@ def made() -> Cast:
     return cast_flight(FLAT, LINES, prf_hz=40_000.0, true={})
 
 
-def products(folder: Path, flight: Flight) -> Path:
+def products(folder: Path, flight: Flight, mapping: Mapping | None = None) -> Path:
     """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar."""
     folder.mkdir()
-    mapping = Mapping("EPSG:25832", datum="same")
+    mapping = mapping or Mapping("EPSG:25832", datum="same")
     for number, swath in enumerate(flight.swaths, start=1):
         points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
         seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
@@ -74,8 +76,7 @@ def products(folder: Path, flight: Flight) -> Path:
     (folder / "a_trajectory.csv").write_text(csv_text(flight.trajectories[0]))
     sidecar = {
         "strips": [{"number": number, "file": f"a_strip{number:02d}.laz"} for number in (1, 2)],
-        "crs": {"crs": "EPSG:25832", "epoch": None},
-        "options": {"datum": "same"},
+        "crs": mapping.description(),
     }
     (folder / "a.json").write_text(json.dumps(sidecar))
     return folder
@@ -142,8 +143,6 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
 
 def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     """Both ways to the same differences: arrays in t, and LAZ in a projection."""
-    from daemon.processing.strips_inputs import strips_of_files
-
     of_flight = strips_of_flight("flight", made.flight, StripRules())
     of_files = strips_of_files([products(tmp_path / "p", made.flight)], StripRules(), lambda what, done, of: None)
     numbers = [one.look.overlap.numbers() for one in (of_flight, of_files)]
@@ -152,6 +151,40 @@ def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     assert numbers[0]["rms_m"] == pytest.approx(numbers[1]["rms_m"], rel=0.1)
     heights = of_files.gathered.points[:, 2], of_flight.gathered.points[:, 2]
     assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},  # EPSG:7912, moved to ETRS89
+        {'datum = "EPSG:7912"': 'datum = "same"'},
+        {'datum = "EPSG:7912"\n': "", "datum_accuracy_m = 0.05": "datum_accuracy_m = 2.0"},
+    ],
+)
+def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said: dict[str, str]) -> None:
+    """Points and trajectory are in one place whoever said the datum and how good the way there must be."""
+    setup = Setup.of_config(aircraft_config(tmp_path / "c", said), Options(crs="EPSG:25832", uncertainty=False))
+    assert setup.mapping is not None
+    setup.mapping.settle(made.flight.trajectories[0].position_e[:1])
+    folder = products(tmp_path / "p", made.flight, setup.mapping)
+    of_files = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    assert of_files.notes == []
+    assert of_files.seen is not None
+    swath, gathered = made.flight.swaths[0], of_files.gathered
+    own = np.flatnonzero((gathered.time_ns > swath.time_ns[0]) & (gathered.time_ns < swath.time_ns[-1]))
+    pulse = np.searchsorted(swath.time_ns, gathered.time_ns[own] - 1000)  # of the file, to 0.1 µs
+    assert len(own) > 1000
+    there = made.flight.frame.e_from_t(np.asarray(swath.points_t[pulse]))
+    assert np.abs(of_files.seen.frame.e_from_t(gathered.points[own]) - there).max() < 0.01
+
+
+def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> None:
+    folder = products(tmp_path / "p", made.flight)
+    sidecar = json.loads((folder / "a.json").read_text())
+    del sidecar["crs"]["datum_said"]
+    (folder / "a.json").write_text(json.dumps(sidecar))
+    (note,) = strips_of_files([folder], StripRules(), lambda what, done, of: None).notes
+    assert "no signatures: the sidecar beside the points does not say of which datum they are" in note
 
 
 @pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level"])

@@ -20,6 +20,7 @@ from daemon.processing.strips_inputs import strips_of_files
 from georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
+from georef.mapping import Mapping
 from georef.trajectory import Trajectory, TrajectoryError
 from tests.fuzz.engine import Target
 from tests.fuzz.mutation import damage
@@ -229,8 +230,7 @@ def _beside_points() -> Target:
     sidecar = {
         "software": "swath",
         "complete": True,
-        "crs": {"crs": "EPSG:32632", "epoch": None, "units": {"metres": [1.0, 1.0, 1.0]}},
-        "options": {"datum": "same"},
+        "crs": Mapping("EPSG:32632", datum="same").description(),
         "strips": [{"number": n, "file": "points.laz", "first_gps_ns": START_NS} for n in (1, 2)],
         "counts": {"left": {"read": 288, "written": 288}},
         "calibrations": {"left": {"id": "cal-1"}},
