@@ -150,7 +150,7 @@ class Trajectory:
         time_ns: (n,) GPS time, strictly rising.
         position_e: (n, 3) m.
         q_e_from_b: (n, 4) scalar first; nan where the file has positions only.
-        velocity_e: (n, 3) m/s relative to the earth; nan: unsaid.
+        velocity_e: (n, 3) m/s relative to the earth; nan: unsaid, and no epoch is near that would tell it.
         position_sigma_l: (n, 3) m, north, east, down; nan: unsaid.
         attitude_sigma_rad: (n, 3) roll, pitch, heading; nan: unsaid.
         max_gap_ns: intervals that are longer are gaps.
@@ -263,6 +263,22 @@ class Trajectory:
         """(k, 2) GPS times of the epochs before and after each gap."""
         at = np.flatnonzero(np.diff(self.time_ns) > self.max_gap_ns)
         return np.stack([self.time_ns[at], self.time_ns[at + 1]], axis=1)
+
+    def with_velocities(self) -> Trajectory:
+        """Velocities where they are unsaid: those of the way from the epoch before to the next, never over a gap.
+
+        At an epoch beside a gap, or at the ends, that of the one interval there is; an epoch alone stays without.
+        """
+        unsaid = ~np.isfinite(self.velocity_e).all(axis=1)
+        if not unsaid.any():
+            return self
+        near = np.diff(self.time_ns) <= self.max_gap_ns
+        before, after = np.r_[False, near], np.r_[near, False]
+        rows = np.arange(len(self))
+        first, last = rows - before, rows + after
+        seconds = np.where(first == last, np.nan, (self.time_ns[last] - self.time_ns[first]) / SECOND_NS)
+        moved_e = (self.position_e[last] - self.position_e[first]) / seconds[:, np.newaxis]
+        return self._with(velocity_e=np.where(unsaid[:, np.newaxis], moved_e, self.velocity_e))
 
     def between(self, first_ns: int, last_ns: int) -> Trajectory:
         """The epochs that poses from first_ns to last_ns need: views, one epoch beyond either end."""

@@ -126,7 +126,8 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
     """What the device's own INS said, and what became of its solutions."""
     buffer = TrajectoryBuffer(setup.protocol(setup.ins_source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
-    return buffer.snapshot(), {what: count for what, count in sorted(buffer.counts.items()) if count}
+    solutions = buffer.snapshot().with_velocities()
+    return solutions, {what: count for what, count in sorted(buffer.counts.items()) if count}
 
 
 def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:

@@ -90,7 +90,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
         attitude_sigma_rad=columns.attitude_sigma_rad,
         max_gap_ns=max_gap_ns,
         name=name,
-    )
+    ).with_velocities()
 
 
 # --- time of week ---

@@ -15,6 +15,8 @@ from calib.flight import Flight
 from calib.signatures import Signature, record_of, signatures
 from calib.strip_cells import StripRules
 from calib.strips import differences
+from georef.formats.trajectory_csv import csv_text
+from georef.formats.trajectory_file import read_trajectory
 from georef.jacobian import parameter_columns_e
 from tests.calib.cast_flight import Cast, cast_flight
 
@@ -59,6 +61,21 @@ def test_columns_are_those_of_the_sensor_model(made: Cast) -> None:
     assert columns[:, NAMES.index("scan direction")] == pytest.approx(-latency, rel=1e-2, abs=30.0)
     assert errors[:, 3:] == pytest.approx(columns[:, :3])
     assert errors[:, :3] == pytest.approx(np.broadcast_to(np.eye(3), errors[:, :3].shape))
+
+
+def test_a_trajectory_whose_file_says_no_velocities_shows_time_too(made: Cast) -> None:
+    flight = made.flight
+    whole = flight.trajectories[0]
+    unsaid = replace(whole, velocity_e=np.full_like(whole.velocity_e, np.nan))
+    trajectory = read_trajectory(csv_text(unsaid).encode(), "unsaid.csv")
+    swath = flight.swaths[1]
+    at = np.arange(100, len(swath), 5000)
+    seen = SeenFrom.of(flight)
+    found, expected = (
+        effect_columns(swath.points_t[at], np.ones(len(at), int), swath.time_ns[at], np.ones(len(at)), one)[0]
+        for one in (replace(seen, trajectories=[trajectory]), seen)
+    )
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.5)  # of 50 m/s
 
 
 def test_a_true_calibration_shows_nothing(made: Cast) -> None:

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from georef.earth import prime_vertical_radius_m
 from georef.formats.trajectory_csv import HEADER, csv_text
 from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory, TrajectoryError
@@ -198,7 +199,9 @@ def test_waypoint_degrees_with_decimals_and_units_without_brackets() -> None:
     assert np.degrees([lat[0], lon[0], lon[3]]) == pytest.approx([31.0, 121.0, 121.00003])
     assert height == pytest.approx([10.5] * 4)
     assert np.degrees([angle[0] for angle in trajectory.attitude()]) == pytest.approx([-2.0, 1.0, 359.0])
-    assert np.isnan(trajectory.velocity_e).all()
+    # it has no velocities: those of the way, 1e-5° of longitude each 0.1 s
+    eastwards_mps = 10 * (prime_vertical_radius_m(lat[0]) + 10.5) * np.cos(lat[0]) * np.radians(1e-5)
+    np.testing.assert_allclose(trajectory.velocity_l(), np.tile([0.0, eastwards_mps, 0.0], (4, 1)), atol=1e-5)
 
 
 def dates(trajectory: Trajectory, form: str, leap_s: int = 0) -> list[str]:

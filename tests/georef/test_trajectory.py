@@ -168,6 +168,53 @@ def test_quaternions_of_neighbours_have_one_sign() -> None:
     assert ((q[1:] * q[:-1]).sum(axis=1) > 0.99).all()
 
 
+# --------------------------------------------------------------------------------------------- velocities
+
+
+def eastwards(times_ns: NDArray[np.int64], said: FloatArray | None = None) -> Trajectory:
+    """Along the equator with a speed that grows by 2 m/s²."""
+    seconds = (times_ns - START_NS) / 1e9
+    lon = (60.0 * seconds + seconds**2) / 6_378_137.0
+    flat = dict.fromkeys(("lat_rad", "height_m", "roll_rad", "pitch_rad", "heading_rad"), np.zeros(len(times_ns)))
+    velocity_l = np.full((len(times_ns), 3), np.nan) if said is None else said
+    return wild(len(times_ns), time_ns=times_ns, lon_rad=lon, velocity_l=velocity_l, **flat)
+
+
+def test_velocities_that_are_unsaid_are_those_of_the_way() -> None:
+    times = START_NS + 50 * MS * np.arange(40)
+    found = eastwards(times).with_velocities().velocity_l()
+    expected = 60.0 + 2.0 * (times - START_NS) / 1e9
+    np.testing.assert_allclose(found[1:-1, 1], expected[1:-1], rtol=1e-9)
+    np.testing.assert_allclose(found[[0, -1], 1], expected[[0, -1]] + [0.05, -0.05], rtol=1e-9)  # half an interval in
+    np.testing.assert_allclose(found[:, [0, 2]], 0.0, atol=1e-3)  # down: the chord of 6 m of the earth
+
+
+def test_velocities_are_taken_over_no_gap_and_an_epoch_alone_has_none() -> None:
+    times = START_NS + 10 * MS * np.r_[np.arange(10), 60, np.arange(160, 170)]
+    trajectory = eastwards(times).with_velocities()
+    found = trajectory.velocity_l()[:, 1]
+    assert np.flatnonzero(np.isnan(found)).tolist() == [10]
+    known = np.r_[0:10, 11:21]
+    half = np.zeros(21)
+    half[[0, 11]], half[[9, 20]] = 0.01, -0.01
+    expected = 60.0 + 2.0 * (times - START_NS) / 1e9 + half
+    np.testing.assert_allclose(found[known], expected[known], rtol=1e-9)
+    poses = trajectory.poses(np.r_[times[0] + 5 * MS, times[12] + 5 * MS])
+    assert np.isfinite(poses.velocity_e).all()
+
+
+def test_velocities_that_are_said_stay() -> None:
+    times = START_NS + 10 * MS * np.arange(20)
+    said = np.tile([1.0, 2.0, 3.0], (20, 1))
+    whole = eastwards(times, said)
+    assert whole.with_velocities() is whole
+    said[5, 2] = np.nan
+    found = eastwards(times, said).with_velocities()
+    others = np.arange(20) != 5
+    np.testing.assert_array_equal(found.velocity_e[others], whole.velocity_e[others])
+    assert found.velocity_l()[5, 1] == pytest.approx(60.1, abs=1e-6)
+
+
 # --------------------------------------------------------------------------------------------- gaps, ends
 
 
