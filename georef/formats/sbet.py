@@ -82,8 +82,7 @@ def read_sbet(
         *(position, attitude),
         angles_in="radians",
     )
-    if np.isfinite(table[:, 1:11]).all() and len(table) > 1 and (np.diff(time_ns) > 0).all():
-        columns.velocity_l = _velocity_l(columns, table[:, 10])
+    columns.velocity_l = _velocity_l(columns, table[:, 10], np.isfinite(table[:, 1:USED_DOUBLES]).all(axis=1))
     return columns
 
 
@@ -159,18 +158,22 @@ def _table(data: bytes, name: str, kind: str, doubles: int) -> FloatArray:
     return table
 
 
-def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray) -> FloatArray:
-    """North, east, down, by those axes of the platform with which velocities go the way the positions go."""
+def _velocity_l(columns: TrajectoryColumns, wander_rad: FloatArray, whole: NDArray[np.bool_]) -> FloatArray:
+    """North, east, down, by those axes of the platform with which velocities go the way the positions go.
+
+    That is judged by the records that say everything, ``whole`` (n,).
+    """
     x, y, z = columns.velocity_l.T
     cos, sin = np.cos(wander_rad), np.sin(wander_rad)
-    pieces = course_pieces(columns.time_ns)
-    moved = moved_l(columns.time_ns, columns.lat_rad, columns.lon_rad, columns.height_m, pieces)
-    velocities = []
-    misfits = []
-    for right, down in AXES:
-        velocity = np.stack([x * cos + right * y * sin, right * y * cos - x * sin, down * z], axis=1)
-        velocities.append(velocity)
-        misfits.append(float(((mean_over(columns.time_ns, velocity, pieces) - moved) ** 2).sum()))
+    velocities = [
+        np.stack([x * cos + right * y * sin, right * y * cos - x * sin, down * z], axis=1) for right, down in AXES
+    ]
+    time_ns = columns.time_ns[whole]
+    if not len(time_ns) or (np.diff(time_ns) <= 0).any():
+        return velocities[0]
+    pieces = course_pieces(time_ns)
+    moved = moved_l(time_ns, columns.lat_rad[whole], columns.lon_rad[whole], columns.height_m[whole], pieces)
+    misfits = [((mean_over(time_ns, velocity[whole], pieces) - moved) ** 2).sum() for velocity in velocities]
     return velocities[int(np.argmin(misfits))]
 
 

@@ -135,6 +135,22 @@ def test_wander_angle_turns_heading_and_velocities(wander_deg: float, pospac: bo
     same(read(table), trajectory)
 
 
+@pytest.mark.parametrize("pospac", [True, False])
+def test_a_record_without_velocity_leaves_the_others_turned(pospac: bool) -> None:
+    trajectory = flown()
+    table = table_of(trajectory)
+    wander = np.radians(25.0)
+    north, east, down = trajectory.velocity_l().T
+    x, west = north * np.cos(wander) - east * np.sin(wander), -north * np.sin(wander) - east * np.cos(wander)
+    table[:, 4:7] = np.stack([x, west, -down] if pospac else [x, -west, down], axis=1)
+    table[:, 9] = (table[:, 9] + wander + np.pi) % (2 * np.pi) - np.pi
+    table[:, 10] = wander
+    table[7, 5] = np.nan
+    back, said = read(table), np.arange(len(table)) != 7
+    np.testing.assert_allclose(back.velocity_e[said], trajectory.velocity_e[said], atol=1e-11)
+    np.testing.assert_allclose(back.velocity_e[7], trajectory.velocity_e[7], atol=0.1)  # by the positions beside it
+
+
 def test_unsaid_sigmas_stay_unsaid() -> None:
     trajectory = flown(position_sigma_l=None)
     back = read_trajectory(sbet_bytes(trajectory), "sbet.out", span_ns=SPAN, smrmsg=smrmsg_bytes(trajectory))
