@@ -14,6 +14,7 @@ ToGrid = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 STEPS = 30
 NEAR_M = 0.5  # a beam has arrived when it is this close to the terrain's height
+ROUND_COLUMNS = 0.5  # off a whole turn; a grid so near to it goes round the earth
 STEEPEST_COS = 0.05  # of beams that reach the ground within a swath
 
 
@@ -29,13 +30,19 @@ class CoarseTerrain:
         first: x and y of height_m[0, 0]: longitude and latitude in radians, or what ``to_grid`` gives.
         step: from column to column and from row to row; either may be negative.
         to_grid: x and y of the grid of latitudes and longitudes (n,) in radians; None: the grid is in those.
+        turn: x once round the earth, where it is a longitude; None: it is none.
 
     Raises:
         TerrainError: no grid of two by two at least, or a step of 0.
     """
 
     def __init__(
-        self, height_m: ArrayLike, first: tuple[float, float], step: tuple[float, float], to_grid: ToGrid | None = None
+        self,
+        height_m: ArrayLike,
+        first: tuple[float, float],
+        step: tuple[float, float],
+        to_grid: ToGrid | None = None,
+        turn: float | None = None,
     ) -> None:
         self._height_m = np.asarray(height_m, dtype=np.float64)
         if self._height_m.ndim != 2 or min(self._height_m.shape) < 2:
@@ -43,12 +50,18 @@ class CoarseTerrain:
         if not (step[0] and step[1]):
             raise TerrainError(f"terrain: got steps of {step[0]:g} and {step[1]:g}, want none that is 0")
         self._first, self._step, self._to_grid = first, step, to_grid
+        self._turn = 2.0 * np.pi if to_grid is None else turn
+        columns = self._height_m.shape[1]
+        if self._turn is not None and abs(columns - abs(self._turn / step[0])) < ROUND_COLUMNS:
+            self._height_m = np.concatenate([self._height_m, self._height_m[:, :1]], axis=1)
 
     def height_at(self, lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
         """(n,) ellipsoidal heights, nan outside the grid."""
         lat, lon = np.asarray(lat_rad, dtype=np.float64), np.asarray(lon_rad, dtype=np.float64)
         x, y = (lon, lat) if self._to_grid is None else self._to_grid(lat, lon)
         column, row = (x - self._first[0]) / self._step[0], (y - self._first[1]) / self._step[1]
+        if self._turn is not None:  # longitudes may be said a turn higher or lower
+            column %= abs(self._turn / self._step[0])
         rows, columns = self._height_m.shape
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
         left = np.where(inside, np.minimum(column, columns - 2), 0).astype(np.intp)

@@ -23,10 +23,16 @@ KEY = "mta.terrain"
 
 
 class ToGrid:
-    """Easting and northing, or degrees, of latitudes and longitudes, for `CoarseTerrain`; pickles."""
+    """Easting and northing, or degrees, of latitudes and longitudes, for `CoarseTerrain`; pickles.
+
+    Attributes:
+        turn: x once round the earth, 360 for degrees; None: x is no longitude.
+    """
 
     def __init__(self, wkt: str) -> None:
-        self._transformer = Transformer.from_crs("EPSG:4979", CRS.from_wkt(wkt), always_xy=True)
+        crs = CRS.from_wkt(wkt)
+        self._transformer = Transformer.from_crs("EPSG:4979", crs, always_xy=True)
+        self.turn = 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor if crs.is_geographic else None
 
     def __call__(self, lat_rad: FloatArray, lon_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) x and y in the raster's CRS."""
@@ -66,7 +72,8 @@ def read_terrain(path: Path) -> CoarseTerrain:
                 transform, wkt = raster.transform, raster.crs.to_wkt()
                 height_m = _heights(raster)
         first = (transform.c + 0.5 * transform.a, transform.f + 0.5 * transform.e)
-        return CoarseTerrain(height_m, first, (transform.a, transform.e), ToGrid(wkt))
+        to_grid = ToGrid(wkt)
+        return CoarseTerrain(height_m, first, (transform.a, transform.e), to_grid, to_grid.turn)
     except rasterio.errors.NotGeoreferencedWarning as error:
         raise ConfigError(f"{KEY}: {path} does not say where it lies; want a GeoTIFF that does") from error
     except (rasterio.errors.RasterioError, CRSError, ValueError) as error:

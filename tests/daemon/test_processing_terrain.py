@@ -49,6 +49,16 @@ def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> 
     assert np.isnan(terrain.height_at(np.array([LAT, np.radians(48.5)]), np.array([LON, LON]))).all()
 
 
+@pytest.mark.parametrize("west_deg", [179.95, 359.95, -0.05])  # across 180° or Greenwich
+def test_a_grid_in_degrees_goes_on_where_longitudes_begin_anew(tmp_path: Path, west_deg: float) -> None:
+    write(tmp_path / "dem.tif", crs="EPSG:4326", transform=Affine(0.001, 0.0, west_deg, 0.0, -0.001, 47.6))
+    terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
+    for lon_deg in (west_deg + 0.02, west_deg + 0.08, west_deg + 0.08 - 360.0, west_deg + 0.08 + 360.0):
+        assert np.isfinite(terrain.height_at(np.array([LAT + 0.001]), np.radians([lon_deg]))).all()
+    for lon_deg in (west_deg - 0.02, west_deg + 0.12):
+        assert np.isnan(terrain.height_at(np.array([LAT + 0.001]), np.radians([lon_deg]))).all()
+
+
 @pytest.mark.parametrize(
     ("others", "words"),
     [

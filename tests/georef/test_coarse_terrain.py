@@ -50,6 +50,32 @@ def test_heights_are_bilinear() -> None:
     assert np.isnan(outside).all()
 
 
+@pytest.mark.parametrize("step_deg", [0.001, -0.001])
+@pytest.mark.parametrize("middle_deg", [0.0, 180.0, -180.0, 360.0])
+def test_a_grid_across_the_beginning_of_longitudes_is_whole(middle_deg: float, step_deg: float) -> None:
+    height_m = hills()
+    first, step = (np.radians(middle_deg - 64.5 * step_deg), np.radians(47.6)), np.radians((step_deg, -0.0008))
+    model = CoarseTerrain(height_m, first, (step[0], step[1]))
+    column = np.linspace(0.5, 128.5, 50)
+    lat, lon = np.full(50, first[1] + 80 * step[1]), first[0] + column * step[0]
+    wanted = np.interp(column, np.arange(130), height_m[80])
+    for turns in (-1, 0, 1):
+        np.testing.assert_allclose(model.height_at(lat, lon + 2 * np.pi * turns), wanted, rtol=0, atol=1e-6)
+    beside = first[0] + np.array([-1.0, 130.0]) * step[0]
+    assert np.isnan(model.height_at(lat[:2], (beside + np.pi) % (2 * np.pi) - np.pi)).all()
+
+
+def test_a_grid_round_the_earth_has_no_seam() -> None:
+    height_m = np.tile(np.arange(36.0), (2, 1))
+    model = CoarseTerrain(
+        height_m, tuple(np.radians((5.0, 40.0))), tuple(np.radians((10.0, 10.0)))
+    )  # centres of pixels
+    lon = np.radians([5.0, 355.0, -5.0, 357.5, -2.5, 0.0, 360.0, 2.5])
+    np.testing.assert_allclose(
+        model.height_at(np.full(8, np.radians(45.0)), lon), [0, 35, 35, 26.25, 26.25, 17.5, 17.5, 8.75]
+    )
+
+
 def test_holes_are_not_filled() -> None:
     height_m = hills()
     height_m[80, 60] = np.nan
