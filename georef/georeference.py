@@ -130,7 +130,7 @@ class Georeferencer:
         points.points_map[to] = points_map
         columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
         rows = rows if done.all() else rows[done]
-        fill_columns(contiguous(rows), kept.time_ns, kept.angle_rad, kept.range_m, columns)
+        fill_columns(contiguous(rows), kept.time_ns, kept.off_nadir_rad, kept.range_m, columns)
         if points.sigma_map is not None:
             points.sigma_map[to] = sigma_map
         return len(points_map), failure

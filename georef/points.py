@@ -49,7 +49,8 @@ class Points:
         time_ns: (n,) GPS time of the pulse, time_offset applied.
         points_map: (n, 3) easting, northing, height in metres; e where there is no mapping frame.
         sigma_map: (n, 3) one sigma along the same axes, metres; None: not computed.
-        scan_angle_rad: (n,) θ; of spinning heads the azimuth.
+        scan_angle_rad: (n,) of the beam about the level way the nose points, from the vertical, positive to the right,
+            −π … π: LAS 1.4's, with the aircraft's roll, whatever the scanner and its mounting.
         range_m: (n,) as corrected.
         intensity: (n,) as the device says it.
         return_number, number_of_returns: (n,).
@@ -116,6 +117,7 @@ class Rays:
         points_e: (n, 3) metres.
         origin_e: (n, 3) of the scanner.
         angle_rad: θ as corrected.
+        off_nadir_rad: see `Points.scan_angle_rad`.
         range_m: ρ as corrected.
         q_e_from_b: (n, 4) attitude taken, scalar first.
         epoch, share: of the trajectory: the epoch before the pulse, and where between it and the next, 0 … 1.
@@ -134,6 +136,7 @@ class Rays:
     points_e: FloatArray
     origin_e: FloatArray
     angle_rad: FloatArray
+    off_nadir_rad: FloatArray
     range_m: FloatArray
     q_e_from_b: FloatArray | None = None
     epoch: Int64Array | None = None

@@ -225,6 +225,7 @@ def _out(count: int) -> Out:
         points_e=np.empty((count, 3)),
         origin_e=np.empty((count, 3)),
         angle_rad=np.empty(count),
+        off_nadir_rad=np.empty(count),
         range_m=np.empty(count),
     )
 

@@ -9,13 +9,13 @@ from georef.records import Int64Array, StructArray
 
 @kept
 def fill_columns(
-    rows: StructArray, time_ns: Int64Array, angle_rad: FloatArray, range_m: FloatArray, to: PointColumns
+    rows: StructArray, time_ns: Int64Array, off_nadir_rad: FloatArray, range_m: FloatArray, to: PointColumns
 ) -> None:
     """From rows (n,) `RETURN_DTYPE` and of rays (n,)."""
     times, angles, ranges, intensity, number, numbers, channel, zone = to
     for i in range(len(rows)):
         times[i] = time_ns[i]
-        angles[i], ranges[i] = angle_rad[i], range_m[i]
+        angles[i], ranges[i] = off_nadir_rad[i], range_m[i]
     for i in range(len(rows)):
         row = rows[i]
         intensity[i], channel[i] = row.intensity, row.channel

@@ -11,6 +11,7 @@ import math
 from typing import Any
 
 from georef.compiled import kept, kernel, whole
+from georef.earth import E2
 from georef.kernels.axes import fill_axes, fill_covariance, take_readings, through_mount, turn_axes
 from georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, ONE, RANGE, SPINNING
 from georef.kernels.block import (
@@ -53,6 +54,7 @@ from georef.kernels.rotations import (
     times,
     transposed_times,
     turned_on,
+    unit,
     vector_at,
 )
 from georef.kernels.types import Axes, FloatArray, Matrix, Model, Out, Ranging, Scanning, Three, Track
@@ -65,6 +67,7 @@ DONE, NO_TIME, OUTSIDE, GAP = (
 )
 NEAR, FAR, NOT_FINITE = (int(fate) for fate in (Fate.BELOW_RANGE_GATE, Fate.ABOVE_RANGE_GATE, Fate.NOT_FINITE))
 TURN = 2.0 * math.pi
+MINOR_2 = 1.0 - E2  # b² / a²
 ORIGIN, POINT = ACROSS, TILT  # places in a block, free again when the axes are computed
 FIRST = whole(0)
 
@@ -100,6 +103,15 @@ def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int,
     begin, end, per_ns, fate, at = interval_of(track, t, guess)
     here = vector_at(track.position_e, at)
     return begin, end, per_ns, fate, at, here, plus(vector_at(track.position_e, at + 1), -1.0, here)
+
+
+@kernel
+def level_at(track: Track, at: int) -> tuple[Three, Three]:
+    """Down, and level to the right of the nose, in e at an epoch."""
+    x, y, z = vector_at(track.position_e, at)
+    down = unit((-x, -y, -z / MINOR_2))  # along the ellipsoid's normal, to 2 µrad at 3 km
+    rot_e_from_b = rot_at(track.q_e_from_b, at)
+    return down, unit(cross(down, (rot_e_from_b[0][0], rot_e_from_b[1][0], rot_e_from_b[2][0])))
 
 
 @kernel
@@ -244,13 +256,18 @@ def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceler
 
 
 @kernel
-def hand_out(block: FloatArray, n: int, here: Any, out: Out) -> None:
-    """What became of the returns of a block."""
+def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], out: Out) -> None:
+    """What became of the returns of a block; ``level`` is down and to the right."""
     give(block, n, ORIGIN, out.origin_e[here])
     give(block, n, POINT, out.points_e[here])
     angles, ranges = out.angle_rad[here], out.range_m[here]
     for i in range(n):
         angles[i], ranges[i] = block[THETA, i], block[RHO, i]
+    down, right = level
+    off_nadir = out.off_nadir_rad[here]
+    for i in range(n):
+        beam = plus(three(block, POINT, i), -1.0, three(block, ORIGIN, i))
+        off_nadir[i] = math.atan2(dot(beam, right), dot(beam, down))
 
 
 @kept
@@ -267,6 +284,7 @@ def cast(
     whole_ns, turn_ns = round(offset_ns), round(turn_offset_ns)
     begin, end, per_ns, fate, at, place, way = way_at(track, time_ns[0] + whole_ns, FIRST)
     begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, time_ns[0] + turn_ns, FIRST)
+    level = level_at(track, turning)
     block = new_block()
     if doubt is not None:
         interval, doubted = interval_at(doubt.flown, at), at
@@ -281,6 +299,7 @@ def cast(
             begin, end, per_ns, fate, at, place, way = way_at(track, t + whole_ns, at)
         if not begun <= t + turn_ns < ended:
             begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, t + turn_ns, turning)
+            level = level_at(track, turning)
         last, n = min(len(rows), k + BLOCK), 1
         first_ns, end_ns = max(begin - whole_ns, begun - turn_ns), min(end - whole_ns, ended - turn_ns)
         while k + n < last and first_ns <= time_ns[k + n] < end_ns:
@@ -302,7 +321,7 @@ def cast(
         gate(block, fates, ranging.minimum_m, ranging.maximum_m)
         factors(block, n, phi2)
         to_e(block, n, (place, way), (turn, phi), arms, mounted.shifted)
-        hand_out(block, n, here, out)
+        hand_out(block, n, here, level, out)
         if axes is not None:
             turn_axes(block, n, k, scanning.kind, mounted, True)
             fill_axes(block, n, k, track, axes, turning, at, phi2)

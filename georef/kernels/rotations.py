@@ -123,6 +123,13 @@ def plus(a: Three, factor: float, b: Three) -> Three:
 
 
 @kernel
+def unit(a: Three) -> Three:
+    """A vector's direction; of none, none."""
+    per_length = 1.0 / math.sqrt(max(dot(a, a), 1e-300))
+    return per_length * a[0], per_length * a[1], per_length * a[2]
+
+
+@kernel
 def cross(a: Three, b: Three) -> Three:
     """Vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

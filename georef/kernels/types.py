@@ -120,6 +120,7 @@ class Out(NamedTuple):
     points_e: FloatArray
     origin_e: FloatArray
     angle_rad: FloatArray
+    off_nadir_rad: FloatArray
     range_m: FloatArray
 
 

@@ -11,7 +11,7 @@ from pyproj import Transformer
 
 from georef import georeference
 from georef.atmosphere import Air
-from georef.beams import LineGeometry
+from georef.beams import Geometry, LineGeometry, SpinningGeometry
 from georef.calibration import nominal
 from georef.georeference import Georeferencer
 from georef.mapping import Mapping, MappingError
@@ -86,10 +86,51 @@ def test_every_row_has_its_fate_and_every_good_one_its_point() -> None:
     for name in ("intensity", "return_number", "number_of_returns", "mta_zone", "channel"):
         assert np.array_equal(getattr(points, name), rows[name][good]), name
     assert np.array_equal(points.range_m, rows["range_m"][good].astype(np.float32))
-    assert np.array_equal(points.scan_angle_rad, rows["encoder_rad"][good].astype(np.float32))
     rays = model(time_offset_s=1e-3).rays(rows, time_ns, flight())
     assert np.array_equal(points.points_map, rays.points_e[good])
     assert points.sigma_map is None
+
+
+LINE, TURNED = LineGeometry(), np.diag([-1.0, -1.0, 1.0])  # cables to the rear
+SPINNING = SpinningGeometry(*np.zeros((6, 2)))
+SIDEWAYS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # it spins about the way, azimuth 0 is down
+
+
+def scan_angles(geometry: Geometry, installation: FloatArray, roll_rad: float, readings_rad: list[float]) -> FloatArray:
+    """Scan angles of points, degrees, of an aircraft that flies to the south-east, nose up."""
+    n = len(readings_rad)
+    time_ns = 10 * MS * np.arange(3, dtype=np.int64)
+    lat_rad, same = 0.82 - 1e-7 * np.arange(3), np.ones(3)
+    trajectory = Trajectory.from_geodetic(
+        time_ns, lat_rad, 0.15 * same, 1500.0 * same, np.zeros((3, 3)), roll_rad * same, 0.06 * same, 2.4 * same
+    )
+    rows = rows_of(np.array(readings_rad), np.full(n, 500.0))
+    head = SensorModel(nominal("left", [0.1, 0.2, 0.3], installation), geometry)
+    points, _ = Georeferencer(head).georeference(rows, np.full(n, 12 * MS), trajectory)
+    assert len(points) == n
+    return np.degrees(points.scan_angle_rad.astype(np.float64))
+
+
+def test_scan_angles_are_positive_to_the_right_however_the_head_is_mounted() -> None:
+    readings = [-0.5, 0.0, 0.3]
+    degrees = np.degrees(readings)
+    np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.0, readings), degrees, atol=0.06)  # of a pitch of 3.4°
+    np.testing.assert_allclose(scan_angles(LINE, TURNED, 0.0, readings), -degrees, atol=0.06)
+
+
+def test_scan_angles_have_the_aircrafts_roll() -> None:
+    """Right wing down: beams of the scanner's own nadir go to the left. LAS 1.4: from the vertical of the data."""
+    level = np.degrees(np.arctan2(-np.sin(0.2), np.cos(0.2) * np.cos(0.06)))
+    np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.2, [0.0]), level, atol=1e-4)
+
+
+def test_scan_angles_of_spinning_heads_are_the_beams_own() -> None:
+    """A head whose axis lies along the way: not its azimuth, but where it looks, all the way round."""
+    readings = np.radians([0.0, 90.0, 179.0, 181.0, 270.0]).tolist()
+    found = scan_angles(SPINNING, SIDEWAYS, 0.0, readings)
+    assert found[[0, 1, 4]] == pytest.approx([0.0, 90.0, -90.0], abs=0.3)
+    assert np.abs(found[2:4]) == pytest.approx([179.0, 179.0], abs=0.3)
+    assert found[2] > 0.0 > found[3]
 
 
 def test_onto_the_map() -> None:
