@@ -168,21 +168,6 @@ def range_m(height_m: FloatArray, cosine: FloatArray) -> float:
     return float(np.mean(height_m * cosine) / np.mean(cosine**2))
 
 
-def in_scanner_axes(installation: FloatArray, omega_rad: float, phi_rad: float, kappa_rad: float) -> FloatArray:
-    """(3,) small angles about the body's axes as turns about the scanner's own, for T (3, 3), b from s.
-
-    The lecture counts roll and pitch about the scan frame's axes: with the cables to the rear, T = R3(180°), a positive
-    roll turns the data counter-clockwise and a positive pitch moves them back.
-    """
-    turned: FloatArray = np.asarray(installation, np.float64).T @ [omega_rad, phi_rad, kappa_rad]
-    return turned
-
-
-def slope_shift_m(slope: float, angle_rad: float, height_m: float) -> float:
-    """Forward shift of flat ground by the static pitch slope (rad a rad) at a scan angle (FORMULAS 5.3, 5.4)."""
-    return slope * angle_rad * height_m
-
-
 def measure(
     flight: Flight,
     control: Sequence[ControlPoint] = (),

@@ -89,11 +89,6 @@ class Mapping:
         return _wkt(self._target.crs)
 
     @property
-    def horizontal_wkt(self) -> str:
-        """Well-known text of the projected (or geocentric) CRS alone."""
-        return _wkt(self._target.horizontal)
-
-    @property
     def unit_m(self) -> FloatArray:
         """Metres in a unit of easting, northing and height (3,)."""
         units = [axis.unit_conversion_factor for axis in self._target.horizontal.axis_info]

@@ -1,4 +1,4 @@
-"""Ranges: time of flight, gates, and pulses in air (FORMULAS 3.1, 3.3; PROTOCOLS, SREP's byte 15).
+"""Ranges of pulses in air, by their time of flight (FORMULAS 3.1, 3.3; PROTOCOLS, SREP's byte 15).
 
 A scanner that fires before the last echo is back measures from its last emission: the apparent range. The emission an
 echo belongs to is k − 1 pulses earlier (k is the zone, in the records z = k − 1), the range longer by the way light
@@ -43,36 +43,6 @@ MOST_TICK_HZ = 1_000_000_000  # device times are whole nanoseconds
 
 class RangingError(ValueError):
     """A scanner's ranging is described by something it cannot be."""
-
-
-def range_of_flight(time_s: float, group_index: float = 1.0) -> float:
-    """Range in metres of an echo that came after ``time_s`` (NGA Eq. 1)."""
-    return LIGHT_MPS * time_s / (2.0 * group_index)
-
-
-def range_of_phase(phase_rad: float, whole_periods: int, modulation_hz: float, group_index: float = 1.0) -> float:
-    """Range of a continuous wave by the phase of its modulation; coarser tones tell the whole periods (NGA Eq. 2)."""
-    return LIGHT_MPS / (2.0 * group_index * modulation_hz) * (whole_periods + phase_rad / (2.0 * math.pi))
-
-
-def range_of_beat(beat_hz: float, chirp_hz_per_s: float, group_index: float = 1.0) -> float:
-    """Range of a chirped wave by the beat with its echo; of a moving target the mean of an up and a down chirp."""
-    return LIGHT_MPS * beat_hz / (2.0 * group_index * chirp_hz_per_s)
-
-
-def unambiguous_range(prf_hz: float, group_index: float = 1.0) -> float:
-    """R_a in metres: from farther away an echo comes after the next emission."""
-    return LIGHT_MPS / (2.0 * group_index * prf_hz)
-
-
-def zone_of(range_m: float, prf_hz: float, group_index: float = 1.0) -> int:
-    """k, 1-based: how many pulses are in the air when an echo from this far comes."""
-    return math.floor(range_m / unambiguous_range(prf_hz, group_index)) + 1
-
-
-def gate_times(range_min_m: float, range_max_m: float, group_index: float = 1.0) -> tuple[float, float]:
-    """When a range gate opens and closes, seconds after the emission."""
-    return 2.0 * group_index * range_min_m / LIGHT_MPS, 2.0 * group_index * range_max_m / LIGHT_MPS
 
 
 class PulseRates:

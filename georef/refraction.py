@@ -1,4 +1,4 @@
-"""Bending of beams by air: ARDC's K, flat layers, spherical layers (FORMULAS 4; NGA Eq. 4 to 11).
+"""Bending of beams by air: ARDC's K, spherical layers (FORMULAS 4; NGA Eq. 4 to 11).
 
 A beam bends towards the vertical as the air gets denser: the point lies nearer to nadir than the beam leaves, by Δd.
 Heights are taken as they come, which are ellipsoidal; the models count them from the sea. With a geoid 50 m from the
@@ -51,16 +51,6 @@ def ardc_k(sensor_m: ArrayLike, ground_m: ArrayLike) -> FloatArray:
     return k
 
 
-def flat_k(sensor_m: ArrayLike, ground_m: ArrayLike, constant_ppm: float) -> FloatArray:
-    """K = n̄ − n_s of flat layers in radians (FORMULAS 4.2): the check of the others, 1 % short at 80° from nadir."""
-    sensor, ground = (np.asarray(height, dtype=np.float64) for height in (sensor_m, ground_m))
-    share = 0.5 * (1.0 + GAUSS_NODES)
-    heights = ground[..., np.newaxis] + (sensor - ground)[..., np.newaxis] * share
-    mean = layer_refractivity(heights, constant_ppm) @ (0.5 * GAUSS_WEIGHTS)
-    k: FloatArray = mean - layer_refractivity(sensor, constant_ppm)
-    return k
-
-
 def spherical_bending(nadir_rad: ArrayLike, sensor_m: ArrayLike, ground_m: ArrayLike, constant_ppm: float) -> Any:
     """Δd in radians of rays through spherical layers (NGA Eq. 6 to 8, restored), for beams that go down.
 
@@ -79,17 +69,3 @@ def spherical_bending(nadir_rad: ArrayLike, sensor_m: ArrayLike, ground_m: Array
     across = (SPHERE_M + ground) * np.sin(central)
     descent = (sensor - ground) + 2.0 * (SPHERE_M + ground) * np.sin(0.5 * central) ** 2
     return nadir - np.arctan2(across, descent)
-
-
-def turned_towards(direction: FloatArray, down: FloatArray, bending_rad: FloatArray) -> FloatArray:
-    """Unit vectors (n, 3) turned about the horizontal towards nadir by angles (n,) (FORMULAS 4.1).
-
-    Args:
-        direction, down: (n, 3) unit vectors of one frame, not parallel.
-    """
-    cos = np.einsum("ni,ni->n", direction, down)
-    sin = np.linalg.norm(direction - cos[:, np.newaxis] * down, axis=1)
-    nadir = np.arctan2(sin, cos)
-    along, towards = np.sin(nadir - bending_rad) / sin, np.sin(bending_rad) / sin
-    turned: FloatArray = along[:, np.newaxis] * direction + towards[:, np.newaxis] * down
-    return turned

@@ -118,25 +118,8 @@ def gravity_e(position_e: ArrayLike) -> FloatArray:
     return gravity.reshape(position.shape)
 
 
-def gravity_gradient_e(position_e: ArrayLike) -> FloatArray:
-    """(…, 3, 3) ∂ gravity / ∂ position, 1/s², at positions (…, 3)."""
-    position = np.asarray(position_e, dtype=np.float64)
-    flat = np.ascontiguousarray(position.reshape(-1, 3))
-    gradient = np.empty((len(flat), 3, 3))
-    _gradients(flat, gradient)
-    return gradient.reshape(*position.shape, 3)
-
-
 @kept
 def _gravities(position_e: FloatArray, gravity: FloatArray) -> None:
     for i in range(len(position_e)):
         g = gravity_of(position_e[i, 0], position_e[i, 1], position_e[i, 2])
         gravity[i, 0], gravity[i, 1], gravity[i, 2] = g
-
-
-@kept
-def _gradients(position_e: FloatArray, gradient: FloatArray) -> None:
-    for i in range(len(position_e)):
-        rows = gradient_of(position_e[i, 0], position_e[i, 1], position_e[i, 2])
-        for j in range(3):
-            gradient[i, j, 0], gradient[i, j, 1], gradient[i, j, 2] = rows[j]

@@ -81,17 +81,10 @@ class HostTimeline:
         host = np.asarray(host_ns, dtype=np.int64)
         if not self._host:
             return host - self.host_minus_monotonic_ns
-        return host + self._interpolate(host, inverse=False)
+        return host + self._interpolate(host)
 
-    def host_from_raw(self, raw_ns: Int64Array) -> Int64Array:
-        """Host times (n,) of RAW (n,)."""
-        raw = np.asarray(raw_ns, dtype=np.int64)
-        if not self._host:
-            return raw + self.host_minus_monotonic_ns
-        return raw - self._interpolate(raw, inverse=True)
-
-    def _interpolate(self, times: Int64Array, *, inverse: bool) -> Int64Array:
-        """RAW − host at host times, or at RAW times where inverse; last slope beyond the last reading."""
+    def _interpolate(self, times: Int64Array) -> Int64Array:
+        """RAW − host at host times; last slope beyond the last reading."""
         if self._arrays is None:
             first = self._offset[0]
             self._arrays = (
@@ -99,11 +92,9 @@ class HostTimeline:
                 np.array([offset - first for offset in self._offset], dtype=np.float64),
                 first,
             )
-        host, relative, first = self._arrays
-        knots = host + relative.astype(np.int64) + first if inverse else host
+        knots, relative, first = self._arrays
         elapsed = (times - knots[0]).astype(np.float64)
         offsets = np.interp(elapsed, (knots - knots[0]).astype(np.float64), relative)
-        slope = self._slope / (1.0 + self._slope) if inverse else self._slope
         beyond = np.maximum(times - knots[-1], 0).astype(np.float64)
-        rounded: Int64Array = np.rint(offsets + slope * beyond).astype(np.int64)
+        rounded: Int64Array = np.rint(offsets + self._slope * beyond).astype(np.int64)
         return rounded + first

@@ -43,10 +43,6 @@ class LeapBook:
         self._said: dict[str, int] = {}
         self._inserted: dict[str, tuple[dt.date, int]] = {}  # source: first day of the new count, the count
 
-    def said_by(self, source: str) -> int | None:
-        """What this source itself has said."""
-        return self._said.get(source)
-
     def on(self, source: str, date: dt.date) -> LeapSeconds:
         """The count for a UTC message of a source on a date; source "": as far as anybody knows."""
         inserted = self._inserted.get(source)

@@ -21,12 +21,10 @@ from calib.profiles import (
     Profile,
     formula,
     heading_rad,
-    in_scanner_axes,
     measure,
     pitch_rad,
     range_m,
     roll_rad,
-    slope_shift_m,
     stepwise,
     survey,
 )
@@ -64,9 +62,6 @@ def test_lectures_numbers() -> None:
     assert 17.92 / 2.0 / 902.5 == pytest.approx(0.0099280, abs=5e-8)
     assert pitch_rad(17.92, 902.5) == pytest.approx(0.00992765, abs=5e-9)
     assert heading_rad(0.61, 493.0) == pytest.approx(0.0012373, abs=5e-8)
-    slope = 1.85e-5 / math.radians(1.0)
-    assert slope == pytest.approx(1.06e-3, abs=5e-6)
-    assert slope_shift_m(slope, math.radians(30.0), 902.5) == pytest.approx(0.50, abs=0.005)
 
 
 def test_range_of_beams_that_are_not_vertical() -> None:
@@ -92,11 +87,6 @@ def test_lectures_corrections_in_words_and_by_mounting(
     rear = formula(kind, separation_m, baseline_m, REAR)
     assert f"{front_deg:+.5f}°" in rear  # about the body's axes nothing changes
     assert (f"{rear_deg}° in the scanner's own axes" in rear) == bool(rear_deg)
-
-
-def test_turns_in_the_scanners_own_axes() -> None:
-    np.testing.assert_allclose(in_scanner_axes(FRONT, 1e-3, 2e-3, 3e-3), [1e-3, 2e-3, 3e-3])
-    np.testing.assert_allclose(in_scanner_axes(REAR, 1e-3, 2e-3, 3e-3), [-1e-3, -2e-3, 3e-3])
 
 
 @pytest.mark.parametrize(("sign", "rear"), [(1.0, False), (-1.0, True)])

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.integrate import quad
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from georef.atmosphere import Air, AtmosphereError, _table, group_refractivity_ppm, saturated_hpa, standard_air
 from georef.kernels.air import BLOCK, means
-from georef.refraction import SPHERE_M, ardc_k, layer_air, layer_constant_ppm, spherical_bending, turned_towards
+from georef.refraction import SPHERE_M, ardc_k, layer_air, layer_constant_ppm, spherical_bending
 from sim.atmosphere import Air as SimulatedAir
 from sim.plan_tables import AtmosphereTable
 
@@ -202,6 +203,29 @@ def bent_by(air: Air, origin: FloatArray, points: FloatArray, down: FloatArray) 
         return np.asarray(np.arctan2(np.einsum("ni,ni->n", vectors, across), np.einsum("ni,ni->n", vectors, down)))
 
     return np.asarray(nadir(before) - nadir(after))
+
+
+def turned_towards(direction: FloatArray, down: FloatArray, bent_rad: FloatArray) -> FloatArray:
+    """Unit vectors (n, 3) turned about the horizontal towards nadir by angles (n,), by SciPy."""
+    axis = np.cross(direction, down)
+    axis /= lengths(axis)[:, np.newaxis]
+    turned: FloatArray = Rotation.from_rotvec(bent_rad[:, np.newaxis] * axis).apply(direction)
+    return turned
+
+
+def test_ardc_bends_points_as_the_sheet_says() -> None:
+    """20° from nadir, 3 km to 200 m: 10.872107 µrad, 34.47 mm on the ground."""
+    top, foot = 6_378_137.0 + 3000.0, 6_378_137.0 + 200.0
+    nadir = np.radians(20.0)
+    range_m = top * np.cos(nadir) - np.sqrt(foot**2 - (top * np.sin(nadir)) ** 2)
+    origin = np.array([[top, 0.0, 0.0]])
+    points = origin + range_m * np.array([[-np.cos(nadir), np.sin(nadir), 0.0]])  # along the equator, a circle
+    bent = bent_by(Air(refraction="ardc"), origin, points, np.array([[-1.0, 0.0, 0.0]]))
+    assert 1e6 * bent[0] == pytest.approx(10.87210664, abs=2e-3)
+    moved = points.copy()
+    Air(refraction="ardc").apply(origin, moved)
+    down_m = -(moved - origin)[0, 0]
+    assert (points[0, 1] - moved[0, 1] * (origin - points)[0, 0] / down_m) == pytest.approx(0.0344745, abs=5e-5)
 
 
 def test_ardc_bends_by_its_formula() -> None:

@@ -182,7 +182,6 @@ def test_wkt_for_files(crs: str, datum: str, begins: str) -> None:
     frame = Mapping(crs, datum=datum, accuracy_m=0.1)
     assert frame.wkt.startswith(begins)
     assert CRS.from_wkt(frame.wkt) == CRS(crs)
-    assert frame.horizontal_wkt == frame.wkt
 
 
 def test_a_three_dimensional_frame_given_as_text() -> None:

@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.ranging import (
-    PulseRates,
-    RangingError,
-    ZoneResolver,
-    gate_times,
-    range_of_beat,
-    range_of_flight,
-    range_of_phase,
-    unambiguous_range,
-    zone_of,
-)
+from georef.ranging import PulseRates, RangingError, ZoneResolver
 from georef.records import RETURN_DTYPE, StructArray
 from tests.sim.srep_spoken import Spoken, joined, scanner, speak
 
@@ -32,32 +22,64 @@ C_MPS = 299_792_458.0
 # ------------------------------------------------------------------------------------------- the formula sheet's
 
 
-def test_ranges_are_the_sheets() -> None:
-    assert range_of_flight(6.67128190396e-6) == pytest.approx(1000.0, abs=1e-8)
-    assert range_of_flight(1e-9) == pytest.approx(0.149896229, abs=1e-12)
-    assert range_of_flight(6.67128190396e-6, 1.000276394225) - 1000.0 == pytest.approx(-0.276317853, abs=1e-8)
-    assert range_of_phase(1.0, 3, 10e6) == pytest.approx(47.35454128, abs=5e-9)
-    assert range_of_phase(0.0, 1, 10e6) == pytest.approx(14.9896229, abs=5e-9)
-    assert range_of_beat(667e3, 1e9 / 10e-6) == pytest.approx(0.99980785, abs=5e-9)
+APPARENT_M = 1e-3
+
+
+def longer_m(ticks: int, tick_hz: int, group_index: float, about_m: float) -> float:
+    """What the range of an echo is longer when it belongs to the pulse so many ticks of the counter before."""
+    rows = np.zeros(2, RETURN_DTYPE)
+    rows["device_time_ns"] = 10**12, 10**12 + ticks * 10**9 // tick_hz
+    rows["pulse_id"], rows["mta_zone"] = (7, 8), 255
+    rows["range_m"][1], rows["number_of_returns"][1] = APPARENT_M, 1
+    resolver = ZoneResolver(3000.0, about_m, group_index=group_index, tick_hz=tick_hz, slanted=False)
+    (found,) = fed(resolver, rows)
+    assert (found["pulse_id"], found["mta_zone"]) == (7, 1)
+    return float(found["range_m"]) - APPARENT_M
 
 
 @pytest.mark.parametrize(
-    ("prf_hz", "range_m"), [(66.7e3, 2247.319775), (100e3, 1498.96229), (150e3, 999.3081933), (500e3, 299.792458)]
+    ("flight_us", "group_index", "range_m", "within_m"),
+    [
+        (6.67128190396, 1.0, 1000.0, 1e-8),
+        (6.67128190396, 1.000276394225, 1000.0 - 0.276317853, 1e-8),
+        (1e-3, 1.0, 0.149896229, 1e-12),
+        (0.1, 1.0, 14.9896229, 5e-9),  # a tone of 10 MHz
+        (5.338500646, 1.000276394225, 800.0, 1e-7),  # when a range gate opens
+        (10.00968871, 1.000276394225, 1500.0, 1e-6),  # and closes
+    ],
 )
-def test_zones_are_the_sheets(prf_hz: float, range_m: float) -> None:
-    assert unambiguous_range(prf_hz) == pytest.approx(range_m, abs=5e-7)
-    assert unambiguous_range(prf_hz, 1.0003) * 1.0003 == pytest.approx(range_m, abs=5e-7)
+def test_ranges_are_the_sheets(flight_us: float, group_index: float, range_m: float, within_m: float) -> None:
+    """By whole nanoseconds, of which the range is a share."""
+    ticks = round(1e3 * flight_us)
+    wanted_m = range_m * ticks / (1e3 * flight_us)
+    assert longer_m(ticks, 10**9, group_index, range_m) == pytest.approx(wanted_m, abs=within_m)
+
+
+@pytest.mark.parametrize(
+    ("prf_hz", "range_m"), [(66_700, 2247.319775), (100_000, 1498.96229), (150_000, 999.3081933), (500_000, 299.792458)]
+)
+def test_zones_are_as_long_as_the_sheets(prf_hz: int, range_m: float) -> None:
+    assert longer_m(1000, 1000 * prf_hz, 1.0, range_m) == pytest.approx(range_m, abs=5e-7)
+    assert longer_m(1000, 1000 * prf_hz, 1.0003, range_m) * 1.0003 == pytest.approx(range_m, abs=5e-7)
 
 
 def test_the_zone_of_a_range_is_the_sheets() -> None:
-    assert zone_of(1780.25, 150e3) == 2
-    assert 1780.25 - unambiguous_range(150e3) == pytest.approx(780.9418067, abs=5e-8)
-    assert [zone_of(range_m, 500e3) for range_m in (0.0, 299.79, 299.80, 1000.0)] == [1, 1, 2, 4]
+    ticks = 10**11 + 1000 * np.arange(20)  # 150 kHz by a counter of 150 MHz
+    rows = np.zeros(20, RETURN_DTYPE)
+    rows["device_time_ns"] = [int(tick) * 10**9 // 150_000_000 for tick in ticks]
+    rows["pulse_id"], rows["number_of_returns"], rows["mta_zone"] = np.arange(20), 1, 255
+    rows["range_m"] = 780.9418067
+    found = fed(ZoneResolver(3000.0, 1780.0, tick_hz=150_000_000, slanted=False), rows)
+    assert set(found["mta_zone"].tolist()) == {1}  # k = 2
+    np.testing.assert_allclose(found["range_m"], 1780.25, rtol=0, atol=5e-8)
 
 
-def test_the_gate_is_the_sheets() -> None:
-    opens, closes = gate_times(800.0, 1500.0, 1.000276394225)
-    assert (1e6 * opens, 1e6 * closes) == pytest.approx((5.338500646, 10.00968871), abs=5e-9)
+@pytest.mark.parametrize(("range_m", "zone"), [(0.01, 0), (299.79, 0), (299.80, 1), (1000.0, 3)])
+def test_zones_at_500_khz_are_the_sheets(range_m: float, zone: int) -> None:
+    rows, true = train(lambda pulse, angle: [range_m], 50)
+    found = fed(ZoneResolver(2000.0, range_m, slanted=False), rows)
+    assert_true(found, true)
+    assert set(found["mta_zone"][:-3].tolist()) == {zone}  # echoes of the last pulses stand in the last record
 
 
 # -------------------------------------------------------------------------------------------------- a made train
@@ -260,7 +282,7 @@ def test_terrain_goes_before_continuity() -> None:
 
 
 def test_between_zones_nothing_is_taken() -> None:
-    zone_m = unambiguous_range(500e3)
+    zone_m = 299.792458  # 500 kHz
     rows, true = train(lambda pulse, angle: [1000.0], 500, every_pulse=True)
     for off, accepted in ((0.38, True), (-0.38, True), (0.42, False), (-0.42, False)):
         resolver = ZoneResolver(2500.0, 1000.0 + off * zone_m, slanted=False)
@@ -273,7 +295,7 @@ def test_between_zones_nothing_is_taken() -> None:
 
 
 def test_echoes_in_the_flash_of_a_later_pulse() -> None:
-    zone_m = unambiguous_range(500e3)
+    zone_m = 299.792458  # 500 kHz
     rows, true = train(lambda pulse, angle: [3 * zone_m + (2.0 if pulse % 10 == 5 else 20.0)], 1000)
     resolver = ZoneResolver(2500.0, 3 * zone_m, slanted=False, blind_m=5.0)
     found = fed(resolver, rows)

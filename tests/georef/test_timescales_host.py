@@ -35,7 +35,7 @@ def timeline(*, step_s: float = 0.0, keep_history: bool = True) -> HostTimeline:
 
 
 def test_raw_is_found_between_and_after_readings() -> None:
-    """Within 2 µs between readings and 10 µs where the slew changed; back again within 1 ns."""
+    """Within 2 µs between readings and 10 µs where the slew changed."""
     line = timeline()
     raw = np.arange(0.05, 310.0, 0.037)
     host = slewed(raw) + CONSTANT
@@ -43,7 +43,6 @@ def test_raw_is_found_between_and_after_readings() -> None:
     error = np.abs(found - np.rint(raw * NS))
     assert np.max(error) < 10_000
     assert np.median(error) < 100
-    assert np.max(np.abs(line.host_from_raw(found) - host)) <= 1
     assert np.all(np.diff(found) > 0)
     assert line.raw_at(int(host[500])) == found[500]
     assert abs(line.raw_at(int(host[-1])) - int(found[-1])) <= 1
@@ -78,7 +77,6 @@ def test_without_readings_raw_is_monotonic() -> None:
     line = HostTimeline(CONSTANT)
     host = np.array([CONSTANT + 5, CONSTANT + 10 * NS])
     np.testing.assert_array_equal(line.raw_from_host(host), host - CONSTANT)
-    np.testing.assert_array_equal(line.host_from_raw(host - CONSTANT), host)
     assert line.raw_at(CONSTANT + 7) == 7
 
 
