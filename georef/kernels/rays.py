@@ -45,6 +45,7 @@ from georef.kernels.covariance import (
     interval_at,
 )
 from georef.kernels.rotations import (
+    angle_of,
     cross,
     dot,
     matrix_at,
@@ -267,7 +268,7 @@ def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], o
     off_nadir = out.off_nadir_rad[here]
     for i in range(n):
         beam = plus(three(block, POINT, i), -1.0, three(block, ORIGIN, i))
-        off_nadir[i] = math.atan2(dot(beam, right), dot(beam, down))
+        off_nadir[i] = angle_of(dot(beam, right), dot(beam, down))
 
 
 @kept

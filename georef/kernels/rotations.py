@@ -117,6 +117,20 @@ def sin_cos(angle: float) -> tuple[float, float]:
 
 
 @kernel
+def angle_of(across: float, down: float) -> float:
+    """atan2 to 2e-8 rad, by steps that every processor rounds alike (Abramowitz and Stegun 4.4.49)."""
+    a, b = abs(across), abs(down)
+    t = min(a, b) / max(a, b, 1e-300)
+    s = t * t
+    odd = -0.0752896400 + s * (0.0429096138 + s * (-0.0161657367 + s * 0.0028662257))
+    odd = 1.0 + s * (-0.3333314528 + s * (0.1999355085 + s * (-0.1420889944 + s * (0.1065626393 + s * odd))))
+    angle = t * odd
+    angle = 0.5 * math.pi - angle if a > b else angle
+    angle = math.pi - angle if down < 0.0 else angle
+    return -angle if across < 0.0 else angle
+
+
+@kernel
 def plus(a: Three, factor: float, b: Three) -> Three:
     """a + factor · b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]

@@ -14,6 +14,7 @@ from georef.atmosphere import Air
 from georef.beams import Geometry, LineGeometry, SpinningGeometry
 from georef.calibration import nominal
 from georef.georeference import Georeferencer
+from georef.kernels.rotations import angle_of
 from georef.mapping import Mapping, MappingError
 from georef.points import Fate, Points
 from georef.records import Int64Array, StructArray
@@ -131,6 +132,12 @@ def test_scan_angles_of_spinning_heads_are_the_beams_own() -> None:
     assert found[[0, 1, 4]] == pytest.approx([0.0, 90.0, -90.0], abs=0.3)
     assert np.abs(found[2:4]) == pytest.approx([179.0, 179.0], abs=0.3)
     assert found[2] > 0.0 > found[3]
+
+
+def test_angles_are_arctangents_all_round() -> None:
+    angle = np.concatenate([np.linspace(-np.pi, np.pi, 4001)[1:], np.radians([-90.0, -45.0, 0.0, 45.0, 90.0])])
+    found = [angle_of(1e3 * np.sin(one), 1e3 * np.cos(one)) for one in angle.tolist()]
+    np.testing.assert_allclose(found, angle, rtol=0, atol=2e-8)
 
 
 def test_onto_the_map() -> None:
