@@ -55,7 +55,7 @@ def ins_as_is(session: Session, config: Config | None) -> AsIs:
         raise UserError(f"{log}: no INS solution in the log; without --ins as-is its IMU and GNSS are navigated")
     buffer = TrajectoryBuffer(setup.ins_protocol, name=session.session_id)
     buffer.append(clocks.ins_rows)
-    trajectory = buffer.snapshot()
+    trajectory = buffer.snapshot().with_velocities()
     if len(trajectory) < 2:
         raise UserError(f"{log}: {setup.ins_source}: its INS had no solution")
     return AsIs(setup.ins_source, trajectory, +Counter(buffer.counts), session_holes(session))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from daemon.processing.flown import _from_device
 from daemon.processing.ins_point import offset_in_b, point_doubts
+from georef.records import INS_DTYPE
 from georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -61,3 +66,16 @@ def test_the_body_itself_and_a_bad_solution_say_nothing() -> None:
     assert point_doubts(near, body, [ARM], "x") == []
     assert point_doubts(wild, body, [ARM], "x") == []
     assert point_doubts(turning(15), body, [ARM], "x") == []
+
+
+def test_an_ins_that_says_no_velocities_has_those_of_its_way() -> None:
+    body = turning()
+    rows = np.zeros(len(body), INS_DTYPE)
+    rows["gps_ns"], rows["velocity_l"] = body.time_ns, np.nan
+    rows["lat_rad"], rows["lon_rad"], rows["height_m"] = body.geodetic()
+    rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"] = body.attitude()
+    setup: Any = SimpleNamespace(ins_source="imu/main", protocol=lambda source: "")
+    told: Any = SimpleNamespace(ins_rows=rows)
+    trajectory, counts = _from_device(setup, told)
+    assert counts == {"taken": len(body)}
+    np.testing.assert_allclose(trajectory.velocity_l()[1:-1], body.velocity_l()[1:-1], rtol=0, atol=0.3)
