@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -296,11 +297,18 @@ def moved_l(
 
 
 def mean_over(time_ns: Int64Array, values: FloatArray, pieces: Int64Array) -> FloatArray:
-    """(k, 3) mean of values (n, 3), linear between rows, over each piece."""
-    step_s = np.diff(time_ns)[:, np.newaxis] / SECOND_NS
-    area = np.concatenate([np.zeros((1, 3)), np.cumsum(step_s * (values[1:] + values[:-1]) / 2, axis=0)])
+    """(k, 3) mean of values (n, 3), linear between rows, over each piece; nan where a row of it says none."""
+    steps = np.diff(time_ns)[:, np.newaxis] / SECOND_NS * (values[1:] + values[:-1]) / 2
+    unsaid = np.isnan(steps)
+
+    def over(columns: NDArray[Any]) -> NDArray[Any]:
+        since = np.concatenate([np.zeros((1, 3), columns.dtype), np.cumsum(columns, axis=0)])
+        return np.asarray(since[pieces[:, 1]] - since[pieces[:, 0]])
+
     length_s = np.diff(time_ns[pieces], axis=1) / SECOND_NS
-    mean: FloatArray = (area[pieces[:, 1]] - area[pieces[:, 0]]) / length_s
+    mean: FloatArray = np.where(
+        over(unsaid.astype(np.int64)) > 0, np.nan, over(np.where(unsaid, 0.0, steps)) / length_s
+    )
     return mean
 
 

@@ -151,6 +151,16 @@ def test_a_record_without_velocity_leaves_the_others_turned(pospac: bool) -> Non
     np.testing.assert_allclose(back.velocity_e[7], trajectory.velocity_e[7], atol=0.1)  # by the positions beside it
 
 
+def test_a_record_without_velocity_hides_no_wrong_ones_behind_it() -> None:
+    table = table_of(flown())
+    north, east = table[:, 4].copy(), table[:, 5].copy()
+    cos, sin = np.cos(np.radians(40.0)), np.sin(np.radians(40.0))
+    table[:, 4], table[:, 5] = north * cos - east * sin, north * sin + east * cos
+    table[1, 5] = np.nan
+    with pytest.raises(TrajectoryError, match="positions and velocities differ in course by 40°"):
+        read(table)
+
+
 def test_unsaid_sigmas_stay_unsaid() -> None:
     trajectory = flown(position_sigma_l=None)
     back = read_trajectory(sbet_bytes(trajectory), "sbet.out", span_ns=SPAN, smrmsg=smrmsg_bytes(trajectory))
