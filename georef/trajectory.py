@@ -269,7 +269,7 @@ class Trajectory:
 
         At an epoch beside a gap, or at the ends, that of the one interval there is; an epoch alone stays without.
         """
-        unsaid = ~np.isfinite(self.velocity_e).all(axis=1)
+        unsaid = np.logical_or.reduce(~np.isfinite(self.velocity_e), axis=1)
         if not unsaid.any():
             return self
         near = np.diff(self.time_ns) <= self.max_gap_ns

@@ -82,7 +82,8 @@ def read_sbet(
         *(position, attitude),
         angles_in="radians",
     )
-    columns.velocity_l = _velocity_l(columns, table[:, 10], np.isfinite(table[:, 1:USED_DOUBLES]).all(axis=1))
+    whole: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(table[:, 1:USED_DOUBLES]), axis=1)
+    columns.velocity_l = _velocity_l(columns, table[:, 10], whole)
     return columns
 
 

@@ -175,7 +175,9 @@ def eastwards(times_ns: NDArray[np.int64], said: FloatArray | None = None) -> Tr
     """Along the equator with a speed that grows by 2 m/s²."""
     seconds = (times_ns - START_NS) / 1e9
     lon = (60.0 * seconds + seconds**2) / 6_378_137.0
-    flat = dict.fromkeys(("lat_rad", "height_m", "roll_rad", "pitch_rad", "heading_rad"), np.zeros(len(times_ns)))
+    flat: dict[str, Any] = dict.fromkeys(
+        ("lat_rad", "height_m", "roll_rad", "pitch_rad", "heading_rad"), np.zeros(len(times_ns))
+    )
     velocity_l = np.full((len(times_ns), 3), np.nan) if said is None else said
     return wild(len(times_ns), time_ns=times_ns, lon_rad=lon, velocity_l=velocity_l, **flat)
 
