@@ -44,7 +44,7 @@ class Residuals:
         swath: index in `Flight.swaths`; −1: of control.
         at: index of the return in its swath; −1: of control.
         misclosure_m: e = −(w + A δ), metres along the plane's normal (of ties: east, north, up, one row each).
-        sigma_m: √M, of the observation alone.
+        sigma_m: √M, of the observation alone, with what returns of a moment have in common.
         redundancy: r_i; 0: uncontrolled, 1: fully.
         normalised: w_i = e / √(M r) of data snooping.
         weight: of the robust estimation, 0 … 1; 0: taken out.

@@ -1,7 +1,9 @@
 """How good an adjustment is: residuals and their redundancy, group by group, control point by point (FORMULAS 6.5).
 
 Residuals are those of the misclosures, e = −(w + A δ) at the last linearisation; r = 1 − A Q Aᵀ / M with the cofactors
-of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups).
+of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups). M is all that a return
+errs by, also what it has in common with the others of its moment; what of A Q Aᵀ counts then is said in
+`calib.row_sums.look`.
 """
 
 from __future__ import annotations
@@ -104,9 +106,10 @@ def _on_planes(solution: Solution) -> tuple[Residuals, dict[str, float]]:
     table = _room("planes", count)
     ranges = []
     known = [_of_feature(solution.covariance, feature) for feature in solution.normals.planes]
-    for batch, looks in rows.looks(solution.state, lambda batch: _cofactors(solution, batch, known)):
+    weights = solution.row_weight
+    for batch, looks in rows.looks(solution.state, lambda batch: _cofactors(solution, batch, known), weights):
         mine = slice(batch.begin, batch.begin + batch.size)
-        weight = solution.row_weight[mine].astype(np.float64)
+        weight = weights[mine].astype(np.float64)
         with np.errstate(invalid="ignore"):
             redundancy = 1.0 - weight * looks.spread / looks.variance
             spread = looks.variance - np.where(weight > 0.0, 1.0, -1.0) * looks.spread

@@ -128,7 +128,9 @@ class Sums(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """Of each row of a batch (n,): f, M, n · beam, q = A Q Aᵀ; Q (g, c, c) of the groups; the design (n, c + 1)."""
+    """Of each row of a batch (n,): f, M (looked at: with c, that of what it has in common with its run), n · beam, q =
+    A Q Aᵀ; Q (g, c, c) of the groups; the design (n, c + 1).
+    """
 
     misclosure: FloatArray
     variance: FloatArray

@@ -161,7 +161,7 @@ class Rows:
         Args:
             state: where they are linearised.
             weight: (n,) of the rows.
-            huber: rows whose |f| / √M is larger lose weight; 0: none does.
+            huber: rows whose |f| / √(M + c) is larger lose weight; 0: none does.
         """
         sums = self._new_sums()
         for batch, task in self._tasks(state):
@@ -169,12 +169,15 @@ class Rows:
             go_over(MODE_SUM, task, mine, float(huber), sums, _NO_LOOKS)
         return sums
 
-    def looks(self, state: State, cofactors: Any = None) -> Iterator[tuple[Batch, Looks]]:
-        """Batch by batch f, M and A Q Aᵀ of each row.
+    def looks(
+        self, state: State, cofactors: Any = None, weight: SingleArray | None = None
+    ) -> Iterator[tuple[Batch, Looks]]:
+        """Batch by batch f and M of each row, and A Q Aᵀ (as `calib.row_sums.look` has them).
 
         Args:
             state: at which.
             cofactors: of a batch's runs, Q (g, c, c) of their columns; None: instead rows of the design are given.
+            weight: (n,) of the rows; None: 1.
         """
         sums = self.no_sums
         widest = max((len(self.unknowns.of_head(head)[0]) for head in range(len(self.flight.heads))), default=0)
@@ -185,7 +188,9 @@ class Rows:
             cofactor = np.zeros((0, 0, 0)) if cofactors is None else cofactors(batch)
             looks = new_looks(batch.size, cofactor, design)
             mode = MODE_GIVE if cofactors is None else MODE_LOOK
-            go_over(mode, task, np.ones(batch.size), 0.0, sums, looks)
+            mine = slice(batch.begin, batch.begin + batch.size)
+            kept = np.ones(batch.size) if weight is None else weight[mine].astype(np.float64)
+            go_over(mode, task, kept, 0.0, sums, looks)
             yield batch, looks
 
     def placed(self, state: State) -> Iterator[BeamTable]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
 
 from calib.adjust import adjust
@@ -13,14 +14,17 @@ from calib.features import Features
 from calib.normals import extras
 from calib.parameters import Wish, unknowns
 from calib.robust import huber_weight, least_detectable, least_shift, tau_critical, w_critical
+from calib.rows import Rows, State
 from calib.solve import Block, Settings, solved
 from calib.trajectory_errors import Taus, gauss_markov
+from georef.records import Int64Array
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made
 from tests.calib.test_adjust import controlled, in_planes
 from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
+FloatArray = NDArray[np.float64]
 PLAIN = Settings(huber=0.0, family=0.0)
 
 
@@ -80,6 +84,85 @@ def test_redundancy_is_that_of_the_dense_solution() -> None:
     assert groups["planes"].variance_factor * groups["planes"].redundancy == pytest.approx(
         float((misclosure**2 / variance).sum()), rel=1e-5
     )
+
+
+def sharing(rows: Rows, state: State) -> tuple[Int64Array, FloatArray, FloatArray]:
+    """(n,) of the rows: their run, M, and the variance c of what they have in common with it."""
+    run_of, variance, common, count = [], [], [], 0
+    for batch, looks in rows.looks(state):
+        begin = 0
+        for run in batch.runs:
+            mine = slice(begin, begin + len(run.at))
+            first = len(rows.expansion(run, state.normal_e[run.plane])[0]) - 12
+            states = looks.design[mine, first : first + 8]
+            lever = states[:, 2:5] + states[:, 5:8]
+            assert rows.prior is not None
+            walk = rows.prior.walk_rad2[run.before]
+            common.append(states[:, 0] * states[:, 1] * walk * (lever**2).sum(axis=1))
+            run_of.append(np.full(len(run.at), count))
+            begin, count = mine.stop, count + 1
+        variance.append(looks.variance)
+    return np.concatenate(run_of), np.concatenate(variance), np.concatenate(common)
+
+
+def test_redundancy_is_that_of_rows_that_share_an_error() -> None:
+    """What residuals are expected to be, (I − H) V (I − H)ᵀ with V of noise and of what a run's rows have in common."""
+    built = made(lines=LINES[:4], points=25)
+    prior = gauss_markov(built.flight, Taus(), 5.0)
+    prior = replace(prior, walk_rad2=np.full(len(prior), (6e-5) ** 2))
+    block = Block.of(built.flight, built.features, unknowns(built.flight, Wish()), prior, None)
+    done = solved(block, PLAIN, block.start())
+    rows, state, u = done.solution.rows, done.solution.state, done.solution.rows.size
+    run_of, variance, common = sharing(rows, state)
+    assert 0.2 < np.median(common / variance) < 1.0
+    every = np.zeros((rows.count, u + 3 * len(rows.planes)))
+    every[:, :u] = design(rows, state)[0]
+    for row, (place, which) in enumerate(zip(*in_planes(rows, state), strict=True)):
+        every[row, u + 3 * which : u + 3 * which + 3] = *place, 1.0
+    together = np.bincount(run_of)[run_of]
+    weighted = every / (variance + together * common)[:, np.newaxis]
+    normal = every.T @ weighted
+    normal[4:u, 4:u] += done.solution.trajectory.normal
+    scale = 1 / np.sqrt(np.diag(normal))
+    cofactor = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    root = np.sqrt(common)
+    spread = np.diag(variance) + np.outer(root, root) * (run_of[:, np.newaxis] == run_of)
+    inner = weighted.T @ spread @ weighted
+    inner[4:u, 4:u] += done.solution.trajectory.normal
+    taken = np.einsum("ij,ji->i", every @ cofactor, weighted.T @ spread)
+    moved = np.einsum("ij,jk,ik->i", every, cofactor @ inner @ cofactor, every)
+    expected = np.diag(spread) - 2.0 * taken + moved
+    (residuals,) = done.quality.residuals
+    np.testing.assert_allclose(residuals.sigma_m, np.sqrt(variance + common), rtol=1e-5)
+    assert residuals.redundancy.sum() == pytest.approx((expected / np.diag(spread)).sum(), rel=0.01)
+    of_w = expected / (np.diag(spread) * residuals.redundancy)  # the variance that w has
+    assert 0.97 < of_w.mean() < 1.03
+    assert 0.85 < np.quantile(of_w, 0.01)
+    assert np.quantile(of_w, 0.99) < 1.15
+
+
+def test_the_variance_factor_of_rows_that_share_an_error_is_one() -> None:
+    """A flight whose runs of returns are off by a common error each, as much as the prior says."""
+    built, factors, rejected = made(lines=LINES[:4], points=25), [], 0
+    prior = gauss_markov(built.flight, Taus(), 5.0)
+    prior = replace(prior, walk_rad2=np.full(len(prior), (8e-5) ** 2))
+    seen = Rows(built.flight, built.features.planes, unknowns(built.flight, Wish()), prior)
+    run_of, variance, common = sharing(seen, seen.start())
+    assert np.median(common / variance) > 0.3
+    along = np.concatenate([looks.along for _, looks in seen.looks(seen.start())])
+    for seed in range(4):
+        error_m = np.sqrt(common) * np.random.default_rng(seed).standard_normal(run_of[-1] + 1)[run_of] / along
+        swaths = list(built.flight.swaths)
+        for batch in seen.batches:
+            at, ranges = np.concatenate([run.at for run in batch.runs]), swaths[batch.swath].rows.copy()
+            ranges["range_m"][at] += error_m[batch.begin : batch.begin + batch.size]
+            swaths[batch.swath] = replace(swaths[batch.swath], rows=ranges)
+        found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, Wish(), prior)
+        planes = next(fit for fit in found.groups if fit.group == "planes")
+        factors.append(planes.variance_factor)
+        rejected += planes.rejected
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.05)
+    assert rejected <= 3
 
 
 def test_variance_components_tell_which_group_is_worse() -> None:

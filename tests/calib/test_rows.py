@@ -239,7 +239,10 @@ def test_columns_of_the_trajectory_are_differences_of_the_model() -> None:
 
 
 def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> None:
-    """Rows of a run count like their mean: of the variance M / n + c, c that of a bridge between the run's knots."""
+    """Rows of a run count like their mean: of the variance M / n + c, c that of a bridge between the run's knots.
+
+    n is as many as the rows that are taken stand for: some are not taken, the others stand for four.
+    """
     flight, planes, _ = line_flight()
     flight = replace(flight, swaths=flight.swaths[:1])
     planes = tuple(replace(plane, patches=plane.patches[:1]) for plane in planes)
@@ -247,22 +250,25 @@ def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> No
     prior = TrajectoryPrior(np.zeros(4, np.int64), times, np.ones(4, np.int64), np.eye(24))
     seen = Rows(flight, planes, unknowns(flight, Wish()), replace(prior, walk_rad2=np.full(4, walk)))
     found = seen.summed(seen.start(), np.ones(seen.count, np.float32), 0.0)
-    expected, grown = np.zeros((4, 4)), []
+    weight = np.where(np.arange(seen.count) % 3 > 0, 4.0, 0.0).astype(np.float32)
+    expected, rest, grown = np.zeros((4, 4)), np.zeros((4, 4)), []
     for batch, looks in seen.looks(seen.start()):
         begin = 0
         for run in batch.runs:
             mine = slice(begin, begin + len(run.at))
             begin = mine.stop
-            columns = looks.design[mine, :4]
+            columns, kept = looks.design[mine, :4], weight[batch.begin + mine.start : batch.begin + mine.stop]
             states = looks.design[mine, 4:12]
             lever = states[:, 2:5] + states[:, 5:8]  # metres a radian about each axis, shared out to both knots
             share = states[:, 1]
             common = share * (1.0 - share) * walk * (lever**2).sum(axis=1)
             variance = looks.variance[mine] + len(run.at) * common
             expected += columns.T @ (columns / variance[:, np.newaxis])
+            rest += columns.T @ (columns * (kept / (looks.variance[mine] + kept.sum() * common))[:, np.newaxis])
             grown.append(variance.mean() / looks.variance[mine].mean())
     np.testing.assert_allclose(found.normal[:4, :4], expected, rtol=1e-9)
     assert max(grown) > 2.0
+    np.testing.assert_allclose(seen.summed(seen.start(), weight, 0.0).normal[:4, :4], rest, rtol=1e-9)
     free = Rows(flight, planes, unknowns(flight, Wish()), prior).summed(
         seen.start(), np.ones(seen.count, np.float32), 0.0
     )
