@@ -152,7 +152,7 @@ def validate(
     """
     rows = plane_rows(flight, features, calibrations)
     classes = _classes(flight, rows)
-    found = {name: _of_rows(name, rows.take(which)) for name, which in classes.items()}
+    found = {name: _of_rows(name, rows, which) for name, which in classes.items()}
     found["testfield"] = _testfield(flight, control, calibrations, rules or ControlRules())
     found["measurementActualParameters"] = _anew(calibrations, anew)
     return Validation(tuple(found[name] for name in CODES))
@@ -204,10 +204,11 @@ def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
     return headings, heights
 
 
-def _of_rows(name: str, rows: Rows) -> Method:
-    if len(rows) < FEWEST:
+def _of_rows(name: str, every: Rows, which: NDArray[np.bool_]) -> Method:
+    rows, tested = every.take(which), every.take(every.independent(which))
+    if len(tested) < FEWEST:
         return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {WANTS[name]}")
-    numbers, tests = Numbers.of(rows.value_m), distance_tests(rows)
+    numbers, tests = Numbers.of(rows.value_m), distance_tests(tested)
     pairs = len({*zip(rows.first.tolist(), rows.second.tolist(), strict=True)})
     what = f"{WORDS[name]}: {numbers.count:,} distances on {len(set(rows.name)):,} planes, {pairs} pairs"
     return Method(name, numbers, tests, _sentence(name, what, numbers, tests), {"pairs": pairs})
@@ -216,7 +217,8 @@ def _of_rows(name: str, rows: Rows) -> Method:
 def distance_tests(rows: Rows) -> tuple[Test, ...]:
     """χ² of values with their expected covariance, z of their mean (generalised least squares), χ² of effects.
 
-    χ² = dᵀ C⁻¹ d, with n degrees of freedom; mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1), z = mean · √(1ᵀ C⁻¹ 1).
+    Of n values none of which follows from others χ² = dᵀ C⁻¹ d has n degrees of freedom;
+    mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1), z = mean · √(1ᵀ C⁻¹ 1).
     """
     factor = np.linalg.cholesky(rows.covariance())
     whitened = np.linalg.solve(factor, np.column_stack([rows.value_m, np.ones(len(rows))]))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from calib.control import ControlRules, Ground, grounds_at
 from calib.effects import EFFECTS, SeenFrom, effect_columns
@@ -24,6 +25,7 @@ FloatArray = NDArray[np.float64]
 
 FLOOR_M = 0.003  # of a distance: no natural plane is better
 SIGMAS = (0.05, 0.05, 0.05, *np.radians([0.005, 0.005, 0.01]).tolist())  # of strips whose trajectory says none
+HALF = math.sqrt(0.5)  # of the floor, each sight's
 WANDER = 0.3  # of a trajectory's sigmas: as much as its errors change from plane to plane
 FAR_M = 10.0
 MOST_ROWS = 1500
@@ -40,6 +42,8 @@ class Rows:
         shared: (n, m) what one sigma of each shared error moves.
         name: of the planes or points.
         effects: (n, heads · effects) what one unit (SI) of each effect of a calibration moves; (n, 0): none.
+        local: sparse (n, m) what one sigma of each error moves that only one plane's or point's share; None: none.
+        sights: (n, 2) which sight of a plane is the first, and the second; (0, 2): all are different.
     """
 
     value_m: FloatArray
@@ -49,6 +53,8 @@ class Rows:
     shared: FloatArray
     name: tuple[str, ...]
     effects: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    local: Any = None
+    sights: Int64Array = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     def __len__(self) -> int:
         """Number of distances."""
@@ -61,14 +67,42 @@ class Rows:
             at = np.sort(np.random.default_rng(6_8).choice(at, MOST_ROWS, replace=False))
         names = tuple(self.name[int(number)] for number in at)
         effects = self.effects[at] if len(self.effects) else self.effects
-        return Rows(
-            self.value_m[at], self.first[at], self.second[at], self.noise_m[at], self.shared[at], names, effects
+        local = None if self.local is None else self.local[at]
+        sights = self.sights[at] if len(self.sights) else self.sights
+        columns = (self.value_m[at], self.first[at], self.second[at], self.noise_m[at], self.shared[at])
+        return Rows(*columns, names, effects, local, sights)
+
+    def independent(self, which: Any) -> NDArray[np.bool_]:
+        """(n,) of the distances chosen those that tell something beyond the others: k sights of a plane have k − 1.
+
+        Those whose sights are surest stay; any others are sums and differences of them.
+        """
+        chosen = np.zeros(len(self), bool)
+        if not len(self.sights):
+            chosen[which] = True
+            return chosen
+        at = np.flatnonzero(which)
+        groups = np.arange(int(self.sights.max(initial=-1)) + 1).tolist()  # a sight leads to another that it hangs on
+
+        def group(sight: int) -> int:
+            while groups[sight] != sight:
+                groups[sight] = groups[groups[sight]]
+                sight = groups[sight]
+            return sight
+
+        variance = self.noise_m**2 + (
+            0.0 if self.local is None else np.asarray(self.local.power(2).sum(axis=1)).ravel()
         )
+        for row in at[np.argsort(variance[at], kind="stable")].tolist():
+            first, second = (group(sight) for sight in self.sights[row].tolist())
+            chosen[row] = first != second
+            groups[first] = second
+        return chosen
 
     def covariance(self) -> FloatArray:
         """(n, n) that is expected, m²."""
         expected: FloatArray = np.diag(self.noise_m**2) + self.shared @ self.shared.T
-        return expected
+        return expected if self.local is None else expected + (self.local @ self.local.T).toarray()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +119,8 @@ class _Sight:
 
 def plane_rows(flight: Flight, features: Features, calibrations: Mapping[str, Calibration]) -> Rows:
     """Every two swaths on every plane: the mean of the one's returns from the other's plane."""
-    values, firsts, seconds, names = [], [], [], []
-    for plane in features.planes:
+    values, firsts, seconds, places = [], [], [], []
+    for place, plane in enumerate(features.planes):
         sights = [_sight(flight, plane, number) for number in range(len(plane.patches))]
         for first, second in combinations([one for one in sights if one.plane.count >= 6], 2):
             away = first.plane.centre_t - second.plane.centre_t
@@ -94,23 +128,26 @@ def plane_rows(flight: Flight, features: Features, calibrations: Mapping[str, Ca
                 values.append(float(away @ second.plane.normal_t))
                 firsts.append(first)
                 seconds.append(second)
-                names.append(plane.name)
-    reach = [_reach(first, second) for first, second in zip(firsts, seconds, strict=True)]
-    noise = np.array([
-        math.sqrt(one.plane.rms_m**2 / one.plane.count + spread**2 * two.plane.rms_m**2 / two.plane.count + FLOOR_M**2)
-        for one, two, spread in zip(firsts, seconds, reach, strict=True)
-    ])  # fmt: skip
+                places.append(place)
     normals = np.array([one.plane.normal_t for one in seconds]).reshape(-1, 3)
     of_first, of_second = (_shared(flight, sights, normals, calibrations) for sights in (firsts, seconds))
     shared, effects = of_first[0] - of_second[0], of_first[1] - of_second[1]
+    number: dict[_Sight, int] = {}
+    of_sights = [
+        [number.setdefault(sight, len(number)) for sight in pair] for pair in zip(firsts, seconds, strict=True)
+    ]
+    sights_at = np.array(of_sights, np.int64).reshape(-1, 2)
+    wander = _wander(shared[:, : len(flight.swaths) * 6], np.array(places, np.int64))
     return Rows(
         np.array(values),
         np.array([one.swath for one in firsts], np.int64),
         np.array([one.swath for one in seconds], np.int64),
-        _with_wander(noise, shared, len(flight.swaths)),
+        np.zeros(len(values)),
         shared,
-        tuple(names),
+        tuple(features.planes[place].name for place in places),
         effects,
+        sparse.hstack([_noise(firsts, seconds, sights_at), wander], format="csr"),
+        sights_at,
     )
 
 
@@ -127,11 +164,28 @@ def _sight(flight: Flight, plane: Plane, number: int) -> _Sight:
     return _Sight(patch.swath, fit, int(times[0]) + int(np.mean(times - times[0])), rate, spread_m)
 
 
-def _reach(first: _Sight, second: _Sight) -> float:
-    """How much a plane's error grows where the other's returns lie off its middle: 1 at its middle."""
-    away = first.plane.centre_t - second.plane.centre_t
-    along = float(np.linalg.norm(away - (away @ second.plane.normal_t) * second.plane.normal_t))
-    return math.sqrt(1.0 + (along / max(second.spread_m, 1e-3)) ** 2)
+def _noise(firsts: Sequence[_Sight], seconds: Sequence[_Sight], sights: Int64Array) -> Any:
+    """Sparse (n, sights · 4): of each sight its place along the normal, and the turn of its plane, by which the place
+    grows unsure where the other's returns lie off its middle."""
+    moved = np.zeros((len(firsts), 2, 4))
+    for row, (first, second) in enumerate(zip(firsts, seconds, strict=True)):
+        away = first.plane.centre_t - second.plane.centre_t
+        along = away - (away @ second.plane.normal_t) * second.plane.normal_t
+        sigmas = [one.plane.rms_m / math.sqrt(one.plane.count) for one in (first, second)]
+        moved[row, :, 0] = math.hypot(sigmas[0], FLOOR_M * HALF), -math.hypot(sigmas[1], FLOOR_M * HALF)
+        moved[row, 1, 1:] = -sigmas[1] * along / max(second.spread_m, 1e-3)
+    row_of = np.repeat(np.arange(len(firsts)), 8)
+    column = 4 * np.repeat(sights.reshape(-1), 4) + np.tile(np.arange(4), 2 * len(firsts))
+    shape = len(firsts), 4 * (int(sights.max(initial=-1)) + 1)
+    return sparse.csr_array((moved.reshape(-1), (row_of, column)), shape=shape)
+
+
+def _wander(of_strips: FloatArray, place: Int64Array) -> Any:
+    """Sparse (n, places · m) what strips' errors (n, m) change from place to place."""
+    row, column = np.nonzero(of_strips)
+    shape = len(of_strips), of_strips.shape[1] * (int(place.max(initial=-1)) + 1)
+    values = WANDER * of_strips[row, column]
+    return sparse.csr_array((values, (row, column + of_strips.shape[1] * place[row])), shape=shape)
 
 
 def control_rows(
@@ -153,18 +207,12 @@ def control_rows(
         values,
         np.array([one.swath for one in grounds], np.int64),
         np.full(len(grounds), -1),
-        _with_wander(noise, shared, len(flight.swaths)),
+        noise,
         np.hstack([shared, of_points]),
         tuple(points[one.point].name for one in grounds),
         effects,
+        _wander(shared[:, : len(flight.swaths) * 6], number),
     )
-
-
-def _with_wander(noise: FloatArray, shared: FloatArray, swaths: int) -> FloatArray:
-    """(n,) with what strips' errors change within them."""
-    of_strips = shared[:, : swaths * 6]
-    wandering: FloatArray = np.sqrt(noise**2 + WANDER**2 * (of_strips**2).sum(axis=1))
-    return wandering
 
 
 def _sight_of_ground(flight: Flight, ground: Ground) -> _Sight:

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.features import ControlPoint, Features, Patch, Plane
+from calib.local_plane import plane_through
 from calib.validation import CODES, Method, distance_tests, same_logs, validate
-from calib.validation_rows import Rows
+from calib.validation_rows import Rows, plane_rows
 from georef.calibration import INDEX, Calibration
 from sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight
@@ -176,6 +177,32 @@ def test_the_tests_reject_as_often_as_they_promise() -> None:
     for column in p.T:
         assert 0.03 < (column < 0.05).mean() < 0.075
         assert 0.45 < column.mean() < 0.55
+
+
+def test_planes_that_many_swaths_show_are_tested_as_often_as_promised(made: Cast, roofs: Features) -> None:
+    """Each sight errs once, in all its distances, as returns and 3 mm of a distance say; so does a strip on a plane."""
+    calibrations, flight = {"left": made.truth}, made.flight.placed({"left": made.truth})
+    planes = tuple(plane for plane in roofs.planes if len(plane.patches) == 4)
+    rows = plane_rows(flight, Features(planes=planes), calibrations)
+    fits = [
+        plane_through(np.asarray(flight.swaths[patch.swath].points_t[patch.at])) for p in planes for patch in p.patches
+    ]
+    sigma = np.hypot([fit.rms_m / np.sqrt(fit.count) for fit in fits], 0.003 / np.sqrt(2.0)).reshape(-1, 4)
+    on = np.repeat(np.arange(len(planes)), 6)
+    chosen = rows.independent(np.ones(len(rows), bool))
+    assert len(rows) == 6 * len(planes) > 60
+    assert chosen.sum() == 3 * len(planes)
+    assert chosen.reshape(-1, 6).sum(axis=1).tolist() == [3] * len(planes)
+    draws, p = np.random.default_rng(4), np.empty((600, 3))
+    for run in range(600):
+        error = sigma * draws.standard_normal(sigma.shape)
+        strips, wandered = draws.standard_normal(24), 0.3 * draws.standard_normal((len(planes), 24))
+        value = (rows.shared[:, :24] * (strips + wandered[on])).sum(axis=1)
+        tested = replace(rows, value_m=value + error[on, rows.first] - error[on, rows.second]).take(chosen)
+        p[run] = [test.p for test in distance_tests(tested)]
+    for column in p.T:
+        assert 0.03 < (column < 0.05).mean() < 0.07
+        assert (column < 0.001).sum() <= 3
 
 
 def test_a_shift_of_all_is_seen_by_the_mean() -> None:
