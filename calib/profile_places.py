@@ -6,7 +6,7 @@ along two overlapping lines side by side, below one of them (FORMULAS 5.4).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,21 +114,23 @@ class Place:
 
 
 def places(
-    flight: Flight, tracks: Sequence[Track | None], kind: str, half_width_m: float, *, pitch_known: bool = True
+    flight: Flight, tracks: Sequence[Track | None], kind: str, half_width_m: float, pitch_unknown: Collection[str] = ()
 ) -> Iterator[list[Place]]:
     """The corridors of a kind, ``roll``, ``pitch`` or ``heading``, pair by pair of swaths of one scanner.
 
     Opposite lines side by side are moved apart by a wrong pitch as by a wrong heading: they serve for the heading only
-    where the pitch is known.
+    of scanners whose pitch is known, not of those named.
     """
     for first in range(len(tracks)):
         for second in range(first + 1, len(tracks)):
             one, other = tracks[first], tracks[second]
             if one is None or other is None or not (one.straight and other.straight):
                 continue
-            if kind == "heading" and not pitch_known and one.forward @ other.forward < 0.0:
+            head = flight.swaths[first].head
+            told_apart = kind != "heading" or flight.heads[head].name not in pitch_unknown
+            if not told_apart and one.forward @ other.forward < 0.0:
                 continue
-            if flight.swaths[first].head == flight.swaths[second].head:
+            if flight.swaths[second].head == head:
                 found = _PLACED[kind](one, other, half_width_m)
                 if found:
                     yield [Place(kind, first, second, corridor) for corridor in found]

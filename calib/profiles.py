@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -197,13 +197,13 @@ def survey(
     given: Sequence[Given] = (),
     *,
     with_points_of: Mapping[str, Calibration] | None = None,
-    pitch_known: bool = True,
+    pitch_unknown: Collection[str] = (),
 ) -> Survey:
     """Profiles of one kind: of each pair the best ones. Arguments as of `measure`.
 
     Args:
         with_points_of: by scanner, the calibrations of the flight's points, where they are not those to measure with.
-        pitch_known: False: no heading from opposite lines (`calib.profile_places.places`).
+        pitch_unknown: scanners that get no heading from opposite lines (`calib.profile_places.places`).
     """
     now = flight.starts() if calibrations is None else dict(calibrations)
     tracks = tracks_of(flight, now)
@@ -218,7 +218,7 @@ def survey(
                 _sort(flight, now, tracks, [measured], 1, taken, refused)
         return Survey(tuple(taken), refused)
     grounds: dict[int, Ground] = {}
-    for group in _groups(flight, tracks, kind, settings, given, pitch_known):
+    for group in _groups(flight, tracks, kind, settings, given, pitch_unknown):
         for swath in (group[0].first, group[0].second):
             grounds.setdefault(swath, Ground.of(flight.swaths[swath]))
         outcomes = [measure_place(flight, grounds, tracks, place, now, settings, margin) for place in group]
@@ -233,14 +233,14 @@ def _groups(
     kind: str,
     settings: Settings,
     given: Sequence[Given],
-    pitch_known: bool,
+    pitch_unknown: Collection[str],
 ) -> Iterator[list[Place]]:
     asked = [one for one in given if one.kind == kind]
     for one in asked:
         corridor = Corridor.between(one.start_t, one.end_t, settings.half_width_m)
         yield [Place(kind, one.first, one.second, corridor)]
     if not asked:
-        yield from places(flight, tracks, kind, settings.half_width_m, pitch_known=pitch_known)
+        yield from places(flight, tracks, kind, settings.half_width_m, pitch_unknown)
 
 
 def _sort(
@@ -363,8 +363,8 @@ def stepwise(
     for _ in range(settings.rounds):
         refused.clear()
         for kind in KINDS:
-            known = any(name.endswith(PARAMETER["pitch"]) for name in sigmas)
-            seen = survey(flight, kind, control, settings, now, given, with_points_of=start, pitch_known=known)
+            unknown = [head.name for head in flight.heads if f"{head.name}.{PARAMETER['pitch']}" not in sigmas]
+            seen = survey(flight, kind, control, settings, now, given, with_points_of=start, pitch_unknown=unknown)
             refused.update({f"{kind}: {why}": count for why, count in seen.refused.items() if count})
             scanners = sorted({profile.scanner for profile in seen.profiles})
             found = {name: combined([one for one in seen.profiles if one.scanner == name]) for name in scanners}

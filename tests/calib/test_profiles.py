@@ -294,3 +294,16 @@ def test_picture() -> None:
     words = " ".join(one.get_text() for one in figure.findobj(Text) if isinstance(one, Text))
     assert profile.formula.split(" = ")[0] in words
     assert {"Before", "After", *profile.names} <= set(words.split())
+
+
+def test_a_pitch_found_for_one_scanner_is_not_known_of_another() -> None:
+    """Left over lines that tell pitch; right over opposite lines side by side, which move by either."""
+    one = village(phi_rad=0.006)
+    other = village((THERE, Line(145, 90, 270, 290, 300)), phi_rad=0.006)
+    right = replace(other.heads[0], name="right", start=replace(other.heads[0].start, scanner="right"))
+    flown = (*one.trajectories, *other.trajectories)
+    swaths = (*one.swaths, *(replace(swath, head=1, flown=len(LINES) + swath.flown) for swath in other.swaths))
+    flight = replace(one, heads=(*one.heads, right), trajectories=flown, swaths=swaths)
+    result = stepwise(flight, settings=Settings(rounds=1))
+    assert {"left.phi_rad", "left.kappa_rad"} <= set(result.sigmas)
+    assert not any(name.startswith("right.") for name in result.sigmas)
