@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from calib.comparable import difference_between
 from georef.calibration import INDEX, PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
@@ -139,8 +140,8 @@ class History:
     Attributes:
         scanner, installation: whose.
         entries: in the order of time; times: (n,) seconds since 1970.
-        steps: each against the one before, boresight only.
-        trends: of the boresight; empty: too few calibrations.
+        steps: each against the one before, boresight only; without those that cannot be compared.
+        trends: of the boresight; empty: too few calibrations, or some that cannot be compared.
         sentences: the verdict.
     """
 
@@ -223,10 +224,20 @@ def history(calibrations: Sequence[Calibration]) -> tuple[History, ...]:
 def _history(key: tuple[str, str], group: list[tuple[float, Calibration]]) -> History:
     times, entries = tuple(time for time, _ in group), tuple(entry for _, entry in group)
     tested = [(time, entry) for time, entry in group if compare(entry, entry, BORESIGHT).freedom]
-    steps = tuple(compare(one, two, BORESIGHT) for (_, one), (_, two) in pairwise(tested))
-    trends = tuple(_trend(name, tested) for name in BORESIGHT if _told(name, tested) >= FEWEST_FOR_TREND)
     when = {entry.id: _date(time)[:10] for time, entry in group}
-    return History(*key, entries, times, steps, trends, tuple(_sentences(key[0], steps, trends, when)))
+    steps, notes = [], []
+    for (_, one), (_, two) in pairwise(tested):
+        step = compare(one, two, BORESIGHT)
+        why = difference_between(one, two, min((row.sigma for row in step.rows), default=math.inf))
+        if why:
+            notes.append(f"{key[0]}: not judged between {when[one.id]} and {when[two.id]}: {why}")
+        else:
+            steps.append(step)
+    trends = (
+        () if notes else tuple(_trend(name, tested) for name in BORESIGHT if _told(name, tested) >= FEWEST_FOR_TREND)
+    )
+    sentences = [] if notes and not steps else _sentences(key[0], steps, trends, when)
+    return History(*key, entries, times, tuple(steps), trends, (*sentences, *notes))
 
 
 def _told(name: str, tested: Sequence[tuple[float, Calibration]]) -> int:

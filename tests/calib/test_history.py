@@ -5,13 +5,14 @@ from __future__ import annotations
 import datetime as dt
 import struct
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.history import BORESIGHT, HistoryError, compare, history
 from calib.history_plots import history_png
-from georef.calibration import INDEX, Calibration, nominal
+from georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 
 SIGMAS = np.radians([0.001, 0.001, 0.002])
 AT = [INDEX[name] for name in BORESIGHT]
@@ -118,6 +119,60 @@ def test_nominal_values_are_listed_and_not_tested() -> None:
     assert one.steps == ()
     assert "fewer than two calibrations with sigmas" in one.sentences[0]
     assert not one.moved
+
+
+IBRC = np.array([200.0, 2000.0])
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"scan_plane_tilt_rad": np.radians(0.01)}, "scan_plane_tilt_deg, held, is 0 and 0.01"),
+        ({"range_scale": 50e-6}, "range_scale_ppm, held, is 0 and 50"),
+        ({"lever_arm_x_m": 0.2}, "lever_arm_x_m, held, is 0 and 0.2"),
+        ({"ibrc": (IBRC, np.array([0.0, 0.08]))}, "range corrections by intensity differ"),
+        ({"range_offsets": (RangeOffset(0.03, return_slot=2),)}, "range offsets by return, zone or rate differ"),
+        ({"beams": {3: BeamCorrection(elevation_rad=1e-4)}}, "corrections of beams differ"),
+        ({"facet_tilt_rad": {1: 1e-4}}, "tilts of facets differ"),
+        ({"refraction": "ardc"}, "refraction is none and ardc"),
+    ],
+)
+def test_what_was_held_otherwise_is_no_move(other: dict[str, Any], said: str) -> None:
+    """Neither a step nor a line through all; steps between others are judged."""
+    values = {name: value for name, value in other.items() if name in INDEX}
+    tables = {name: value for name, value in other.items() if name not in INDEX}
+    entries = [replace(made(number), refraction="none") for number in (1, 2, 3)]
+    entries.append(replace(made(4, (0.25, -0.39, 0.6)), **({"refraction": "none"} | tables)).changed(**values))
+    (one,) = history(entries)
+    assert not one.moved
+    assert len(one.steps) == 2
+    assert one.trends == ()
+    assert one.sentences[0].startswith("left: the boresight has not moved: 2 steps")
+    assert one.sentences[1] == f"left: not judged between 2026-03-01 and 2026-04-01: {said}"
+    (alone,) = history(entries[2:])
+    assert alone.sentences == one.sentences[1:]
+
+
+def test_what_was_held_nearly_alike_is_compared() -> None:
+    near = made(2, (0.25, -0.39, 0.6)).changed(lever_arm_x_m=0.002, range_offset_m=0.001, range_scale=2e-6)
+    near = replace(near, ibrc=(IBRC, np.array([0.0, 0.002])), refraction="none")  # the other leaves it unsaid
+    (one,) = history([made(1), near])
+    assert one.moved
+
+
+def test_what_one_held_and_the_other_estimated_is_compared_where_values_agree() -> None:
+    tilt, sigmas = INDEX["scan_plane_tilt_rad"], made(2).sigmas.copy()
+    sigmas[tilt] = np.radians(0.002)
+    estimated = replace(made(2, (0.25, -0.39, 0.6)), sigmas=sigmas)
+    (one,) = history([made(1), estimated])
+    assert one.moved
+    (one,) = history([made(1), estimated.changed(scan_plane_tilt_rad=np.radians(0.003))])
+    assert one.sentences == (
+        "left: not judged between 2026-01-01 and 2026-02-01: scan_plane_tilt_deg, held in one, is 0 and 0.003",
+    )
+    both = replace(made(1), sigmas=sigmas)
+    (one,) = history([both, estimated.changed(scan_plane_tilt_rad=np.radians(0.003))])
+    assert one.moved
 
 
 def test_each_installation_has_its_own_history() -> None:
