@@ -1,7 +1,7 @@
 """Against blunders: weights that large misclosures lose, and tests that find what does not belong (FORMULAS 6.5).
 
-Huber's weights bring the adjustment near; then Baarda's w-test takes single observations out, and Pope's τ-test where
-the variance factor is estimated too. A rejected observation comes back if a later solution fits it.
+Huber's weights (in `calib.row_sums.weigh`) bring the adjustment near; then Baarda's w-test takes single observations
+out, by the variances that were assumed. A rejected observation comes back if a later solution fits it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,6 @@ LEVEL = 0.001  # α0 of a single test (Baarda 1968)
 POWER = 0.80  # with which a least detectable error is found
 
 
-def huber_weight(sizes: FloatArray, limit: float = HUBER) -> FloatArray:
-    """Weights of misclosures in sigmas (Huber 1964): 1 up to the limit, then limit / size."""
-    weights: FloatArray = limit / np.maximum(np.abs(sizes), limit)
-    return weights
-
-
 def w_critical(count: int, family: float = 0.05, level: float = LEVEL) -> float:
     """Greatest |w| of a good observation.
 
@@ -34,14 +28,6 @@ def w_critical(count: int, family: float = 0.05, level: float = LEVEL) -> float:
         level: α0 of one test, where that asks for less: among few observations 3.29.
     """
     return float(stats.norm.isf(min(level, family / max(count, 1)) / 2.0))
-
-
-def tau_critical(level: float, redundancy: float) -> float:
-    """Greatest |w| / σ̂0 of a good observation, σ̂0 of the same adjustment (Pope 1976): √r t / √(r − 1 + t²)."""
-    if redundancy <= 1.0:
-        return float("inf")
-    t = float(stats.t.isf(level / 2.0, redundancy - 1.0))
-    return float(np.sqrt(redundancy) * t / np.sqrt(redundancy - 1.0 + t * t))
 
 
 @cache

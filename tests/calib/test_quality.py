@@ -13,7 +13,7 @@ from calib.adjust import adjust
 from calib.features import Features
 from calib.normals import extras
 from calib.parameters import Wish, unknowns
-from calib.robust import huber_weight, least_detectable, least_shift, tau_critical, w_critical
+from calib.robust import HUBER, least_detectable, least_shift, w_critical
 from calib.rows import Rows, State
 from calib.solve import Block, Settings, solved
 from calib.trajectory_errors import Taus, gauss_markov
@@ -30,22 +30,24 @@ PLAIN = Settings(huber=0.0, family=0.0)
 
 def test_printed_limits() -> None:
     assert least_shift() == pytest.approx(4.13215, abs=1e-5)
-    for redundancy, printed_tau in ((10, 2.6786), (100, 3.22634), (1000, 3.28409)):
-        assert tau_critical(0.001, redundancy) == pytest.approx(printed_tau, abs=1e-5)
     assert w_critical(10) == pytest.approx(3.2905, abs=1e-4)
     assert w_critical(10_000_000) == pytest.approx(stats.norm.isf(0.05 / 2e7))
-    np.testing.assert_allclose(huber_weight(np.array([-3.0, 0.0, 1.4, 6.0])), [0.5, 1.0, 1.0, 0.25])
     np.testing.assert_allclose(least_detectable(np.array([4.0]), np.array([0.25])), 4.13215 * 4.0, rtol=1e-5)
 
 
 def test_the_printed_huber_weight() -> None:
     """Four times six steps with weights of the last solution; a blunder of 0.6 m gets 0.185."""
     flight, features = printed().with_blunder().flight()
-    found = adjust(flight, features, Wish(), None, Settings(huber=1.5, family=0.0, rounds=0, tolerance=1e-3))
-    (residuals,) = found.residuals
-    worst = int(np.abs(residuals.normalised).argmax())
-    size = abs(float(residuals.misclosure_m[worst])) / float(residuals.sigma_m[worst])
-    assert huber_weight(np.array([size]))[0] == pytest.approx(0.18467852582257605, abs=2e-3)
+    block = Block.of(flight, features, unknowns(flight, Wish()), None, None)
+    done = solved(block, Settings(huber=HUBER, family=0.0, rounds=0, tolerance=1e-3), block.start())
+    (residuals,) = done.quality.residuals
+    size = residuals.misclosure_m.astype(float) / residuals.sigma_m
+    alone = np.zeros(len(size), np.float32)
+    alone[int(np.abs(residuals.normalised).argmax())] = 1.0
+    square = block.rows.summed(done.solution.state, alone, HUBER).square[0]
+    assert square / (alone @ size**2) == pytest.approx(0.18467852582257605, abs=2e-3)
+    every = block.rows.summed(done.solution.state, np.ones(len(size), np.float32), HUBER).square[0]
+    assert every == pytest.approx(float(np.where(np.abs(size) > HUBER, HUBER * np.abs(size), size**2).sum()), rel=1e-5)
 
 
 def test_redundancy_is_that_of_the_dense_solution() -> None:
