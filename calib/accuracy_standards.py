@@ -5,16 +5,12 @@ The limits are those of the editions named. A contract may name another edition:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 TO_CONFIRM = "limits as of the editions named; confirm them against the edition in the contract"
 USGS = "USGS Lidar Base Specification 2.x"
 ASPRS_2014 = "ASPRS Positional Accuracy Standards, edition 1, 2014"
-ASPRS_2023 = "ASPRS Positional Accuracy Standards, edition 2, 2023"
-Z_95 = 1.96  # of a normal error, 95 %
-IMU_HORIZONTAL = 0.55894170  # ASPRS 2014, horizontal error of lidar: the IMU's angle to RMSE of one coordinate
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +42,6 @@ QUALITY_LEVELS = (
 )
 ASPRS_CLASSES_M = (0.01, 0.025, 0.05, 0.10, 0.15, 0.20, 0.333, 0.667, 1.0, 3.333)  # ASPRS 2014, vertical classes
 ASPRS_WITHIN, ASPRS_OVERLAP, ASPRS_OVERLAP_MAX = 0.6, 0.8, 1.6  # of a class: its limits within and between strips
-FEWEST_CHECK_POINTS = 30  # ASPRS 2023
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +124,3 @@ def _asprs(measured: dict[str, float | None]) -> Judged:
 def best_of(judged: Sequence[Judged]) -> str | None:
     """The strictest USGS level that is kept."""
     return next((one.level for one in judged if one.standard == USGS and one.all_kept), None)
-
-
-def nva_95_m(rmse_z_m: float) -> float:
-    """Non-vegetated vertical accuracy at 95 % (ASPRS 2014)."""
-    return Z_95 * rmse_z_m
-
-
-def horizontal_rmse_m(gnss_sigma_m: float, imu_sigma_rad: float, height_m: float) -> float:
-    """RMSE_r that a flight at a height above ground should have (ASPRS 2014, estimate for lidar)."""
-    return math.hypot(gnss_sigma_m, math.tan(imu_sigma_rad) / IMU_HORIZONTAL * height_m)
-
-
-def rmse_with_survey_m(rmse_check_m: float, survey_sigma_m: float) -> float:
-    """RMSE_V that is to be reported: the check points' own error is added (ASPRS 2023)."""
-    return math.hypot(rmse_check_m, survey_sigma_m)
