@@ -22,7 +22,7 @@ from daemon.channels import ChannelTable
 from daemon.cli import mark, split
 from daemon.control import LINE_BYTES, Control
 from daemon.errors import one_line
-from daemon.events import Events
+from daemon.events import Event, Events, Severity
 from daemon.recorder import WriterHealth
 from drivers.core.parser import DeviceSettings
 from drivers.core.registry import KINDS, all_drivers
@@ -58,12 +58,24 @@ def asked_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
 # --- the control socket ---------------------------------------------------------------------------------------------
 
 
+class _Heard(Events):
+    """Events that are kept."""
+
+    def __init__(self, clock: Any) -> None:
+        super().__init__(clock, BlockQueue(1 << 20), ChannelTable())
+        self.heard: list[Event] = []
+
+    def post(self, severity: Severity, source: str, code: str, text: str) -> Event:
+        self.heard.append(super().post(severity, source, code, text))
+        return self.heard[-1]
+
+
 def _control(folder: Path) -> Control:
     """Of a recorder at work, which notes and begins parts."""
     clock: Any = SimpleNamespace(now_ns=lambda: NOW_NS)
     assembly: Any = SimpleNamespace(
         parts=SimpleNamespace(directory=folder, part=3),
-        shared=SimpleNamespace(events=Events(clock, BlockQueue(1 << 20), ChannelTable())),
+        shared=SimpleNamespace(events=_Heard(clock)),
         info=SimpleNamespace(session_id=SESSION),
         recorder=SimpleNamespace(health=WriterHealth(), new_part=SimpleNamespace(set=lambda: None)),
     )
@@ -116,7 +128,8 @@ def _answered(sock: socket.socket, one: Control) -> Iterator[str]:
         return
     assert said.endswith(b"\n")
     assert said.count(b"\n") == 1
-    for event in one._events.recent:
+    assert isinstance(one._events, _Heard)
+    for event in one._events.heard:
         event.text.encode()
         assert one_line(event.text) == event.text
     answer = json.loads(said)

@@ -1,0 +1,28 @@
+"""What the service's journal says of events, for tests without a process."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+
+from daemon.events import Severity
+
+
+class Said(NamedTuple):
+    """An event's line."""
+
+    severity: Severity
+    source: str
+    code: str
+    text: str
+
+
+def journal_of(caplog: pytest.LogCaptureFixture) -> list[Said]:
+    """The events since the test began, in order; of severity info where the test has set that level."""
+    found = []
+    for record in caplog.records:
+        if (record.name, record.msg) == ("swath", "%s %s: %s") and isinstance(record.args, tuple):
+            source, code, text = map(str, record.args)
+            found.append(Said(Severity(record.levelname.lower()), source, code, text))
+    return found
