@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
     from daemon.device_setup import DeviceSetup, Step, WireSetup
 
+MAX_BAUD = 20_000_000  # as in drivers.transports.uri, which loads NumPy: too much for a help
+
 
 def command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, for example /etc/swath/swath.toml.")],
@@ -24,7 +26,8 @@ def command(
     ] = None,
     save: Annotated[bool, typer.Option("--save", help="Let the devices keep it without power.")] = False,
     from_baud: Annotated[
-        int | None, typer.Option(help="The rate the device speaks at now; it is told the configured one.", min=1)
+        int | None,
+        typer.Option(help="The rate the device speaks at now; it is told the configured one.", min=1, max=MAX_BAUD),
     ] = None,
     timeout: Annotated[float, typer.Option(help="Seconds to wait for each answer.", min=0.1, max=60.0)] = 2.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,

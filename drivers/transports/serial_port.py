@@ -69,7 +69,7 @@ class SerialTransport(DescriptorTransport):
                 timeout=0,
                 exclusive=True,
             )
-        except (OSError, ValueError, termios.error) as error:
+        except (OSError, ValueError, OverflowError, termios.error) as error:
             raise TransportError(self._why_not_opened(error)) from error
         self._port = port
         self._fd = port.fileno()

@@ -19,6 +19,7 @@ from drivers.transports.base import PpsSource, Transport
 FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
+MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
 
 _TRUE = {"1", "true", "yes", "on"}
 _FALSE = {"0", "false", "no", "off"}
@@ -157,6 +158,12 @@ def _buffer_mb(value: str) -> bool:
     return True
 
 
+def _baud(value: str) -> bool:
+    if _positive(value) and int(value) > MAX_BAUD:
+        raise ValueError("too fast")
+    return True
+
+
 def ntrip_position(value: str) -> tuple[float, float, float]:
     """Latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
     lat, lon, height = (float(part) for part in value.split(","))
@@ -181,7 +188,7 @@ _Option = tuple[Callable[[str], object], str]
 
 # option: (check, what would be right)
 SERIAL_OPTIONS: dict[str, _Option] = {
-    "baud": (_positive, "a positive whole number such as 921600"),
+    "baud": (_baud, f"a whole number, 1 to {MAX_BAUD}, such as 921600"),
     "bytesize": (_one_of("5", "6", "7", "8"), "5, 6, 7 or 8"),
     "parity": (_one_of("N", "E", "O", "M", "S"), "N, E, O, M or S"),
     "stopbits": (_one_of("1", "1.5", "2"), "1, 1.5 or 2"),

@@ -113,6 +113,7 @@ class TestErrors:
             (["run"], "swath: Missing argument 'CONFIG'; see `swath run --help`"),
             (["devices", "--jsn"], "swath: No such option: --jsn"),
             (["check", "x.toml", "--seconds", "soon"], "swath: Invalid value for '--seconds'"),
+            (["setup", "x.toml", "--from-baud", "2147483648"], "swath: Invalid value for '--from-baud'"),
             (["check", "nowhere.toml"], "swath: nowhere.toml: No such file or directory; give the path"),
         ],
     )

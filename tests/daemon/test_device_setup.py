@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 from pyubx2 import SET, UBXReader
 
+from daemon.cli import setup
 from daemon.config import parse_config
 from daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
 from daemon.errors import ExitCode, UserError
+from drivers.transports import uri
 from tests.daemon.commands import swath
 from tests.daemon.receivers import (
     novatel_replies,
@@ -228,6 +230,9 @@ class TestCommand:
         assert lines[0] == "gnss/rover: ubx by serial:/dev/ttyS99?baud=460800"
         assert {"UBX-CFG-VALSET RAM+BBR", "CFG-RATE-MEAS = 200", "CFG-MSGOUT-UBX_NAV_PVT_UART1 = 1"} <= set(lines)
         assert lines[-1] == "nothing was sent; --apply sends it"
+
+    def test_the_present_rate_has_the_bound_of_the_configured_one(self) -> None:
+        assert setup.MAX_BAUD == uri.MAX_BAUD
 
     def test_says_of_each_message_what_became_of_it(self, tmp_path: Path) -> None:
         with receiver(split_lines, novatel_replies(refuses=b"RANGEB"), NOVATEL_DATA) as device:

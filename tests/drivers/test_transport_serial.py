@@ -19,7 +19,7 @@ import pytest
 from drivers.session import Session, SessionState
 from drivers.transports.base import TransportError, UnitBlock
 from drivers.transports.serial_port import SerialTransport
-from drivers.transports.uri import parse_transport
+from drivers.transports.uri import TransportSpec, parse_transport
 
 
 class Device:
@@ -193,6 +193,14 @@ def test_what_cannot_be_opened_says_why(path: str, says: str) -> None:
     with pytest.raises(TransportError, match=says) as caught:
         serial.open()
     assert "\n" not in str(caught.value)
+    serial.close()
+
+
+def test_a_rate_that_the_kernel_has_no_number_for(device: Device) -> None:
+    """Nothing hands one over that was not checked; a port must not end its thread all the same."""
+    serial = SerialTransport(TransportSpec("serial", device.path, {"baud": str(1 << 32)}))
+    with pytest.raises(TransportError, match="cannot open"):
+        serial.open()
     serial.close()
 
 
