@@ -78,7 +78,7 @@ class NtripTransport(DescriptorTransport):
         request = self._request()
         try:
             sock = socket.create_connection((self._spec.ntrip_host, self._spec.ntrip_port), CONNECT_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a name that cannot be encoded for the resolver
             raise TransportError(self._why(error)) from error
         try:
             self._converse(sock, request)
@@ -164,8 +164,10 @@ class NtripTransport(DescriptorTransport):
             return "the caster sends its table in place of this mountpoint's data: may this user have it?"
         return f"the caster has no mountpoint {self._spec.mountpoint}; it has: {shown}{more}"
 
-    def _why(self, error: OSError) -> str:
+    def _why(self, error: OSError | UnicodeError) -> str:
         host, port = self._spec.ntrip_host, self._spec.ntrip_port
+        if isinstance(error, UnicodeError):
+            return f"{self.name}: {host} is no name that can be looked up"
         if isinstance(error, socket.gaierror):
             return f"{self.name}: the name {host} is not known; is there a network?"
         if isinstance(error, TimeoutError):

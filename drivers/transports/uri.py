@@ -267,6 +267,15 @@ def _check_gnss(spec: TransportSpec) -> None:
         raise ValueError(f"transport {spec.text!r}: want gnss:<name> of a [gnss.<name>] section, without options")
 
 
+def _can_be_asked_for(host: str) -> bool:
+    """Whether the resolver takes a name: it encodes it first, as Python does here."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return True
+
+
 def _check_ntrip(spec: TransportSpec) -> None:
     place, _, mountpoint = spec.address.partition("/")
     host, _, port = place.rpartition(":")
@@ -276,6 +285,11 @@ def _check_ntrip(spec: TransportSpec) -> None:
         )
     if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535, such as 2101")
+    if not _can_be_asked_for(spec.ntrip_host):
+        raise ValueError(
+            f"transport {spec.text!r}: host {spec.ntrip_host!r} is no name that can be looked up: "
+            "want 1 to 63 letters between its dots"
+        )
     _check_options(spec, NTRIP_OPTIONS)
     if "password_env" in spec.options and "user" not in spec.options:
         raise ValueError(f"transport {spec.text!r}: password_env needs user=<name> too")

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.transports.base import Transport, TransportError
 from drivers.transports.ntrip_client import NtripTransport, gga_sentence
-from drivers.transports.uri import open_transport, parse_transport
+from drivers.transports.uri import TransportSpec, open_transport, parse_transport
 from tests.drivers.caster import Caster, Script, caster, listen
 
 DATA = bytes(range(256)) * 20
@@ -150,6 +150,13 @@ def test_nobody_listens_and_no_such_name() -> None:
         open_transport(parse_transport("ntrip:caster.invalid:2101/A")).open()
 
 
+def test_a_name_that_cannot_be_encoded_is_one_line() -> None:
+    one = NtripTransport(TransportSpec("ntrip", "a..b:2101/ZIMM0"))
+    with pytest.raises(TransportError, match=r"ntrip:a\.\.b:2101/ZIMM0: a\.\.b is no name that can be looked up"):
+        one.open()
+    one.close()
+
+
 def test_a_password_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_SUCH", raising=False)
     with caster(saying(V2)) as found:
@@ -212,6 +219,8 @@ def test_gga_against_pynmea2(lat: float) -> None:
         ("ntrip:caster:2101", "want ntrip:<host>:<port>/<mountpoint>"),
         ("ntrip:caster/A", "want ntrip:<host>:<port>/<mountpoint>"),
         ("ntrip:caster:99999/A", "port '99999' should be 1 to 65535"),
+        ("ntrip:a..b:2101/A", "host 'a..b' is no name that can be looked up"),
+        (f"ntrip:{'a' * 64}.example:2101/A", "want 1 to 63 letters between its dots"),
         ("ntrip:caster:2101/A B", "want ntrip:<host>:<port>/<mountpoint>"),
         ("ntrip:caster:2101/A?password=x", "unknown option 'password'; ntrip knows: user, password_env"),
         ("ntrip:caster:2101/A?password_env=X", "password_env needs user=<name> too"),
