@@ -30,6 +30,7 @@ ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
 def check_devices(config: Config) -> list[str]:
     """All findings of a configuration whose types are right."""
     lines: list[str] = []
+    lines += _check_directory(config)
     lines += _check_pps(config)
     lines += _check_files(config)
     for kind, name, table in config.device_tables():
@@ -83,6 +84,13 @@ def _unreadable(path: Path) -> str | None:
             return None
     except OSError as error:
         return error.strerror or str(error)
+    except ValueError:
+        return "has a zero character in it"
+
+
+def _check_directory(config: Config) -> Iterator[str]:
+    if "\0" in config.session.directory:
+        yield "session.directory: has a zero character in it; want a path"
 
 
 def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTable) -> Iterator[str]:

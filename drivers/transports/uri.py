@@ -96,6 +96,7 @@ def parse_transport(text: str) -> TransportSpec:
     Raises:
         ValueError: one line naming what is wrong and what would be right.
     """
+    _refuse_unprintable("transport", text)
     kind, colon, rest = text.partition(":")
     if kind not in _CHECKS or not colon:
         raise ValueError(f"transport {text!r}: want {FORMS}")
@@ -104,6 +105,12 @@ def parse_transport(text: str) -> TransportSpec:
     spec = TransportSpec(kind, address, options, text)
     _CHECKS[kind](spec)
     return spec
+
+
+def _refuse_unprintable(what: str, text: str) -> None:
+    """No path, name or address has any, and the system takes none with a zero in it."""
+    if not text.isprintable():
+        raise ValueError(f"{what} {text!r}: has an unprintable character in it; want a path, name or address")
 
 
 def _parse_options(text: str, query: str) -> dict[str, str]:
@@ -345,6 +352,7 @@ def parse_pps(text: str, edge: str = "assert") -> PpsSource:
     """
     from drivers.transports.pps_device import FixedPps, KernelPps, SerialDcdPps
 
+    _refuse_unprintable("PPS source", text)
     if edge not in ("assert", "clear"):
         raise ValueError(f"PPS edge {edge!r}: want assert or clear")
     kind, colon, path = text.partition(":")

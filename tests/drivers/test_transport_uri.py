@@ -87,6 +87,9 @@ def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
         ("can:can0", "want can:<interface>:<channel>"),
         ("can:sockecan:can0", "unknown CAN interface 'sockecan'; python-can has: "),
         ("can:socketcan:can0?bitrat=5", "unknown option 'bitrat'"),
+        ("serial:/dev/a\0b", "has an unprintable character in it"),
+        ("can:socketcan:a\0b", "has an unprintable character in it"),
+        ("udp:0.0.0.0:2368?interface=eth1\n", "has an unprintable character in it"),
         ("gnss:", "want gnss:<name>"),
         ("gnss:rover?baud=5", "want gnss:<name>"),
     ],
@@ -117,6 +120,12 @@ def test_pps_sources() -> None:
 @pytest.mark.parametrize("text", ["", "pps0", "fixed:", "serial-dcd:ttyS0", "gpio:4"])
 def test_wrong_pps_text_says_what_would_be_right(text: str) -> None:
     with pytest.raises(ValueError, match="want /dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"):
+        parse_pps(text)
+
+
+@pytest.mark.parametrize("text", ["fixed:x\0y", "/dev/pps\0", "serial-dcd:/dev/tty\x1bS0"])
+def test_a_pps_text_with_a_control_character_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="has an unprintable character in it"):
         parse_pps(text)
 
 
