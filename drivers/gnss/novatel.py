@@ -24,6 +24,7 @@ from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
+from drivers.gnss.date_floor import read_date_floor, week_of
 from drivers.gnss.novatel_records import DECODERS, Header, State
 from drivers.gnss.novatel_startup import startup_messages
 from drivers.gnss.rows import Row, join_rows
@@ -82,16 +83,16 @@ class NovatelParser(StreamParser):
     """Decodes the logs listed above; everything else is framed and counted."""
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        """Args: the device's table (``imu_type`` is read), and the record types to give; None: all.
+        """Args: the device's table (``imu_type`` and ``date_floor`` are read), and the record types to give; None: all.
 
         Raises:
-            DriverSettingsError: an IMU type that is not in the table.
+            DriverSettingsError: an IMU type that is not in the table, or a floor that is no date.
         """
         super().__init__()
         self._framer = Framer(FRAME_KINDS, self.counters)
         self._wanted = wanted
         self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
-        self._state = State(self.counters, configured_scale=imu_scale(settings))
+        self._state = State(self.counters, week_of(read_date_floor(settings)), imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
 
     def feed(self, chunk: Chunk) -> list[Record]:
@@ -111,7 +112,7 @@ class NovatelParser(StreamParser):
         layout = nov.LAYOUTS.get(int.from_bytes(frame.data[4:6], "little"))
         if layout is None or layout.body not in self._bodies:
             return []
-        header, body = _split(frame, layout.name)
+        header, body = _split(frame, layout.name, self._state.floor_week)
         if header is None:
             return []
         if len(body) < layout.wire.size:
@@ -135,18 +136,18 @@ class NovatelParser(StreamParser):
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
 
 
-def _split(frame: Frame, name: str) -> tuple[Header | None, bytes]:
+def _split(frame: Frame, name: str, floor_week: int) -> tuple[Header | None, bytes]:
     """Header and body of a frame; None for answers to commands and for other formats."""
     data = frame.data
     if data[:3] == nov.SYNC_SHORT:
         short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
-        header = Header(name, frame.host_time_ns, short.week, short.milliseconds, None, 0)
+        header = Header(name, frame.host_time_ns, short.week, short.milliseconds, None, 0, floor_week)
         return header, data[nov.SHORT_HEADER.size : -nov.CRC_BYTES]
     long = nov.LongHeader._make(nov.LONG_HEADER.unpack_from(data))
     if long.message_type & (nov.RESPONSE_BIT | nov.FORMAT_BITS):
         return None, b""
     source = long.message_type & nov.SOURCE_BITS
-    header = Header(name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source)
+    header = Header(name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source, floor_week)
     return header, data[long.header_bytes : -nov.CRC_BYTES]
 
 

@@ -46,15 +46,22 @@ class Header(NamedTuple):
     milliseconds: int
     time_status: int | None
     source: int
+    floor_week: int = 0
+
+    @property
+    def before_floor(self) -> bool:
+        """Whether it has a week that is not believed: that of a receiver one roll-over behind."""
+        return 0 < self.week < self.floor_week
 
     @property
     def time_valid(self) -> bool:
-        """Whether the receiver vouches for the time; a short header says nothing against it but a missing week."""
-        return 0 < self.week <= GREATEST_WEEK and (self.time_status is None or self.time_status in tables.TIME_VALID)
+        """Whether the receiver vouches for the time; a short header says nothing against it but its week."""
+        known = is_week(self.week, self.floor_week)
+        return known and (self.time_status is None or self.time_status in tables.TIME_VALID)
 
     def tag(self, earlier_ns: int = 0) -> TimeTag:
         """The header's GPS time less ``earlier_ns``."""
-        return gps_tag(self.week, self.milliseconds * NS_PER_MS - earlier_ns)
+        return gps_tag(self.week, self.milliseconds * NS_PER_MS - earlier_ns, self.floor_week)
 
 
 @dataclass(slots=True)
@@ -63,20 +70,28 @@ class State:
 
     Attributes:
         counters: the parser's.
+        floor_week: the oldest believed.
         configured_scale: of the setting ``imu_type``.
         announced_scale: of the last INSCONFIG.
     """
 
     counters: ParserCounters
+    floor_week: int = 0
     configured_scale: tables.ImuScale | None = None
     announced_scale: tables.ImuScale | None = None
 
     def has_week(self, week: int) -> bool:
         """Whether a solution can be placed in time; counted where not."""
-        known = 0 < week <= GREATEST_WEEK
+        known = is_week(week, self.floor_week)
         if not known:
-            self.counters.errors["time_unknown"] += 1
+            self.counters.errors["date_before_floor" if 0 < week < self.floor_week else "time_unknown"] += 1
         return known
+
+    def time_counts(self, header: Header) -> bool:
+        """Whether what a header dates is valid in time; a week before the floor is counted."""
+        if header.before_floor:
+            self.counters.errors["date_before_floor"] += 1
+        return header.time_valid
 
 
 def time_message(state: State, header: Header, time: nov.Time) -> list[Record | Row]:
@@ -114,7 +129,7 @@ def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Re
             fix_type=tables.FIX_TYPES.get(position.position_type, FixType.NONE),
             satellites=position.satellites_used,
             antenna="secondary" if header.source == 1 else "primary",
-            valid=there and position.solution_status == tables.SOL_COMPUTED and header.time_valid,
+            valid=state.time_counts(header) and there and position.solution_status == tables.SOL_COMPUTED,
             message=header.name,
         )
     ]
@@ -135,7 +150,7 @@ def velocity_fix(state: State, header: Header, velocity: nov.BestVel) -> list[Re
             velocity_l=(north, east, -velocity.up_mps) if there else None,
             fix_type=tables.FIX_TYPES.get(velocity.velocity_type, FixType.NONE),
             antenna="secondary" if header.source == 1 else "primary",
-            valid=there and velocity.solution_status == tables.SOL_COMPUTED and header.time_valid,
+            valid=state.time_counts(header) and there and velocity.solution_status == tables.SOL_COMPUTED,
             message=header.name,
         )
     ]
@@ -214,7 +229,7 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
         (imu.gyro_x * rate, -imu.gyro_minus_y * rate, imu.gyro_z * rate),
         nan,
         imu.imu_status,
-        imu.week if 0 < imu.week <= GREATEST_WEEK else -1,
+        imu.week if is_week(imu.week, state.floor_week) else -1,
     )
     return [Row(ImuSamples, values)]
 
@@ -243,10 +258,10 @@ def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record 
     return [
         EventMark(
             host_time_ns=header.host_time_ns,
-            time=gps_tag(mark.week, _nanoseconds(mark.seconds) - _nanoseconds(mark.clock_offset_s)),
+            time=gps_tag(mark.week, _nanoseconds(mark.seconds) - _nanoseconds(mark.clock_offset_s), state.floor_week),
             channel=nov.MARK_CHANNELS[header.name],
             sigma_s=mark.clock_offset_sigma_s,
-            valid=mark.clock_status == tables.CLOCK_VALID and header.time_valid,
+            valid=state.time_counts(header) and mark.clock_status == tables.CLOCK_VALID,
             message=header.name,
         )
     ]
@@ -264,7 +279,7 @@ def baseline_heading(state: State, header: Header, heading: nov.Heading2) -> lis
             baseline_m=heading.baseline_m if heading.baseline_m > 0.0 else None,
             heading_sigma_rad=radians(heading.heading_sigma_deg),
             pitch_sigma_rad=radians(heading.pitch_sigma_deg),
-            valid=there and heading.solution_status == tables.SOL_COMPUTED and header.time_valid,
+            valid=state.time_counts(header) and there and heading.solution_status == tables.SOL_COMPUTED,
             message=header.name,
         )
     ]
@@ -276,10 +291,15 @@ def ins_config(state: State, header: Header, config: nov.InsConfig) -> list[Reco
     return []
 
 
-def gps_tag(week: int, time_ns: int) -> TimeTag:
-    """GPS time of week, carried over the week's end; no week where the receiver has none."""
+def is_week(week: int, floor_week: int) -> bool:
+    """Whether a message has a week, and one that is believed."""
+    return max(1, floor_week) <= week <= GREATEST_WEEK
+
+
+def gps_tag(week: int, time_ns: int, floor_week: int) -> TimeTag:
+    """GPS time of week, carried over the week's end; no week where the receiver has none that is believed."""
     weeks, time_ns = divmod(time_ns, WEEK_NS)
-    return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if 0 < week <= GREATEST_WEEK else None)
+    return TimeTag(TimeScale.GPS, time_ns, week=week + weeks if is_week(week, floor_week) else None)
 
 
 def _nanoseconds(seconds: float) -> int:

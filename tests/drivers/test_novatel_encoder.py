@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from drivers.core.parser import DeviceSettings, DriverSettingsError
 from drivers.core.registry import find_driver
 from drivers.gnss import novatel_layouts as nov
-from drivers.gnss.novatel import NovatelParser
+from drivers.gnss.novatel import NovatelParser, make_time_parser
 from drivers.gnss.novatel_encoder import encode_frame, encode_log
 from drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE, TIME_STATUS_SATTIME, TIME_STATUS_UNKNOWN
 from georef.records import (
@@ -106,6 +106,52 @@ def test_a_position_without_valid_time_names_no_second(status: int) -> None:
     records, _ = parse(encode_log("BESTPOS", BEST_POS, WEEK, MS, time_status=status))
     assert [type(record) for record in records] == [GnssFix]
     assert not one(encode_log("BESTPOS", BEST_POS, WEEK, MS, time_status=status), GnssFix).valid
+
+
+def early_logs() -> dict[str, bytes]:
+    """What is dated, from a receiver that is one roll-over of ten bits behind."""
+    week = WEEK - 1024
+    bodies = {
+        "TIME": TIME,
+        "BESTPOS": BEST_POS,
+        "BESTVEL": BEST_VEL,
+        "HEADING2": HEADING,
+        "MARK1TIME": MARK._replace(week=week),
+        "INSPVA": INS_PVA._replace(week=week),
+        "INSPVAS": INS_PVA._replace(week=week),
+        "INSPVAX": INS_PVAX,
+        "INSATT": nov.InsAtt(week, 345_600.005, 1.0, 2.0, 90.0, 3),
+    }
+    return {name: encode_log(name, body, week, MS, time_status=TIME_STATUS_FINE) for name, body in bodies.items()}
+
+
+@pytest.mark.parametrize("name", early_logs())
+def test_a_week_one_roll_over_behind_is_not_believed(name: str) -> None:
+    records, parser = parse(early_logs()[name])
+    assert all(isinstance(record, GnssFix | GnssHeading | EventMark) for record in records)
+    assert [(record.valid, record.time.week) for record in records] == [(False, None)] * len(records)  # type: ignore[union-attr]
+    assert parser.counters.errors == {"date_before_floor": 1}
+    records, parser = parse(early_logs()[name], date_floor="1999-08-22")
+    assert records
+    assert all(record.valid for record in records if not isinstance(record, InsSolution))  # type: ignore[union-attr]
+    assert not +parser.counters.errors
+
+
+def test_the_recorder_takes_no_time_from_a_week_before_the_floor() -> None:
+    for config, expected in (({}, set()), ({"date_floor": "1999-08-22"}, {True})):
+        parser = make_time_parser(DeviceSettings("gnss/rover", config))
+        records = parser.feed(Chunk("gnss/rover", HOST_NS, b"".join(early_logs().values())))
+        assert {message.valid for message in records if isinstance(message, TimeMessage)} == expected
+
+
+def test_a_raw_imus_week_before_the_floor_is_none() -> None:
+    data = encode_log("RAWIMU", RAW_IMU._replace(week=WEEK - 1024), WEEK - 1024, MS)
+    assert one(data, ImuSamples, imu_type="HG1900_CA50").rows["gps_week"] == [-1]
+
+
+def test_a_date_floor_that_is_no_date_is_refused() -> None:
+    with pytest.raises(DriverSettingsError, match="date_floor"):
+        parse(b"", date_floor="soon")
 
 
 def test_position_and_velocity() -> None:
