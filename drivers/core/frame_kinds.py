@@ -289,4 +289,3 @@ XBUS = FrameKind(
 SBF = FrameKind("sbf", (b"$", b"@"), SBF_MAX_BYTES, measure_sbf, intact_sbf, sbf_name)
 
 GNSS_KINDS = (NMEA, UBX, RTCM3)  # on one port of a u-blox or of most others
-NOVATEL_KINDS = (NOVATEL, NOVATEL_SHORT, NMEA, RTCM3)

@@ -16,7 +16,7 @@ from drivers.core.registry import find_driver
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss.novatel import NovatelParser, make_time_parser
 from drivers.gnss.novatel_encoder import encode_frame, encode_log
-from drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE, TIME_STATUS_SATTIME, TIME_STATUS_UNKNOWN
+from drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE
 from georef.records import (
     Chunk,
     EventMark,
@@ -34,6 +34,8 @@ from georef.records import (
 from tests.drivers.harness import packed_rows
 from tests.drivers.novatel_ascii import WEEK_NS, recording
 
+TIME_STATUS_UNKNOWN = 20
+TIME_STATUS_SATTIME = 200  # time of satellite data, not of the receiver
 HOST_NS = 1_700_000_000_000_000_000
 WEEK, MS = 2400, 345_600_000
 BEST_POS = nov.BestPos(
