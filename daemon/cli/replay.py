@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -30,8 +31,8 @@ def command(
     from daemon.replay import close_outputs, open_outputs
     from daemon.wire_player import wait_for_readers
 
-    if pace <= 0:
-        raise UserError(f"--pace {pace}: must be above 0", exit_code=ExitCode.USAGE)
+    if not 0 < pace < math.inf:
+        raise UserError(f"--pace {pace}: must be a number above 0", exit_code=ExitCode.USAGE)
     config = load_config(wire)
     console = Console(stderr=True, markup=False, highlight=False)
     sessions = _open_sessions(logs, console)

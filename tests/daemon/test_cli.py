@@ -114,6 +114,7 @@ class TestErrors:
             (["devices", "--jsn"], "swath: No such option: --jsn"),
             (["check", "x.toml", "--seconds", "soon"], "swath: Invalid value for '--seconds'"),
             (["setup", "x.toml", "--from-baud", "2147483648"], "swath: Invalid value for '--from-baud'"),
+            (["replay", "x.mcap", "--wire", "x.toml", "--pace", "nan"], "swath: --pace nan: must be a number above 0"),
             (["check", "nowhere.toml"], "swath: nowhere.toml: No such file or directory; give the path"),
         ],
     )
