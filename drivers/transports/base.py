@@ -7,6 +7,8 @@ line; the session that owns the transport closes it, waits and opens it again.
 
 from __future__ import annotations
 
+import errno
+import termios
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -17,6 +19,16 @@ HEAD_ROOM_BYTES = 31  # of a message's header in the log: opcode, length, channe
 
 class TransportError(OSError):
     """The device cannot be opened or has gone; the text is one line: what, where, what would be right."""
+
+
+def is_no_serial_port(error: BaseException) -> bool:
+    """Whether a port could not be set because it is none: ENOTTY in or below what pyserial raises."""
+    below: BaseException | None = error
+    while below is not None:
+        if isinstance(below, OSError | termios.error) and below.args[:1] == (errno.ENOTTY,):
+            return True
+        below = below.__cause__ or below.__context__
+    return False
 
 
 @dataclass(slots=True)

@@ -17,7 +17,7 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.transports.base import TransportError, UnitBlock
+from drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
 from drivers.transports.can_frame import ERROR_BUS_OFF, pack_frame, unpack_frame
 from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
 from drivers.transports.mmsg import DropCounter, ask_receive_buffer
@@ -74,10 +74,15 @@ class PythonCanTransport(DescriptorTransport):
                 f"{self.name}: the library of the {spec.interface} adapter is not installed"
             ) from error
         except (can.CanError, OSError, ImportError, *_UNREADABLE) as error:
-            raise TransportError(f"{self.name}: cannot open the CAN bus: {_one_line(error)}") from error
+            raise TransportError(f"{self.name}: cannot open the CAN bus: {self._why_not_opened(error)}") from error
         self._fd = _descriptor(self._bus)
         self._watch_socket()
         return self._fd
+
+    def _why_not_opened(self, error: Exception) -> str:
+        if is_no_serial_port(error):
+            return f"{self._spec.channel} is no serial port"
+        return _one_line(error)
 
     def _watch_socket(self) -> None:
         """A bus on a datagram socket gets a larger buffer and its drops are counted."""

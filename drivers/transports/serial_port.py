@@ -17,7 +17,7 @@ import time
 import numpy as np
 import serial
 
-from drivers.transports.base import TransportError, UnitBlock
+from drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
 from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate, wait_writable
 from drivers.transports.holders import process_holding
 from drivers.transports.pps_dcd import line_set
@@ -93,6 +93,8 @@ class SerialTransport(DescriptorTransport):
         self._errors_at_open = self._line_errors()
 
     def _why_not_opened(self, error: BaseException) -> str:
+        if is_no_serial_port(error):
+            return f"{self.name}: {self._path} is no serial port; see `ls /dev/serial/by-id`"
         number = getattr(error, "errno", None)
         if number == errno.ENOENT:
             return f"{self.name}: there is no {self._path}"

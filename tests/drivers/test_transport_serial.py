@@ -184,7 +184,8 @@ def test_another_process_holds_the_port(device: Device) -> None:
     ("path", "says"),
     [
         ("/nonexistent/ttyUSB0", "there is no /nonexistent/ttyUSB0"),
-        ("/dev/null", "cannot open /dev/null as a serial port"),
+        ("/dev/null", "/dev/null is no serial port"),
+        (__file__, "test_transport_serial.py is no serial port"),
         ("/tmp", "cannot open /tmp as a serial port: Is a directory"),
     ],
 )
