@@ -9,6 +9,7 @@ over.
 from __future__ import annotations
 
 import os
+import re
 import socket
 import stat
 import time
@@ -31,6 +32,8 @@ BUFFER_BYTES = 4 << 20
 SEND_TIMEOUT_S = 1.0
 
 _UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+_MISSING = re.compile(r"missing \d+ required .*arguments?: (.*)")  # Python's word for options that were not given
+_NAME = re.compile(r"'(\w+)'")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
@@ -82,6 +85,9 @@ class PythonCanTransport(DescriptorTransport):
     def _why_not_opened(self, error: Exception) -> str:
         if is_no_serial_port(error):
             return f"{self._spec.channel} is no serial port"
+        if isinstance(error, TypeError) and (found := _MISSING.search(str(error))):
+            wanted = "&".join(f"{name}=…" for name in _NAME.findall(found[1]))
+            return f"{self._spec.interface} needs the options ?{wanted}"
         return _one_line(error)
 
     def _watch_socket(self) -> None:

@@ -267,6 +267,8 @@ def _check_can(spec: TransportSpec) -> None:
     if spec.interface not in VALID_INTERFACES:
         known = ", ".join(sorted(VALID_INTERFACES))
         raise ValueError(f"transport {spec.text!r}: unknown CAN interface {spec.interface!r}; python-can has: {known}")
+    if taken := [key for key in ("interface", "channel", "ignore_config") if key in spec.options]:
+        raise ValueError(f"transport {spec.text!r}: {taken[0]} is no option; want can:<interface>:<channel>?…")
 
 
 def _check_gnss(spec: TransportSpec) -> None:

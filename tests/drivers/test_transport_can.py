@@ -326,6 +326,7 @@ def test_a_bus_that_dies_is_a_transport_error(monkeypatch: pytest.MonkeyPatch) -
     ("text", "says"),
     [
         ("can:slcan:/nonexistent/ttyACM0", "cannot open the CAN bus: No such file or directory"),
+        ("can:socketcand:x", r"socketcand needs the options \?host=…&port=…"),
         ("can:serial:/dev/null", "cannot open the CAN bus: /dev/null is no serial port"),
         ("can:slcan:/dev/null", "cannot open the CAN bus: /dev/null is no serial port"),
         ("can:udp_multicast:10.0.0.1", "cannot open the CAN bus: Invalid argument"),

@@ -86,6 +86,8 @@ def test_inside_a_gnss_stream_is_nothing_to_open() -> None:
         ("serial:/dev/ttyUSB0?rtscts=maybe", "rtscts=maybe should be yes or no"),
         ("can:can0", "want can:<interface>:<channel>"),
         ("can:sockecan:can0", "unknown CAN interface 'sockecan'; python-can has: "),
+        ("can:slcan:/dev/ttyUSB0?channel=3", "channel is no option; want can:<interface>:<channel>?…"),
+        ("can:virtual:x?interface=y", "interface is no option"),
         ("can:socketcan:can0?bitrat=5", "unknown option 'bitrat'"),
         ("serial:/dev/a\0b", "has an unprintable character in it"),
         ("can:socketcan:a\0b", "has an unprintable character in it"),
