@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
     Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 
-EIGHT_BIT = ("velodyne", "hesai")
-INTENSITY_FACTOR = 257.0  # theirs, 0 … 255, fill the field of 16 bits
+INTENSITY_FACTOR = 257.0  # eight bits, 0 … 255, fill the field of 16
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Wish:
             "copc": self.copc,
             "scale": self.scale,
             "write_dropped": self.write_dropped,
-            "intensity_factors": dict.fromkeys(EIGHT_BIT, INTENSITY_FACTOR),
+            "intensity_factor": INTENSITY_FACTOR,
         }
 
 

@@ -31,9 +31,7 @@ from georef.stream import GivenMotion, ScannerChain
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise, Uncertainty
 
-# of the makers' data sheets; airborne scanners mostly 1064
-WAVELENGTH_NM = {"velodyne": 903.0, "hesai": 905.0, "ouster": 865.0}
-USUAL_WAVELENGTH_NM = 1064.0
+USUAL_WAVELENGTH_NM = 1064.0  # of airborne scanners
 INSTALLATION_TOLERANCE = 1e-6
 FAR_M = 1000.0  # along a beam, to tell its direction
 NO_ANGLES = AngleSeries(np.array([-2, -1]), np.zeros((2, 3)))  # at no time there is
@@ -86,7 +84,11 @@ def make_georeferencer(
 
 
 def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = None) -> Geometry:
-    """How the beam goes: by the protocol's table of beams where it has one, else as the configuration declares."""
+    """How the beam goes: by the protocol's table of beams, or of a line scanner as the configuration declares.
+
+    Raises:
+        ValueError: the protocol says neither, one line.
+    """
     beams, head = getattr(parser, "beams", None), getattr(parser, "head", None)
     if isinstance(head, OusterHead):
         return OusterGeometry(head.altitude_rad, head.azimuth_rad, head.beam_origin_m, head.sensor_from_lidar)
@@ -94,6 +96,8 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
         return SpinningGeometry(
             beams.elevation_deg, beams.azimuth_deg, beams.range_m, beams.right_m, beams.forward_m, beams.up_m
         )
+    if not find_driver("scanner", table.protocol).line_scanner:
+        raise ValueError(f"protocol {table.protocol}: its parser has no beams and it is no line scanner; want either")
     geometry = table.geometry
     if geometry is None:
         return line_scanner(None)
@@ -164,7 +168,7 @@ def refuse_logged_gimbals(config: Config, scanners: list[str]) -> None:
 
 def air_of(config: Config, table: ScannerConfig) -> Air:
     """Of [atmosphere], for a scanner's light."""
-    usual = WAVELENGTH_NM.get(table.protocol.partition("-")[0], USUAL_WAVELENGTH_NM)
+    usual = find_driver("scanner", table.protocol).wavelength_nm or USUAL_WAVELENGTH_NM
     return Air(**config.atmosphere.model_dump(), wavelength_nm=table.wavelength_nm or usual)
 
 

@@ -23,12 +23,13 @@ import numpy as np
 from daemon.errors import ExitCode, UserError
 from daemon.log.durable import sync_file, try_sync_directory
 from daemon.processing import refusals
-from daemon.processing.flights import EIGHT_BIT, INTENSITY_FACTOR, Flight, Wish, read_flights
+from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
 from daemon.processing.unread import unread_lines
 from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.workers import run_jobs
+from drivers.core.registry import find_driver
 from georef.formats.las import LasSettings
 from georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from georef.formats.trajectory_csv import csv_text
@@ -106,7 +107,8 @@ def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> Ses
             }
         ),
     )
-    factors = {name: INTENSITY_FACTOR for name, protocol in protocols.items() if protocol.startswith(EIGHT_BIT)}
+    eight_bit = [name for name, protocol in protocols.items() if find_driver("scanner", protocol).eight_bit_intensity]
+    factors = dict.fromkeys(eight_bit, INTENSITY_FACTOR)
     return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, wish.copc)
 
 

@@ -228,7 +228,7 @@ class Setup:
         for name in self.scanners:
             clock = self._clock_of(config.scanner[name].pps)
             if clock is not None:
-                past_hour = config.scanner[name].protocol.startswith("velodyne")
+                past_hour = find_driver("scanner", config.scanner[name].protocol).past_hour
                 devices[f"scanner/{name}"] = DevicePlan(clock, past_hour)
         return ClockPlan(
             host_minus_monotonic_ns=info.realtime_ns - info.monotonic_ns,

@@ -162,6 +162,11 @@ class Driver:
         names_edge: which edge its time messages name by default; None where mixed or none.
         tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
         needs: configuration keys without which it cannot work.
+        line_scanner: of a scanner: one beam, which goes as the configuration's ``geometry`` declares. The parser of any
+            other has ``beams``, a `drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
+        wavelength_nm: of a scanner's light, by its maker's data sheet; None: 1064, as of most airborne ones.
+        eight_bit_intensity: whether a scanner's intensities are 0 to 255.
+        past_hour: whether a scanner's device time is that past the full hour of UTC.
         startup: builds the messages a device needs before a survey, in the order they are sent, and raises
             `DriverSettingsError`; None where there are none.
     """
@@ -177,4 +182,8 @@ class Driver:
     names_edge: NamesEdge | None = None
     tells_pps: bool = True
     needs: tuple[str, ...] = ()
+    line_scanner: bool = False
+    wavelength_nm: float | None = None
+    eight_bit_intensity: bool = False
+    past_hour: bool = False
     startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None

@@ -295,6 +295,8 @@ def _driver(protocol: str, head: HesaiHead) -> Driver:
         make_parser=_maker(head, clock_only=False),
         make_time_parser=_maker(head, clock_only=True),
         needs=("installation",),
+        wavelength_nm=905.0,
+        eight_bit_intensity=True,
     )
 
 

@@ -325,5 +325,6 @@ DRIVERS = (
         make_probe=OusterProbe,
         tells_pps=False,
         needs=("installation", "geometry.file"),
+        wavelength_nm=865.0,
     ),
 )

@@ -359,5 +359,6 @@ DRIVERS = (
         make_parser=SrepParser,
         make_time_parser=_clock_parser,
         needs=("mirror_factor",),
+        line_scanner=True,
     ),
 )

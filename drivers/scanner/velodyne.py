@@ -298,6 +298,9 @@ def _driver(protocol: str, head: SpinningHead) -> Driver:
         make_parser=_maker(head, clock_only=False),
         make_time_parser=_maker(head, clock_only=True),
         needs=("installation",),
+        wavelength_nm=903.0,
+        eight_bit_intensity=True,
+        past_hour=True,
     )
 
 

@@ -14,6 +14,7 @@ from daemon.config import Config
 from daemon.config.tables import GimbalConfig, ScannerConfig
 from daemon.processing.models import (
     connect,
+    geometry_of,
     gimbal_sources,
     make_georeferencer,
     make_resolver,
@@ -43,6 +44,13 @@ STAGES = {
         {"angles_deg": [0.0, 10.0, 0.0]},
     ]
 }
+
+
+def test_a_scanner_that_says_nothing_of_its_beams_is_not_taken_for_a_line_scanner() -> None:
+    """Of srep's parser, which has no table of beams, under the name of a head that has one."""
+    table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": "velodyne-vlp16"})
+    with pytest.raises(ValueError, match="protocol velodyne-vlp16: its parser has no beams and it is no line scanner"):
+        geometry_of(table, SrepParser(DeviceSettings("scanner/left", {"mirror_factor": 2.0})))
 
 
 def test_logged_angles_are_added_to_the_stages_fixed_ones() -> None:

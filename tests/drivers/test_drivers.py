@@ -6,7 +6,11 @@ A driver's recordings lie in ``fixtures/<protocol>/`` or in that of its family, 
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
+from dataclasses import replace
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +21,7 @@ from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Par
 from drivers.core.registry import KINDS, UnknownProtocolError, all_drivers, find_driver
 from georef.records import Chunk, ChunkBatch
 from tests.drivers.recordings import FIXTURES
+from tests.fuzz.recordings import settings_of
 
 DRIVERS = [driver for kind in KINDS for driver in all_drivers(kind).values()]
 
@@ -51,6 +56,38 @@ def test_every_driver_says_what_it_is(driver: Driver) -> None:
     assert driver.transports
     assert driver.yields
     assert find_driver(driver.kind, driver.protocol) is driver
+
+
+@pytest.mark.parametrize("driver", all_drivers("scanner").values(), ids=of_protocol)
+def test_every_scanner_says_how_its_beams_go(driver: Driver) -> None:
+    parsers = []
+    for found in settings_of(driver):
+        with suppress(DriverSettingsError):  # a file of the fixtures that is another head's
+            parsers.append(driver.make_parser(found))
+    assert parsers
+    for parser in parsers:
+        assert driver.line_scanner != (hasattr(parser, "beams") or hasattr(parser, "head"))
+
+
+def test_the_pages_example_is_a_driver_as_any_other() -> None:
+    """Of docs/adding-a-device.md."""
+    page = (FIXTURES.parent / "docs/adding-a-device.md").read_text()
+    [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    module: dict[str, Any] = {}
+    exec(block, module)
+    [driver] = module["DRIVERS"]
+    assert driver.summary
+    assert driver.transports
+    assert driver.yields
+    parser = driver.make_parser(DeviceSettings("gnss/test"))
+    assert parser.feed(Chunk("gnss/test", 0, b"abc")) == []
+    assert (parser.counters.bytes, parser.counters.bytes_skipped) == (3, 3)
+
+
+def test_a_driver_without_a_page_is_told_to_have_one() -> None:
+    driver = replace(find_driver("gnss", "ubx"), protocol="unwritten")
+    with pytest.raises(AssertionError, match=r"unwritten: write docs/devices/unwritten\.md first"):
+        settings_of(driver)
 
 
 def refusal(driver: Driver) -> str:
