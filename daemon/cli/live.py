@@ -56,11 +56,10 @@ def command(
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)
     paths = where or [DEFAULT_CONFIG]
-    with _stop_signals() as stop:
-        if replay:
-            _replay(paths, output or Path(), points, as_json=as_json)
-            return
-        found = _follow(paths[0], points, lambda: bool(stop), from_start=from_start, as_json=as_json)
+    if replay:
+        _replay(paths, output or Path(), points, as_json=as_json)
+        return
+    found = _follow(paths[0], points, from_start=from_start, as_json=as_json)
     if "no end" in found["state"]:
         raise typer.Exit(int(ExitCode.PROBLEM))
 
@@ -91,16 +90,15 @@ def _stop_signals() -> Iterator[list[int]]:
 # ---------------------------------------------------------------------------------------------- a recording
 
 
-def _follow(
-    where: Path, points: Path | None, stopped: Callable[[], bool], *, from_start: bool, as_json: bool
-) -> dict[str, Any]:
+def _follow(where: Path, points: Path | None, *, from_start: bool, as_json: bool) -> dict[str, Any]:
+    """Until it ends or is stopped; while loops compile, which looks at no list of signals, a signal ends it at once."""
     from rich.console import Console
 
     from daemon.config import load_config
     from daemon.config.tables import LiveConfig
     from daemon.processing.live import Live, be_humble
     from daemon.processing.setup import Options, Setup
-    from daemon.processing.warm_up import get_ready, warm_up
+    from daemon.processing.warm_up import before_compiling, get_ready, warm_up
     from daemon.sd_notify import ServiceManager
 
     directory = log_directory(where)
@@ -108,13 +106,21 @@ def _follow(
     be_humble()
     manager = ServiceManager()
     manager.notify(STATUS="compiling")
-    warmed = warm_up([] if config is None else [Setup.of_config(config, Options(uncertainty=False))])
-    with _teller(Console(), manager, as_json=as_json) as tell:
+    with before_compiling(_tell_of_compiling):
+        warmed = warm_up([] if config is None else [Setup.of_config(config, Options(uncertainty=False))])
+    with _stop_signals() as stop, _teller(Console(), manager, as_json=as_json) as tell:
         if warmed.cache is None or warmed.compiled:
             print(one_line(warmed.text()), file=sys.stderr, flush=True)
         manager.notify(READY="1", STATUS="waiting for a recording to begin")
         live = LiveConfig() if config is None else config.tables.live
-        return Live(directory, live, tell, from_start=from_start, points=points, prepare=get_ready).run(stopped)
+        return Live(directory, live, tell, from_start=from_start, points=points, prepare=get_ready).run(
+            lambda: bool(stop)
+        )
+
+
+def _tell_of_compiling() -> None:
+    text = "compiling, a minute or more; `swath warm-up` does this before a flight"
+    print(text, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -131,6 +131,27 @@ def compilations() -> Iterator[list[str]]:
         names += [str(event.data["dispatcher"]) for _, event in recorder.buffer if event.is_start]
 
 
+class _FirstCompilation(numba.core.event.Listener):
+    """Calls once, when the first loop is about to be compiled."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._calls = [call]
+
+    def on_start(self, event: numba.core.event.Event) -> None:
+        while self._calls:
+            self._calls.pop()()
+
+    def on_end(self, event: numba.core.event.Event) -> None:
+        """Nobody asks."""
+
+
+@contextlib.contextmanager
+def before_compiling(call: Callable[[], None]) -> Iterator[None]:
+    """Have something called before the first loop that is compiled meanwhile; never where all come from the cache."""
+    with numba.core.event.install_listener(COMPILE_EVENT, _FirstCompilation(call)):
+        yield
+
+
 def cache_folder() -> Path | None:
     """Where loops are kept; None: nowhere."""
     loop: Any = count_points

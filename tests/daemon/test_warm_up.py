@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,8 @@ from typing import Any
 import numba
 import pytest
 
-from daemon.processing.warm_up import WarmUp, cache_folder, compilations
+from daemon.cli.main import INTERRUPTED
+from daemon.processing.warm_up import WarmUp, before_compiling, cache_folder, compilations
 from tests.daemon.rig import HANGS_S
 from tests.daemon.test_cli import ROOT, swath
 
@@ -95,6 +97,35 @@ def test_what_is_compiled_is_noticed() -> None:
     with compilations() as names:
         assert compiled(4) == 8
     assert names == []
+
+
+def test_compiling_is_told_once_and_before_it_begins() -> None:
+    told: list[str] = []
+    with before_compiling(lambda: told.append("begins")):
+        numba.njit(lambda x: 3 * x)(2)
+        numba.njit(lambda x: 4 * x)(2)
+    assert told == ["begins"]
+    with before_compiling(lambda: told.append("again")):
+        pass
+    assert told == ["begins"]
+
+
+@pytest.mark.parametrize(
+    ("signum", "code"), [(signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, INTERRUPTED)], ids=lambda one: str(one)
+)
+def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum: int, code: int) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "daemon.cli.main", "live", str(tmp_path)]
+    with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as live:
+        assert live.stderr is not None
+        try:
+            assert live.stderr.readline() == "compiling, a minute or more; `swath warm-up` does this before a flight\n"
+            live.send_signal(signum)
+            assert live.wait(HANGS_S) == code
+            rest = live.stderr.read()
+        finally:
+            live.kill()
+    assert "loops compiled" not in rest, "it has not compiled all of them first"
 
 
 @pytest.mark.skipif(

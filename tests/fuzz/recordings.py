@@ -51,9 +51,7 @@ def settings_of(driver: Driver) -> list[DeviceSettings]:
     """Of the page's example, once for each file that could be the one it names."""
     source = f"{driver.kind}/fuzz"
     file = PAGES / f"{driver.protocol}.md"
-    assert file.is_file(), (
-        f"{driver.protocol}: write docs/devices/{file.name} first: the page's example is what is fuzzed"
-    )
+    assert file.is_file(), f"{driver.protocol}: write docs/devices/{file.name} first: its example is fuzzed"
     page = file.read_text()
     for block in re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S):
         config = Config(Tables.model_validate({"session": {"name": "fuzz"}, **tomllib.loads(block)}), Path("x"), block)
