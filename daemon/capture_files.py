@@ -46,7 +46,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
     """Every file with its kind and device.
 
     Raises:
-        UserError: all that is wrong, a line each: no such file, no device, no times.
+        UserError: all that is wrong, a line each: no device, no times, or, where that is all, what cannot be read.
     """
     found: dict[tuple[Path, str, str | None], Capture] = {}
     wrong: list[str] = [
@@ -54,6 +54,7 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
         for source in dict.fromkeys([*told.start_ns, *told.baud])
         if source and source not in routes.ports
     ]
+    unread = 0
     items: list[str | Path] = [*told.named, *files]
     for item in items:
         try:
@@ -63,10 +64,11 @@ def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Cap
                 found[capture.path, source, capture.selector] = capture
         except (UserError, TransportError) as error:
             wrong.append(one_line(str(error)))
+            unread += isinstance(error, TransportError)
     if not found and not wrong:
         wrong.append("nothing to import: give captures, or the folder of an export")
     if wrong:
-        raise UserError("\n".join(wrong), ExitCode.USAGE)
+        raise UserError("\n".join(wrong), ExitCode.IO if unread == len(wrong) else ExitCode.USAGE)
     return list(found.values())
 
 

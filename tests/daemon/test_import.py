@@ -342,6 +342,18 @@ class TestWrong:
         assert all(line.startswith("swath: ") for line in result.stderr.splitlines())
         return result.returncode, result.stderr, json.loads(result.stdout) if result.stdout else {}
 
+    def test_what_cannot_be_read_is_3_and_beside_wrong_use_2(self, tmp_path: Path) -> None:
+        """As docs/commands.md has it: no such file."""
+        nowhere, folder = str(tmp_path / "nowhere.pcap"), f"gnss/rover={tmp_path}"
+        (tmp_path / "cut.gz").write_bytes(gzip.compress(bytes(100))[:15])
+        code, error, _ = self.run(tmp_path, str(tmp_path / "cut.gz"))
+        assert (code, error.count("\n")) == (3, 1)
+        assert "cannot be read" in error
+        assert self.run(tmp_path, nowhere)[:2] == (3, f"swath: {nowhere}: No such file or directory\n")
+        assert self.run(tmp_path, "--source", folder)[:2] == (3, f"swath: {tmp_path}: Is a directory\n")
+        assert not (tmp_path / "logs").exists()
+        assert self.run(tmp_path, nowhere, "--source", f"gnss/nobody={nowhere}")[0] == 2
+
     def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
@@ -364,7 +376,6 @@ class TestWrong:
     @pytest.mark.parametrize(
         ("arguments", "line"),
         [
-            (["{}/nowhere.pcap"], "nowhere.pcap: No such file or directory"),
             (["{}/port.bin"], "neither pcap nor candump -L; if it is a device's bytes, say --source kind/name="),
             (["{}"], "is a folder without swath-export.json"),
             ([], "nothing to import"),
@@ -376,12 +387,10 @@ class TestWrong:
             ),
             (["--source", "scanner/top={}/port.bin"], "scanner/top comes by udp: want a pcap file"),
             (["--source", "gnss/rover={}/port.bin"], "says no times"),
-            (["{}/cut.gz"], "cannot be read"),
         ],
     )
     def test_what_cannot_be_imported(self, tmp_path: Path, arguments: list[str], line: str) -> None:
         (tmp_path / "port.bin").write_bytes(b"$GPGGA,")
-        (tmp_path / "cut.gz").write_bytes(gzip.compress(bytes(100))[:15])
         write_pcap(tmp_path / "a.pcap", [b"x"])
         code, error, _ = self.run(tmp_path, *(one.replace("{}", str(tmp_path)) for one in arguments))
         assert (code, error.count("\n")) == (2, 1), error
