@@ -7,13 +7,14 @@ import fcntl
 import os
 from pathlib import Path
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ConfigError, ExitCode, UserError
 
 DEFAULT_CONFIG = Path("/etc/swath/swath.toml")
 LOCK = ".swath.lock"  # in the log directory: held while a recorder is at work there
 CONTROL_LINK = ".swath.control"  # in the log directory: the control socket, or a link to it
 
 _WHO_MAY = "the group of the log directory may (swath, as installed), and root"
+_WANTED = "give the log directory or a configuration file"
 
 
 def log_directory(where: Path) -> Path:
@@ -26,11 +27,17 @@ def log_directory(where: Path) -> Path:
     from daemon.config import load_config
 
     try:
+        if not where.exists():
+            raise UserError(f"{where}: no such file or directory; {_WANTED}", ExitCode.USAGE)
         directory = where if where.is_dir() else Path(load_config(where).session.directory)
         if not directory.is_dir():
             raise UserError(f"{directory}: no such directory, so no recorder has written there", ExitCode.IO)
     except PermissionError as error:
         raise UserError(f"{error.filename}: not permitted; {_WHO_MAY}", ExitCode.IO) from error
+    except ConfigError as error:
+        if where.suffix == ".toml":
+            raise
+        raise ConfigError([*error.lines[:-1], f"{error.lines[-1]}; {_WANTED}"]) from error
     if not os.access(directory, os.R_OK | os.X_OK):
         raise UserError(f"{directory}: not permitted; {_WHO_MAY}", ExitCode.IO)
     return directory.absolute()

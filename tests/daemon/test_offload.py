@@ -262,6 +262,17 @@ def test_a_disk_that_fills_up_while_it_is_written(logs: Path, small_disk: Path) 
     assert coreutils_agree(small_disk) == 1
 
 
+def test_what_is_neither_a_directory_nor_a_configuration_is_one_line(disk: Path, tmp_path: Path) -> None:
+    text = tmp_path / "text.txt"
+    text.write_text("line 4: start\n")
+    for where, said in ((tmp_path / "nowhere", "no such file or directory"), (text, "not TOML: ")):
+        done = swath("offload", str(where), str(disk))
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(f"swath: {where}: {said}")
+        assert done.stderr.endswith("; give the log directory or a configuration file\n")
+        assert done.stderr.count("\n") == 1
+
+
 def test_what_cannot_be_a_destination_is_one_line(logs: Path, disk: Path, tmp_path: Path) -> None:
     write_part(logs / "flight_0.mcap")
     for where, to, code, said in (
