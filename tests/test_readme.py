@@ -8,8 +8,9 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -239,6 +240,22 @@ def test_commands_named_in_the_pages_exist() -> None:
     for page in sorted((ROOT / "docs").glob("*.md")):
         for name in re.findall(r"(?:`|\$ )swath ([a-z-]+)\b", page.read_text()):
             assert name in known, f"{page.name}: there is no `swath {name}`"
+
+
+def options(command: Any, name: str = "swath") -> Iterator[tuple[str, list[str]]]:
+    """Of a command and those below it: who has it, and how it is written, with the word that turns it off."""
+    for below, found in getattr(command, "commands", {}).items():
+        yield from options(found, f"{name} {below}")
+    for parameter in command.params:
+        written = [word for word in (*parameter.opts, *parameter.secondary_opts) if word.startswith("--")]
+        if written and parameter.name != "help":
+            yield name, written
+
+
+def test_every_option_stands_in_a_page() -> None:
+    pages = README + "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
+    stands = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", pages))
+    assert [f"{name} {words[0]}" for name, words in options(get_command(app)) if stands.isdisjoint(words)] == []
 
 
 def test_make_help_lists_every_target() -> None:
