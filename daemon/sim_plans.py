@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daemon.errors import ExitCode, UserError, one_line
+from georef.extras import how_to_install
 
 if TYPE_CHECKING:
     from daemon.sim_flight import Flight
@@ -65,7 +66,7 @@ class Wish:
 def _check_installed() -> None:
     missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
     if missing:
-        text = f"swath sim needs {', '.join(missing)}, not installed here: pip install 'swath[sim]'"
+        text = f"swath sim needs {', '.join(missing)}, not installed here: {how_to_install('sim')}"
         raise UserError(text, ExitCode.USAGE)
 
 

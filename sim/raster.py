@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
+from georef.extras import how_to_install
 from sim.errors import PlanError
 from sim.plan import Plan
 from sim.site import Site, geodetic_from_e
@@ -156,7 +157,7 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
     try:
         import rasterio
     except ImportError:
-        raise PlanError(KEY, "rasters need rasterio; want pip install 'swath[raster]', or no raster") from None
+        raise PlanError(KEY, f"rasters need rasterio: {how_to_install('raster')}; or no raster") from None
     path = plan.folder / plan.tables.terrain.raster
     if not path.is_file():
         raise PlanError(KEY, f"there is no file {path}; want a GeoTIFF, its path relative to the plan")

@@ -126,7 +126,7 @@ def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
 def test_bare_install_says_what_the_virtual_aircraft_wants(installed: Path, tmp_path: Path) -> None:
     done = run_installed(installed, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(tmp_path / "small"))
     assert done.returncode == 2
-    assert "pip install 'swath[sim]'" in done.stderr
+    assert "pip install '.[sim]'" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "small").exists()
 

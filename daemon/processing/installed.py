@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 from daemon.errors import ExitCode, UserError
+from georef.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
 EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it
@@ -15,5 +16,5 @@ def require_installed(command: str, *others: str) -> None:
     missing = [name for name in (*PROCESS, *others) if importlib.util.find_spec(name) is None]
     if missing:
         extras = ",".join(dict.fromkeys(["process", *(EXTRA_OF[name] for name in others)]))
-        text = f"{command} needs {', '.join(missing)}, not installed here: pip install 'swath[{extras}]'"
+        text = f"{command} needs {', '.join(missing)}, not installed here: {how_to_install(extras)}"
         raise UserError(text, ExitCode.USAGE)

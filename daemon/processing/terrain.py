@@ -14,6 +14,7 @@ from pyproj.exceptions import CRSError
 from daemon.config.config import Config
 from daemon.errors import ConfigError
 from georef.coarse_terrain import CoarseTerrain
+from georef.extras import how_to_install
 
 FloatArray = NDArray[np.float64]
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer
@@ -63,7 +64,7 @@ def read_terrain(path: Path) -> CoarseTerrain:
     try:
         import rasterio
     except ImportError as error:
-        raise ConfigError(f"{KEY}: reading {path} needs rasterio: pip install 'swath[raster]'") from error
+        raise ConfigError(f"{KEY}: reading {path} needs rasterio: {how_to_install('raster')}") from error
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", rasterio.errors.NotGeoreferencedWarning)

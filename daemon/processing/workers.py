@@ -15,6 +15,7 @@ from typing import Any
 
 from daemon.errors import ExitCode, UserError
 from daemon.processing.jobs import Job, JobResult, run_job
+from georef.extras import how_to_install
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
@@ -169,7 +170,9 @@ def _on_cluster(
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError:
-        raise UserError("--scheduler wants the extra swath[cluster] (dask, distributed)", ExitCode.USAGE) from None
+        raise UserError(
+            f"--scheduler wants dask and distributed: {how_to_install('cluster')}", ExitCode.USAGE
+        ) from None
     try:
         client = distributed.Client(scheduler, timeout=CONNECT_S)
     except (OSError, ValueError) as error:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.core.parser import DriverSettingsError
+from georef.extras import how_to_install
 from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 # Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
@@ -196,7 +197,7 @@ def filler(*, compiled: bool) -> Fill:
     try:
         from drivers.compiled.rows import fill
     except ImportError as error:
-        raise DriverSettingsError(f"compiled decoding wants numba, of pip install 'swath[process]': {error}") from error
+        raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
     return fill
 
 

@@ -23,6 +23,7 @@ from daemon.sim_ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
 from daemon.sim_folder import FlightFolder
 from daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
 from daemon.wire_player import Output, TimedUnit
+from georef.extras import how_to_install
 from sim.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until
@@ -256,7 +257,7 @@ class TestErrors:
         missing = ("numba", "scipy")
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else real(name))
         monkeypatch.chdir(tmp_path)
-        line = "swath: swath sim needs scipy, numba, not installed here: pip install 'swath[sim]'\n"
+        line = f"swath: swath sim needs scipy, numba, not installed here: {how_to_install('sim')}\n"
         assert in_process(capsys, *words) == (ExitCode.USAGE, line)
         assert list(tmp_path.iterdir()) == []
 

@@ -120,6 +120,6 @@ def test_any_pulses_give_the_same_rows(named: tuple[bool, bool] | None, seed: in
 def test_without_numba_one_line_says_what_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "drivers.compiled.rows")
     monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(DriverSettingsError, match=r"wants numba, of pip install 'swath\[process\]'"):
+    with pytest.raises(DriverSettingsError, match=r"wants numba: pip install '\.\[process\]'"):
         filler(compiled=True)
     assert filler(compiled=False) is ReturnSlots.fill

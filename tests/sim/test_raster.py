@@ -163,4 +163,4 @@ def test_holes_outside_the_area_do_no_harm(tmp_path: Path) -> None:
 
 def test_without_rasterio_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    assert "pip install 'swath[raster]'" in refused(tmp_path)
+    assert "pip install '.[raster]'" in refused(tmp_path)
