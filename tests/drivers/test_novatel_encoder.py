@@ -113,7 +113,7 @@ def test_a_position_without_valid_time_names_no_second(status: int) -> None:
 def early_logs() -> dict[str, bytes]:
     """What is dated, from a receiver that is one roll-over of ten bits behind."""
     week = WEEK - 1024
-    bodies = {
+    bodies: dict[str, nov.Body] = {
         "TIME": TIME,
         "BESTPOS": BEST_POS,
         "BESTVEL": BEST_VEL,
