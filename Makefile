@@ -38,11 +38,11 @@ test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it instal
 
 test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtual machine that it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
-	$(PYTEST) -n 0 -v -m "not long" tests/vm
+	$(BIN)/python -m tests.vm -m "not long"
 
 test-vm-long: $(VENV)/.tests ## the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh
-	$(PYTEST) -n 0 -v tests/vm
+	$(BIN)/python -m tests.vm
 
 test-arm64: $(VENV)/.tests ## decoders, log and points on an emulated ARM64, which it installs (root, apt): the same as here
 	@bash tests/arm64/setup.sh $(VENV)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-import time
-from collections.abc import Iterator
+import json
+from collections import Counter
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from tests.named_only import is_asked_for, limit
+from tests.vm.beside import Moment
+from tests.vm.machine import BESIDE_OTHERS
 
 HERE = Path(__file__).resolve().parent
 HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
-STEP_S = 0.05
+OTHERS = 0.2  # of the processors: with more beside it the emulated machine is another
+_BEGAN = pytest.StashKey[Moment]()
+_FAILURES = pytest.StashKey[list[tuple[str, str, float]]]()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -25,24 +28,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     limit(HERE, items, HANGS_S)
 
 
-@pytest.fixture(autouse=True)
-def _own_stalls() -> Iterator[None]:
-    """Beside a failure stands how long this computer did not come to its work: the machine stood as long."""
-    stopped, longest_s = threading.Event(), 0.0
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.stash[_BEGAN] = Moment.here()
 
-    def watch() -> None:
-        nonlocal longest_s
-        before_s = time.monotonic()
-        while not stopped.wait(STEP_S):
-            now_s = time.monotonic()
-            longest_s, before_s = max(longest_s, now_s - before_s - STEP_S), now_s
 
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    yield
-    stopped.set()
-    thread.join()
-    sys.stdout.write(f"this computer stood still for up to {longest_s:.2f} s\n")
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Beside a failure stands how much of this computer others had."""
+    report = yield
+    if report.failed:
+        share = item.stash[_BEGAN].share_of_others()
+        report.sections.append(("this computer", f"others had {share:.0%} of its processors meanwhile"))
+        failures = item.config.stash.setdefault(_FAILURES, [])
+        failures.append((str(item.path), "failed" if report.when == "call" else "error", share))
+    return report
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Where others had much of it in all that failed, that is left for `tests.vm.__main__`."""
+    BESIDE_OTHERS.unlink(missing_ok=True)
+    failures = session.config.stash.get(_FAILURES, [])
+    if failures and all(share > OTHERS for _, _, share in failures):
+        kinds = Counter(kind for _, kind, _ in failures)
+        told = {"failed": kinds["failed"], "error": kinds["error"], "paths": sorted({path for path, _, _ in failures})}
+        BESIDE_OTHERS.parent.mkdir(exist_ok=True)
+        BESIDE_OTHERS.write_text(json.dumps(told))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
