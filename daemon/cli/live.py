@@ -190,10 +190,13 @@ def _replay(paths: list[Path], output: Path, points: Path | None, *, as_json: bo
     from daemon.processing.setup import Options, Setup
 
     configs = [path for path in paths if path.suffix == ".toml"]
+    passed_over: list[str] = []
     try:
-        sessions = open_logs([path for path in paths if path not in configs])
+        sessions = open_logs([path for path in paths if path not in configs], passed_over)
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
+    for line in passed_over:
+        print(f"passed over: {one_line(line)}", file=sys.stderr)
     if len(sessions) != 1 or len(configs) > 1:
         names = ", ".join(session.session_id for session in sessions)
         raise UserError(f"one session and one configuration at a time; these are {names}", ExitCode.USAGE)

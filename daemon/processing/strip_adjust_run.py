@@ -26,6 +26,7 @@ from calib.signatures import signatures
 from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
 from calib.strips import StripReport, differences
 from daemon.errors import ExitCode, UserError
+from daemon.places import nearest_there
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, refuse_no_planes
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
@@ -103,10 +104,10 @@ class StripsCorrected:
 
 def _refuse_output(wish: AdjustWish) -> None:
     """UserError where no folder can be there, or it holds an adjustment already; before anything lasts long."""
-    there = next(path for path in (wish.output, *wish.output.resolve().parents) if path.exists())
-    if not there.is_dir():
+    there, permitted = nearest_there(wish.output.absolute())
+    if permitted and not there.is_dir():
         raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
-    if not os.access(there, os.W_OK | os.X_OK):
+    if not permitted or not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"--adjust {wish.output}: {there} cannot be written to", ExitCode.IO)
     if (wish.output / RECORD).exists() and not wish.overwrite:
         raise UserError(

@@ -279,8 +279,14 @@ class TestCommand:
     def test_replays_with_a_configuration_of_its_own(self, flown: Flown, tmp_path: Path) -> None:
         config = flown.config.path.with_name("other.toml")
         config.write_text(flown.config.text + "\n[live]\npoints_per_s = 100\ncell_m = 5.0\n")
-        done = swath("live", "--replay", *map(str, flown.paths), str(config), "-o", str(tmp_path), "--json")
+        logs = tmp_path / "logs"
+        logs.mkdir()
+        for path in flown.paths:
+            (logs / path.name).symlink_to(path.absolute())
+        (logs / "empty.mcap").touch()  # as a power cut leaves one
+        done = swath("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json")
         assert done.returncode == 0, done.stderr
+        assert f"passed over: {logs}/empty.mcap: " in done.stderr
         found = json.loads(done.stdout)
         assert found["state"] == "replayed"
         seconds = int(SECONDS) + 1
