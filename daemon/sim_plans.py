@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daemon.errors import ExitCode, UserError, one_line
-from georef.extras import how_to_install
+from drivers.core.extras import how_to_install
 
 if TYPE_CHECKING:
     from daemon.sim_flight import Flight

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from georef.extras import how_to_install
+from drivers.core.extras import how_to_install
 from sim.errors import PlanError
 from sim.plan import Plan
 from sim.site import Site, geodetic_from_e

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 from daemon.errors import ExitCode, UserError
-from georef.extras import how_to_install
+from drivers.core.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
 EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it

@@ -13,8 +13,8 @@ from pyproj.exceptions import CRSError
 
 from daemon.config.config import Config
 from daemon.errors import ConfigError
+from drivers.core.extras import how_to_install
 from georef.coarse_terrain import CoarseTerrain
-from georef.extras import how_to_install
 
 FloatArray = NDArray[np.float64]
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer

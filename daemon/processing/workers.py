@@ -15,7 +15,7 @@ from typing import Any
 
 from daemon.errors import ExitCode, UserError
 from daemon.processing.jobs import Job, JobResult, run_job
-from georef.extras import how_to_install
+from drivers.core.extras import how_to_install
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10

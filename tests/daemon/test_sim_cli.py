@@ -23,7 +23,7 @@ from daemon.sim_ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
 from daemon.sim_folder import FlightFolder
 from daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
 from daemon.wire_player import Output, TimedUnit
-from georef.extras import how_to_install
+from drivers.core.extras import how_to_install
 from sim.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until

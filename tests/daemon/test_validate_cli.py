@@ -104,6 +104,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         flight = replace(made.flight, heads=(replace(head, start=start),)).placed({"left": start})
         profile = SimpleNamespace(installation=PLACE)
         logged: Any = SimpleNamespace(
+            holes=[],
             log=path,
             setup=SimpleNamespace(config=SimpleNamespace(profile=profile)),
             session=SimpleNamespace(parts=[SimpleNamespace(path=path)]),
