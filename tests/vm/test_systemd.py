@@ -94,6 +94,14 @@ def newest_log(service: Machine) -> str:
     return name
 
 
+def next_part(service: Machine) -> str:
+    """Begin one; its name."""
+    old = newest_log(service)
+    service.told("systemctl reload swathd")
+    service.until(f"! grep -q {old} {LOGS}/recording.json")
+    return newest_log(service)
+
+
 def fetched(service: Machine, place: Path) -> Path:
     """A copy of the logs as they are, on the host."""
     service.told(f"rm -rf /vm/logs; mkdir /vm/logs; cp {LOGS}/*.mcap /vm/logs/")
@@ -172,7 +180,8 @@ def without_live(service: Machine) -> Iterator[None]:
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
 def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place: Path, thread: str) -> None:
     """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
-    old, pid = newest_log(service), shown(service, "MainPID")
+    old, pid = next_part(service), shown(service, "MainPID")  # a long one is repaired for minutes here
+    service.told("sleep 3")
     stem, fired = Path(old).stem, "journalctl -b -u swathd | grep -c 'Watchdog timeout'"
     before = int(service.shell(fired).output)
     stop = f"/usr/bin/python3 {machine.GUEST}/stop_thread.py"
@@ -190,10 +199,9 @@ def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place
 
 
 def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
+    service.told("sleep 3")
     old = newest_log(service)
-    service.told("sleep 3; systemctl reload swathd")
-    service.until(f"! grep -q {old} {LOGS}/recording.json")
-    new = newest_log(service)
+    new = next_part(service)
     assert new.rpartition("_")[0] == old.rpartition("_")[0]
     assert int(new.removesuffix(".mcap").rpartition("_")[2]) == int(old.removesuffix(".mcap").rpartition("_")[2]) + 1
     service.told("sleep 3")
