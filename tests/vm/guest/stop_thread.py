@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-import time
 from pathlib import Path
 
 PTRACE_SEIZE, PTRACE_INTERRUPT, WAIT_ALL = 0x4206, 0x4207, 0x40000000  # <linux/ptrace.h>, __WALL of wait(2)
@@ -19,9 +18,9 @@ def main() -> None:
     for request in (PTRACE_SEIZE, PTRACE_INTERRUPT):
         if libc.ptrace(request, thread, None, None) != 0:
             raise OSError(ctypes.get_errno(), "ptrace")
-    os.waitpid(thread, WAIT_ALL)
-    while tasks.exists():
-        time.sleep(0.2)
+    # who does not wait for the end of what he traces keeps the process from ending
+    while os.WIFSTOPPED(os.waitpid(thread, WAIT_ALL)[1]):
+        pass
 
 
 if __name__ == "__main__":
