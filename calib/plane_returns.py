@@ -20,7 +20,7 @@ from georef.records import Int64Array
 FloatArray = NDArray[np.float64]
 
 WIDE_M = 0.5  # within which of a plane returns are looked at
-RIM_M = 0.5  # of a face: so far beyond a fold of 17° or more the other face is within a gate of 0.15 m
+RIM_M = 0.5  # of a face: so far beyond a fold of 17° the other face is 0.15 m off, and out of a gate of that
 PURE, PURE_BEFORE = 0.9, 0.75  # share of a cell's returns there that have to lie on the plane
 COMES = 0.9  # share of the gate for what was not of the plane before
 _SAG_SHARE, _SHORTEST = 0.7, 0.3  # of the sag allowed that the middle may have; of a tile that it must have

@@ -53,11 +53,8 @@ def read_sign(directory: Path) -> Sign | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     names = isinstance(sign.session_id, str) and _NAME.fullmatch(sign.session_id) and _NAME.fullmatch(sign.path.stem)
-    return (
-        sign
-        if names and sign.path.suffix == ".mcap" and type(sign.part) is int and 0 <= sign.part <= MAX_PART
-        else None
-    )
+    number = type(sign.part) is int and 0 <= sign.part <= MAX_PART
+    return sign if names and number and sign.path.suffix == ".mcap" else None
 
 
 @dataclass(slots=True)

@@ -28,11 +28,7 @@ def sync_directory(directory: Path) -> None:
     Raises:
         OSError: the directory cannot be opened or synced.
     """
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+    _sync(directory, os.O_DIRECTORY)
 
 
 def try_sync_directory(directory: Path) -> None:
@@ -47,11 +43,7 @@ def sync_file(path: Path) -> None:
     Raises:
         OSError: it cannot be opened or synced.
     """
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+    _sync(path)
 
 
 def sync_tree(folder: Path) -> None:
@@ -62,3 +54,11 @@ def sync_tree(folder: Path) -> None:
         else:
             sync_file(path)
     try_sync_directory(folder)
+
+
+def _sync(path: Path, flags: int = 0) -> None:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

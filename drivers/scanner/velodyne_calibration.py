@@ -79,16 +79,11 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
     """Distance resolution in metres, and corrections by laser id."""
     import yaml  # only where a head has such a file
 
-    class Plain(yaml.SafeLoader):  # type: ignore[misc]
-        """Without aliases: by them a file of a few lines can mean more values than memory holds."""
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):
-                raise ValueError("has an alias; want every value where it belongs")
-            return super().compose_node(parent, index)
-
     try:
-        table = yaml.load(data, Plain)
+        # by aliases a file of a few lines can mean more values than memory holds
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(data, yaml.SafeLoader)):
+            raise ValueError("has an alias; want every value where it belongs")
+        table = yaml.safe_load(data)
     except yaml.YAMLError as error:
         raise ValueError(str(error).replace("\n", " ")) from error
     lasers: dict[int, dict[str, float]] = {}

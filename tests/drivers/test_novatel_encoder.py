@@ -130,12 +130,15 @@ def early_logs() -> dict[str, bytes]:
 @pytest.mark.parametrize("name", early_logs())
 def test_a_week_one_roll_over_behind_is_not_believed(name: str) -> None:
     records, parser = parse(early_logs()[name])
-    assert all(isinstance(record, GnssFix | GnssHeading | EventMark) for record in records)
-    assert [(record.valid, record.time.week) for record in records] == [(False, None)] * len(records)  # type: ignore[union-attr]
+    for record in records:
+        assert isinstance(record, GnssFix | GnssHeading | EventMark)
+        assert record.time is not None
+        assert (record.valid, record.time.week) == (False, None)
     assert parser.counters.errors == {"date_before_floor": 1}
     records, parser = parse(early_logs()[name], date_floor="1999-08-22")
     assert records
-    assert all(record.valid for record in records if not isinstance(record, InsSolution))  # type: ignore[union-attr]
+    others: list[Any] = [record for record in records if not isinstance(record, InsSolution)]
+    assert all(record.valid for record in others)
     assert not +parser.counters.errors
 
 
