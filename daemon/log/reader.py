@@ -207,7 +207,9 @@ def open_logs(paths: Sequence[Path | str], passed_over: list[str] | None = None)
             continue
         by_session.setdefault(part.info.session_id, []).append(part)
     if not by_session:
-        raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there")
+        why = f"; {passed_over[0]}" if passed_over else ""
+        more = f", and {len(passed_over) - 1} more" if passed_over and len(passed_over) > 1 else ""
+        raise LogError(f"{', '.join(map(str, paths))}: no logs (*.mcap) there{why}{more}")
     sessions = [_session(parts) for parts in by_session.values()]
     return sorted(sessions, key=lambda session: session.info.realtime_ns)
 

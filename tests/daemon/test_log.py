@@ -373,6 +373,14 @@ def test_what_a_writer_lays_at_once_after_a_stall_is_read_in_order_of_time(tmp_p
     assert (np.diff(times) >= 0).all()
 
 
+def test_of_a_directory_without_a_log_it_is_said_why(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.mcap").touch()
+    with pytest.raises(LogError) as error:
+        open_logs([tmp_path], [])
+    assert str(error.value) == f"{tmp_path}: no logs (*.mcap) there; {tmp_path}/a.mcap: is no MCAP file, and 1 more"
+
+
 # ------------------------------------------------------------------ a disk that refuses
 
 
