@@ -33,12 +33,13 @@ def test_clock_stepped_slewed_and_with_a_leap_second_no_wrong_second_and_no_gap(
     assert wrong_seconds(moments, lambda moment: moment.raw_ns + told["base_ns"]) == []
     assert sum(moment.state == "LOCKED" for moment in moments) > 200
 
-    # no gap: a pulse a second, and none that is not accounted for; log_time knows nothing of steps
+    # no gap: a pulse a second, and none that is not accounted for; log_time knows nothing of steps, the least of which
+    # is a second, while an emulated timer makes a pulse some hundredths late now and then
     edges = [value["edge_time_ns"] - offset_ns for _, value in content.messages["/pps/main"]]
     sequences = [value["sequence"] for _, value in content.messages["/pps/main"]]
     for (edge, sequence), (later, next_sequence) in pairwise(zip(edges, sequences, strict=True)):
         assert next_sequence > sequence
-        assert abs(later - edge - (next_sequence - sequence) * SECOND_NS) < 0.02 * SECOND_NS
+        assert abs(later - edge - (next_sequence - sequence) * SECOND_NS) < 0.2 * SECOND_NS
     missed = sequences[-1] - sequences[0] + 1 - len(sequences)
     assert content.messages["/status/pps/main"][-1][1]["lost_kernel"] == missed == 0
     for source in ("pps/main", "gnss/rover"):
