@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from drivers.core.extras import how_to_install
 from sim.errors import PlanError
@@ -179,7 +179,7 @@ def _read(plan: Plan, to_crs: _Projected, corners: FloatArray, height_m: float) 
         raise
     except rasterio.errors.NotGeoreferencedWarning:
         raise PlanError(KEY, f"{path} does not say where it lies; want a GeoTIFF of heights") from None
-    except (rasterio.errors.RasterioError, CRSError, ValueError) as error:
+    except (rasterio.errors.RasterioError, ProjError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise PlanError(KEY, f"{path} cannot be read: {reason}; want a GeoTIFF of heights") from None
 

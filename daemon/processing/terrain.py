@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import ProjError
 
 from daemon.config.config import Config
 from daemon.errors import ConfigError
@@ -77,7 +77,7 @@ def read_terrain(path: Path) -> CoarseTerrain:
         return CoarseTerrain(height_m, first, (transform.a, transform.e), to_grid, to_grid.turn)
     except rasterio.errors.NotGeoreferencedWarning as error:
         raise ConfigError(f"{KEY}: {path} does not say where it lies; want a GeoTIFF that does") from error
-    except (rasterio.errors.RasterioError, CRSError, ValueError) as error:
+    except (rasterio.errors.RasterioError, ProjError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ConfigError(f"{KEY}: {path} cannot be read: {reason}") from error
 

@@ -135,7 +135,7 @@ class LidarLayout:
         if self.head.profile not in PROFILES:
             known = ", ".join(PROFILES)
             raise DriverSettingsError(
-                f"{FILE}: udp_profile_lidar: {self.head.profile} is not known; there are: {known}"
+                f"{FILE}: udp_profile_lidar: {self.head.profile!r} is not known; there are: {known}"
             )
         if self.packet_bytes > LARGEST_PACKET_BYTES:
             raise DriverSettingsError(f"{FILE}: data_format: its packets are larger than a datagram")

@@ -91,7 +91,7 @@ def changed(path: str, value: Any) -> bytes:
         (
             "lidar_data_format/udp_profile_lidar",
             "RNG9",
-            "udp_profile_lidar: RNG9 is not known; there are: LEGACY, RNG19_…",
+            "udp_profile_lidar: 'RNG9' is not known; there are: LEGACY, RNG19_…",
         ),
         ("lidar_data_format/header_type", "ODD", 'data_format.header_type: got "ODD", want STANDARD or FUSA'),
         (
