@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Tangent
+from georef.calibration import INDEX, PARAMETERS
 from georef.records import Int64Array
 from georef.rotations import rot_from_quaternion
 from georef.trajectory import Trajectory
@@ -35,6 +36,11 @@ class Effect:
     unit: str
     look: str
     remedy: str
+
+    @property
+    def key(self) -> str:
+        """Of the parameter in calibration files, which has the report's unit: ``omega_deg``."""
+        return PARAMETERS[INDEX[self.parameter]].key
 
 
 _DEG = 180.0 / math.pi

@@ -283,12 +283,12 @@ def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
         return Signature(
             effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({told})"
         )
-    words = f"{effect.name}: {effect.look}; add {number} to {effect.parameter} ({told})"
+    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({told})"
     return Signature(effect, value, sigma, moves_m, "significant", words)
 
 
 def record_of(found: Signatures) -> Mapping[str, object]:
-    """For JSON: values in the unit of the report."""
+    """For JSON: values in the unit of the report, which is that of the parameter's key in calibration files."""
     return {
         "rows": found.rows,
         "rms_m": found.rms_m,
@@ -297,7 +297,7 @@ def record_of(found: Signatures) -> Mapping[str, object]:
         "effects": [
             {
                 "name": one.effect.name,
-                "parameter": one.effect.parameter,
+                "parameter": one.effect.key,
                 "unit": one.effect.unit,
                 "value": one.value * one.effect.factor if math.isfinite(one.value) else None,
                 "sigma": one.sigma * one.effect.factor if math.isfinite(one.sigma) else None,

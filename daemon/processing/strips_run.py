@@ -28,11 +28,11 @@ RECORD = "strips.json"
 LOG_SUFFIX = ".mcap"
 POINT_SUFFIXES = (".las", ".laz")
 LIMITS = {
-    "pulses_m2": "pulses per m²",
-    "within_m": "metres within strips",
-    "overlap_m": "metres RMSDz",
-    "overlap_max_m": "metres at most",
-    "rmse_z_m": "metres RMSEz",
+    "pulses_m2": "{:g} pulses per m²",
+    "within_m": "{:g} m within strips",
+    "overlap_m": "{:g} m RMSDz",
+    "overlap_max_m": "{:g} m for the largest difference",
+    "rmse_z_m": "{:g} m RMSEz",
 }
 
 
@@ -259,7 +259,7 @@ class Judgement:
 
 def _broken(one: Judged) -> list[str]:
     """Limits that are not kept, in words."""
-    return [f"{LIMITS[word]} {one.limits[word]:g}" for word, kept in one.kept.items() if kept is False]
+    return [LIMITS[word].format(one.limits[word]) for word, kept in one.kept.items() if kept is False]
 
 
 def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:

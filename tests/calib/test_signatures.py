@@ -90,24 +90,24 @@ def test_a_true_calibration_shows_nothing(made: Cast) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "parameter", "error"),
+    ("name", "parameter", "error", "key"),
     [
-        ("roll", "omega_rad", 2.5e-4),
-        ("pitch", "phi_rad", -4.0e-4),
-        ("heading", "kappa_rad", 9.0e-4),
-        ("torsion", "scan_angle_scale", 1.5e-3),
-        ("time", "time_offset_s", 2.0e-3),
+        ("roll", "omega_rad", 2.5e-4, "omega_deg"),
+        ("pitch", "phi_rad", -4.0e-4, "phi_deg"),
+        ("heading", "kappa_rad", 9.0e-4, "kappa_deg"),
+        ("torsion", "scan_angle_scale", 1.5e-3, "scan_angle_scale_ppm"),
+        ("time", "time_offset_s", 2.0e-3, "time_offset_us"),
     ],
 )
 def test_a_wrong_parameter_is_found_with_the_size_that_mends_it(
-    made: Cast, name: str, parameter: str, error: float
+    made: Cast, name: str, parameter: str, error: float, key: str
 ) -> None:
     found = found_in(wrong(made, **{parameter: error}))
     one = found[name]
     assert one.level == "significant"
     assert one.value == pytest.approx(-error, abs=3.5 * one.sigma)
     assert abs(one.value) > 5.0 * one.sigma
-    assert f"to {parameter}" in one.words
+    assert f"to {key} (" in one.words  # the calibration file's, whose unit the number has
     for other in found.values():
         assert other is one or other.level in ("none", "not told", "small"), other.words
 

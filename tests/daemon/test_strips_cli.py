@@ -108,7 +108,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
     told = capsys.readouterr().out
     assert "before: RMS 19.8 cm, largest 19.8 cm; now: 1.0 cm, 1.0 cm" in told
-    assert "strips keep QL2; QL1 not for its limit of pulses per m² 8" in told
+    assert "strips keep QL2; QL1 not for its limit of 8 pulses per m²" in told
     assert "confirm them against the edition in the contract" in told
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "differences.png",
@@ -120,7 +120,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
 def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
-    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of metres RMSDz 0\.08") as caught:
+    with pytest.raises(UserError, match=r"QL2 is not kept, for its limit of 0\.08 m RMSDz") as caught:
         run(str(folder), "--level", "QL2")
     assert caught.value.exit_code == ExitCode.PROBLEM
 
@@ -133,7 +133,7 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
     assert effects["roll"]["level"] == "none"
     assert record["notes"] == []
     bad = products(tmp_path / "bad", made.flight.placed({"left": made.truth.changed(omega_rad=4e-4)}))
-    with pytest.raises(UserError, match=r"roll: opposite strips tilt .* to omega_rad") as caught:
+    with pytest.raises(UserError, match=r"roll: opposite strips tilt .* to omega_deg") as caught:
         run(str(bad), "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
     roll = next(one for one in json.loads(capsys.readouterr().out)["signatures"]["effects"] if one["name"] == "roll")
