@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import CoordinateOperation
+from pyproj.datadir import get_user_data_dir
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
@@ -326,8 +327,10 @@ def transformer_of(operation: Operation) -> Transformer:
 def _how_to_get(grids: tuple[tuple[str, bool], ...]) -> str:
     listed = ", ".join(name for name, _ in grids)
     command = " ".join(f"--file {name}" for name, offered in grids if offered)
-    get = f"`projsync {command}` (or `pyproj sync`), the package proj-data, or " if command else ""
-    return f"the grid {listed}, which is not installed: {get}a copy in a folder that PROJ_DATA names"
+    get = f"`projsync {command}` (or `pyproj sync`), or " if command else ""
+    return (
+        f"the grid {listed}, which is not installed: {get}a copy in {get_user_data_dir()}, PROJ's folder of this user"
+    )
 
 
 def _short(name: str) -> str:

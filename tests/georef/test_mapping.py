@@ -264,20 +264,18 @@ def test_heights_above_a_grid_keep_to_its_own_bilinear_values(tmp_path: Path) ->
 
 
 def test_a_grid_that_is_installed_gives_orthometric_heights(tmp_path: Path) -> None:
-    """EPSG:32632+5773 with a file in the folder of PROJ_DATA under the name that Debian's proj-data gives EGM96."""
+    """EPSG:32632+5773 with a file in the user's folder under the name that Debian's proj-data gives EGM96."""
     nodes = write_gtx(tmp_path / "egm96_15.gtx", -90.0, -180.0, 0.25, (721, 1440))
     script = (
-        "import sys, json, numpy as np, pyproj\n"
-        "pyproj.datadir.append_data_dir(sys.argv[1])\n"
+        "import json, numpy as np\n"
         "from georef.mapping import Mapping\n"
         "from georef.earth import e_from_geodetic\n"
         "frame = Mapping('EPSG:32632+5773')\n"
         "e = e_from_geodetic(np.radians([[47.3]]), np.radians([[8.6]]), [[500.0]])[0]\n"
         "print(json.dumps([frame.exact(e)[0, 2], frame.description(), frame.wkt[:9]]))"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True, env=dict(os.environ)
-    )
+    environment = {**os.environ, "PROJ_USER_WRITABLE_DIRECTORY": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
     height, stated, wkt = json.loads(run.stdout)
     expected = 500.0 - bilinear(nodes, -90.0, -180.0, 0.25, np.array([47.3]), np.array([8.6]))[0]
     assert height == pytest.approx(expected, abs=1e-5)
