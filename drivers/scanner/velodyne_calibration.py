@@ -19,6 +19,7 @@ from drivers.scanner.beams import BeamTable, beam_table
 from drivers.scanner.velodyne_heads import SpinningHead
 
 _MOST_BYTES = 256 * 1024  # ten times the file of 128 lasers
+_MOST_LEVELS = 16  # a file has three
 _KEYS = (  # in the XML without its trailing underscore, in the YAML, the XML's unit
     ("vertCorrection", "vert_correction", math.pi / 180),
     ("rotCorrection", "rot_correction", math.pi / 180),
@@ -80,9 +81,15 @@ def _read_yaml(data: bytes) -> tuple[float | None, dict[int, dict[str, float]]]:
     import yaml  # only where a head has such a file
 
     try:
-        # by aliases a file of a few lines can mean more values than memory holds
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(data, yaml.SafeLoader)):
-            raise ValueError("has an alias; want every value where it belongs")
+        depth = 0
+        for event in yaml.parse(data, yaml.SafeLoader):
+            # by aliases a file of a few lines can mean more values than memory holds
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError("has an alias; want every value where it belongs")
+            # the scanner's time for a token grows with its depth: 20 kB of brackets were minutes
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MOST_LEVELS:
+                raise ValueError(f"nested more than {_MOST_LEVELS} deep; want lasers, each a table of numbers")
         table = yaml.safe_load(data)
     except yaml.YAMLError as error:
         raise ValueError(str(error).replace("\n", " ")) from error
