@@ -32,6 +32,7 @@ chrt -f 20 /usr/bin/python3 {aircraft.SENSORS} /vm \
 until [ -s /vm/durable ] && [ -s /vm/sent ]; do sleep 0.2; done
 echo FLYING; wait
 """
+TRACED = "trace_event=syscalls:sys_enter_fdatasync,syscalls:sys_exit_fdatasync"
 WITHOUT_SYNC = "[Service]\nEnvironment=LD_PRELOAD=/usr/local/lib/nosync.so\n"
 
 
@@ -92,7 +93,14 @@ def fly_and_cut(folder: Path, disk: Path, after_s: float, *, syncs: bool = True)
     senders = SENDERS if syncs else SENDERS.replace("-s /vm/durable ", "-e /var/lib/swath/recording.json ")
     qemu = [*machine.disk(machine.make_disk(disk, DISK_MB)), *aircraft.null_modem(folder)]
     with machine.start(
-        senders, shared=shared, systemd=True, overlay=overlay, layers=with_udev(), qemu=qemu, timeout_s=900
+        senders,
+        shared=shared,
+        systemd=True,
+        overlay=overlay,
+        layers=with_udev(),
+        qemu=qemu,
+        kernel=[TRACED],
+        timeout_s=900,
     ) as flying:
         flying.said("FLYING", 800)
         time.sleep(after_s)

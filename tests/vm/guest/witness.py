@@ -3,7 +3,8 @@
     witness.py LOGS FILE
 
 A line of FILE is ``<CLOCK_MONOTONIC in ns at the sync's begin> <at its end> <bytes> <log>``: bytes that the log had
-before the sync began, so that its end makes them durable. The kernel's tracing is the witness, not the recorder.
+before the sync began, so that its end makes them durable. The kernel's tracing is the witness, not the recorder; it is
+switched on by the kernel's command line: a switch rewrites running code, which the emulator at times does not notice.
 """
 
 from __future__ import annotations
@@ -19,13 +20,12 @@ _LINE = re.compile(r"(?P<task>\S.*)-\d+\s+\[\d+\].*? (?P<time>\d+\.\d+): sys_fda
 
 
 def begin() -> int:
-    """Trace fdatasync of threads called writer; returns the pipe."""
+    """Of what is traced only threads called writer; returns the pipe."""
     if not (TRACING / "trace_pipe").exists():
         os.system(f"mount -t tracefs nodev {TRACING}")
-    (TRACING / "trace_clock").write_text("mono")
     for event in ("sys_enter_fdatasync", "sys_exit_fdatasync"):
         (TRACING / f"events/syscalls/{event}/filter").write_text('comm == "writer"')
-        (TRACING / f"events/syscalls/{event}/enable").write_text("1")
+    (TRACING / "trace_clock").write_text("mono")  # empties the buffer of what others did before
     return os.open(TRACING / "trace_pipe", os.O_RDONLY | os.O_NONBLOCK)
 
 
