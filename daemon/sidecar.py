@@ -23,6 +23,7 @@ from drivers.transports.capture_base import LATEST_NS, CaptureDamageError, Captu
 
 SUFFIX = ".swath.csv.gz"
 _HEADER = "unit,time_ns,length,native,data"
+_NATIVE = {"0": False, "1": True}
 _MAX_UNIT_BYTES = 16 << 20  # a chunk of the recorder closes at 1 MiB
 _MAX_LINE_BYTES = 2 * _MAX_UNIT_BYTES + 100
 
@@ -103,11 +104,10 @@ def _line(stream: IO[bytes], sidecar: Path) -> str:
 
 def _row(line: str) -> SidecarRow | None:
     try:
-        unit, time_ns, length, native, data = line.rstrip("\n").split(",")
-        row = SidecarRow(
-            int(unit), int(time_ns), int(length), native == "1", bytes.fromhex(data) if data or native == "0" else None
-        )
-    except ValueError:
+        unit, time_ns, length, native, text = line.rstrip("\n").split(",")
+        data = bytes.fromhex(text) if text or native == "0" else None
+        row = SidecarRow(int(unit), int(time_ns), int(length), _NATIVE[native], data)
+    except (ValueError, KeyError):
         return None
     fits = row.data is None or len(row.data) == row.length
     return row if fits and 0 <= row.length <= _MAX_UNIT_BYTES and 0 <= row.time_ns <= LATEST_NS else None

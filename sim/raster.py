@@ -205,6 +205,9 @@ def _check_pixels(source: Any, path: Path) -> None:
     area = abs(place.a * place.e - place.b * place.d) if steps.max() < FARTHEST else 0.0
     if not (1 / FARTHEST < area and corner.max() < FARTHEST):
         raise PlanError(KEY, f"{path} has pixels that lie nowhere: {tuple(place)[:6]}; want a GeoTIFF of heights")
+    rows, columns = source.block_shapes[0]
+    if rows * columns * source.count > MOST_PIXELS:  # a block may hold all bands, and is read as a whole
+        raise PlanError(KEY, f"{path} has {source.count} bands in blocks of {columns} × {rows}; want one of heights")
     if not source.dtypes[0].startswith(("int", "uint", "float")):
         raise PlanError(KEY, f"{path} has pixels of type {source.dtypes[0]}; want a GeoTIFF of heights")
 

@@ -93,6 +93,11 @@ def _check(raster: Any, path: Path) -> None:
         raise ConfigError(f"{KEY}: {path} has pixels of {place.a:g} × {place.e:g} from {place.c:g}, {place.f:g} on")
     if raster.width * raster.height > MAX_NODES:
         raise ConfigError(f"{KEY}: {path} has {raster.width} × {raster.height} pixels; want a coarse model")
+    rows, columns = raster.block_shapes[0]
+    if rows * columns * raster.count > MAX_NODES:  # a block may hold all bands, and is read as a whole
+        raise ConfigError(
+            f"{KEY}: {path} has {raster.count} bands in blocks of {columns} × {rows}; want one of heights"
+        )
     if not raster.dtypes[0].startswith(("int", "uint", "float")):
         raise ConfigError(f"{KEY}: {path} has pixels of type {raster.dtypes[0]}; want heights")
 

@@ -19,7 +19,9 @@ from daemon.exporting import export_session
 from daemon.log.reader import open_logs
 from daemon.places import take_directory
 from daemon.replay import timed_units
+from daemon.sidecar import read_sidecar, sidecar_of
 from drivers.core.can_frames import encode_can_frame
+from drivers.transports.capture_base import CaptureDamageError
 from drivers.transports.capture_file import read_candump, read_pcap, read_serial
 from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
@@ -452,6 +454,15 @@ class TestWrong:
             code, error, _ = self.run(tmp_path, str(folder))
             assert (code, error.count("\n")) == (2, 1)
             assert line in error
+
+
+@pytest.mark.parametrize("row", ["0,5,3,2,010203", "0,5,3,?,", "0,5,3,0,", "1,5,2,0,010203"])
+def test_a_row_of_a_sidecar_that_cannot_be_is_told(tmp_path: Path, row: str) -> None:
+    """An entry that is neither there nor not; one that is not there and lacks its bytes, or has others than it says."""
+    with gzip.open(sidecar_of(tmp_path / "a.log"), "wt") as stream:
+        stream.write(f"unit,time_ns,length,native,data\n{row}\n")
+    with pytest.raises(CaptureDamageError, match="line 2: want unit,time_ns,length,native,data"):
+        list(read_sidecar(tmp_path / "a.log"))
 
 
 @pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])

@@ -78,6 +78,17 @@ def test_a_raster_that_lies_nowhere_is_refused() -> None:
         read_terrain(Path(__file__).parents[1] / "fuzz/seeds/terrain/nowhere")
 
 
+def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
+    profile = {"crs": "EPSG:32632", "transform": Affine(30.0, 0.0, EAST_M, 0.0, -30.0, NORTH_M), "SPARSE_OK": True}
+    blocks = {"tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "pixel"}
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=9, height=9, count=100, dtype="float64", **profile, **blocks
+    ):
+        pass
+    with pytest.raises(ConfigError, match="has 100 bands in blocks of 512 × 512; want one of heights"):
+        read_terrain(tmp_path / "dem.tif")
+
+
 def test_what_is_no_raster_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "dem.tif").write_text("no raster")
     with pytest.raises(ConfigError, match=r"^mta\.terrain: .*dem\.tif cannot be read: ") as refused:

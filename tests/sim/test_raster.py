@@ -111,6 +111,16 @@ def test_a_raster_that_is_not_there_or_no_raster(tmp_path: Path) -> None:
     assert refused(tmp_path).startswith(f"terrain.raster: {tmp_path / 'dem.tif'} cannot be read: ")
 
 
+def test_bands_that_share_blocks_too_large_to_read_are_refused(tmp_path: Path) -> None:
+    profile = {"crs": CRS, "transform": Affine(5.0, 0.0, CENTER[0], 0.0, -5.0, CENTER[1]), "SPARSE_OK": True}
+    blocks = {"tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "pixel"}
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=9, height=9, count=400, dtype="float64", **profile, **blocks
+    ):
+        pass
+    assert refused(tmp_path).endswith("dem.tif has 400 bands in blocks of 512 × 512; want one of heights")
+
+
 def test_another_crs_is_named_with_the_one_that_is_wanted(tmp_path: Path) -> None:
     write(tmp_path, crs="EPSG:25832")
     assert refused(tmp_path) == f"terrain.raster: {tmp_path / 'dem.tif'} is in EPSG:25832; want flight.crs, EPSG:32632"
