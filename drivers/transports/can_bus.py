@@ -8,6 +8,7 @@ over.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import socket
@@ -21,7 +22,7 @@ import numpy as np
 from drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
 from drivers.transports.can_frame import ERROR_BUS_OFF, pack_frame, unpack_frame
 from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
-from drivers.transports.mmsg import DropCounter, ask_receive_buffer
+from drivers.transports.mmsg import DropCounter, ask_receive_buffer, stamping
 from drivers.transports.uri import TransportSpec
 
 KERNEL_STAMPED = frozenset({"udp_multicast"})
@@ -71,7 +72,8 @@ class PythonCanTransport(DescriptorTransport):
         keywords: dict[str, Any] = {key: keyword_value(value) for key, value in self._spec.options.items()}
         spec = self._spec
         try:
-            self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
+            with stamping() if self._kernel_stamped else contextlib.nullcontext():
+                self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
         except NameError as error:  # how a python-can interface says that its maker's library is not installed
             raise TransportError(
                 f"{self.name}: the library of the {spec.interface} adapter is not installed"

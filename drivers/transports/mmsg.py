@@ -7,11 +7,15 @@ SCM_TIMESTAMPNS (socket(7)).
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import mmap
 import os
 import socket
+import struct
+import time
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -28,6 +32,8 @@ PEER_BYTES = 16  # struct sockaddr_in
 MEMORY_BYTES = 2 << 20  # taken at once; it is given back when the last block in it is written
 LEAST_OFFERED = 32  # slots; with fewer left a read begins new memory
 FIRST_EXPECTED_BYTES = 1248  # a guess: if it is wrong, the first read is copied
+STAMPING_WITHIN_S = 1.0  # a work queue's turn on a busy machine; half a millisecond on an idle one
+STAMPING_LOOK_S = 0.0005
 
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _MMSGHDR = np.dtype(  # struct msghdr in whole words, then msg_len
@@ -42,6 +48,8 @@ _IOVEC = np.dtype([("base", np.uintp), ("len", np.uintp)])
 _STAMP = np.dtype(  # struct cmsghdr with a struct timespec
     [("len", np.uintp), ("level", np.int32), ("type", np.int32), ("sec", np.intp), ("nsec", np.intp)]
 )
+
+_TIMESPEC = struct.Struct("@ll")
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _recvmmsg = _libc.recvmmsg
@@ -204,5 +212,36 @@ def ask_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
 
 
 def ask_stamps(sock: socket.socket) -> None:
-    """Have the kernel stamp every datagram with CLOCK_REALTIME on arrival."""
-    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    """Have the kernel stamp every datagram with CLOCK_REALTIME on arrival; before the socket hears its first."""
+    with stamping():
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+
+
+@contextlib.contextmanager
+def stamping() -> Iterator[None]:
+    """The kernel stamps what arrives, whatever its protocol, until a socket that asks for stamps has been opened.
+
+    It does so only while some socket of the machine wants it, and begins a while after the first one asks
+    (net_enable_timestamp of net/core/dev.c leaves it to a work queue). What arrived before that is stamped when it is
+    read, tens of milliseconds late, and nothing in the stamp tells. Where no datagram comes back from this machine's
+    own address it is not waited for.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        deadline_s = time.monotonic() + STAMPING_WITHIN_S
+        with contextlib.suppress(OSError):
+            probe.settimeout(STAMPING_WITHIN_S)
+            probe.bind(("127.0.0.1", 0))
+            while not _stamps_on_arrival(probe) and time.monotonic() < deadline_s:
+                pass
+        yield
+
+
+def _stamps_on_arrival(probe: socket.socket) -> bool:
+    """Whether a datagram to itself has a stamp of before it was read."""
+    probe.sendto(b"", probe.getsockname())
+    time.sleep(STAMPING_LOOK_S)
+    before_reading_ns = time.time_ns()
+    _, control, _, _ = probe.recvmsg(0, socket.CMSG_SPACE(_TIMESPEC.size))
+    seconds, nanoseconds = _TIMESPEC.unpack(control[0][2])
+    return bool(seconds * 1_000_000_000 + nanoseconds < before_reading_ns)

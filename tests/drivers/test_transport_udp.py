@@ -158,6 +158,21 @@ def test_stamps_are_the_kernels_and_ordered(sender: socket.socket) -> None:
     udp.close()
 
 
+def test_the_first_after_opening_has_the_stamp_of_its_coming(sender: socket.socket) -> None:
+    """Also where nothing else on this machine had asked for stamps; the kernel takes a while to begin with them."""
+    for _ in range(20):
+        udp = transport()
+        udp.open()
+        sender.sendto(b"first", ("127.0.0.1", port_of(udp)))
+        time.sleep(0.02)
+        before_reading_ns = time.time_ns()
+        (block,) = collect(udp, 1)
+        udp.close()
+        assert block.kernel_realtime_ns is not None
+        assert block.kernel_realtime_ns[0] < before_reading_ns
+        time.sleep(0.02)  # the kernel stops stamping, if nobody else wants it
+
+
 def test_two_senders_are_told_apart(sender: socket.socket) -> None:
     udp = transport(host="0.0.0.0")
     udp.open()
