@@ -226,12 +226,13 @@ def stamping() -> Iterator[None]:
     read, tens of milliseconds late, and nothing in the stamp tells. Where no datagram comes back from this machine's
     own address it is not waited for.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        deadline_s = time.monotonic() + STAMPING_WITHIN_S
+    with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):
+            probe = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC))
+            probe.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             probe.settimeout(STAMPING_WITHIN_S)
             probe.bind(("127.0.0.1", 0))
+            deadline_s = time.monotonic() + STAMPING_WITHIN_S
             while not _stamps_on_arrival(probe) and time.monotonic() < deadline_s:
                 pass
         yield
