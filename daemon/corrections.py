@@ -41,6 +41,7 @@ class Relay(threading.Thread):
         self._waiting: queue.Queue[bytes] = queue.Queue(MOST_WAITING)
         self._ending = stop
         self._refused = False
+        self._telling = threading.Lock()  # who puts counts too
 
     def put(self, data: bytes) -> None:
         """Never waits; the first begins the thread."""
@@ -62,18 +63,22 @@ class Relay(threading.Thread):
             self._tell(taken=self._send(data), count=len(data))
 
     def _tell(self, *, taken: bool, count: int) -> None:
-        if taken:
-            self.forwarded_bytes += count
-        else:
-            self.dropped_bytes += count
-        if taken == self._refused:
-            self._refused = not taken
-            post = self._events.post
+        with self._telling:
             if taken:
-                post(Severity.INFO, self._source, "forwarding_again", f"{self.target} takes corrections again")
+                self.forwarded_bytes += count
             else:
-                text = f"{self.target} does not take the corrections; they are recorded all the same"
-                post(Severity.WARNING, self._source, "forwarding_failed", text)
+                self.dropped_bytes += count
+            if taken == self._refused:
+                self._refused = not taken
+                self._post(taken=taken)
+
+    def _post(self, *, taken: bool) -> None:
+        if taken:
+            text = f"{self.target} takes corrections again"
+            self._events.post(Severity.INFO, self._source, "forwarding_again", text)
+        else:
+            text = f"{self.target} does not take the corrections; they are recorded all the same"
+            self._events.post(Severity.WARNING, self._source, "forwarding_failed", text)
 
 
 class CorrectionsWatch:
