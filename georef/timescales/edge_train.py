@@ -138,6 +138,11 @@ class EdgeTrain:
         del self._whole[-1], self._index[-1], self._doubt[-1], self._numbers[-KNOT_NUMBERS:]
         self._remember()
 
+    def doubt_all(self) -> None:
+        """Mark every knot as doubtful, from the first on."""
+        self.doubtful = True
+        self._doubt = array("b", bytes([True]) * len(self._doubt))
+
     def _remember(self) -> None:
         knot = self.bank.knot
         whole = math.floor(knot.phase_ns)

@@ -94,6 +94,12 @@ class LabelKeeper:
         train.doubtful = False
         train.labeller.conflict = ""
 
+    def give_up(self, train: EdgeTrain, host_ns: int, jump_s: float) -> None:
+        """Edges that have ended are outlived by others that contradict their seconds: all they named is doubtful."""
+        train.doubt_all()
+        text = f"by edges and messages that have outlived those before: time moves by {jump_s:+.1f} s"
+        self._events.add(host_ns, Severity.ERROR, "relabelled", text)
+
     def _relabel(self, train: EdgeTrain, host_ns: int, seconds: int, why: str) -> None:
         train.labeller.label = (train.labeller.label or 0) + seconds
         text = f"all seconds since these edges began move by {seconds:+d} s, {why}"

@@ -40,6 +40,8 @@ RECENT_EDGES = 24
 MAX_QUANTISATION_AGE_NS = 1_100_000_000
 SAME_SECOND_NS = SECOND_NS // 2
 PHASE_JUMP_NS = 1_000_000
+NAMED_WITHIN_NS = 2_500_000_000  # of an edge that was taken: one may be missing. What has ended is given no name
+OUTLIVES = 2  # edges of a train against those of an ended one whose label it contradicts
 
 
 class _Said(NamedTuple):
@@ -75,6 +77,7 @@ class PpsClock:
         self._lost_sigma_ns = lost_sigma_ns
         self._train: EdgeTrain | None = None
         self._candidate: EdgeTrain | None = None
+        self._contradicted = False  # by the candidate: messages alone confirm nothing then
         self._former: list[EdgeTrain] = []
         self._coarse = CoarseClock()
         self._wall = WallClock()
@@ -105,7 +108,7 @@ class PpsClock:
             reason = train.offer(host)
             if reason is None:
                 self._edges_used += 1
-                self._candidate = None
+                self._drop_candidate()
                 return
             self._refuse_edge(reason)
             if train.refused_in_a_row <= MAX_REFUSED_IN_A_ROW:
@@ -137,7 +140,7 @@ class PpsClock:
                 if reason is None:
                     self._replace_if_labelled()
                 return
-            self._candidate = None
+            self._drop_candidate()
         self._edges_unlocked += 1
         chain = find_chain(list(self._edges), noisy=self._edges_unlocked > NOISY_AFTER_EDGES)
         if chain is None:
@@ -173,19 +176,28 @@ class PpsClock:
             return
         held = _gps_float(old, host)
         jump_ns = (verdict.offset + new.index_at(host) - held) * SECOND_NS
-        if abs(jump_ns) >= SAME_SECOND_NS and not outranks(verdict, old.labeller.basis):
+        contradicts = abs(jump_ns) >= SAME_SECOND_NS and not outranks(verdict, old.labeller.basis)
+        if contradicts and new.used <= OUTLIVES * old.used:
+            self._contradicted = True
             self._labels.set_conflict(
                 old, host, f"since the edges changed messages are {jump_ns / SECOND_NS:+.1f} s off"
             )
             return
-        severity = Severity.WARNING if abs(jump_ns) >= PHASE_JUMP_NS else Severity.INFO
-        self._events.add(host, severity, "pps_relocked", f"edges moved by {jump_ns / 1e6:+.3f} ms against holdover")
+        if contradicts:
+            self._labels.give_up(old, host, jump_ns / SECOND_NS)
+        else:
+            severity = Severity.WARNING if abs(jump_ns) >= PHASE_JUMP_NS else Severity.INFO
+            self._events.add(host, severity, "pps_relocked", f"edges moved by {jump_ns / 1e6:+.3f} ms against holdover")
         new.labeller.label, new.labeller.basis = verdict.offset, verdict
         self._former.append(old)
         if not self._keep_history:
             del self._former[:-2]
         self._edges_used += new.used
-        self._train, self._candidate = new, None
+        self._train = new
+        self._drop_candidate()
+
+    def _drop_candidate(self) -> None:
+        self._candidate, self._contradicted = None, False
 
     # ---- messages
 
@@ -215,7 +227,7 @@ class PpsClock:
         self._messages.append(said)
         self._coarse.add(said.host_ns, (second - names_next) * SECOND_NS)
         for train in (self._train, self._candidate):
-            if train is not None and self._vote(train, said) and train is self._train:
+            if train is not None and self._vote(train, said) and train is self._train and not self._contradicted:
                 self._labels.decide(train, said.host_ns)
 
     def _refuse_message(self, reason: str) -> None:
@@ -263,7 +275,13 @@ class PpsClock:
             train.amend_last(-message.quantisation_ns)
 
     def _vote(self, train: EdgeTrain, said: _Said) -> bool:
-        """Let a message vote. Which edges surround it follows from the line, not from what came first."""
+        """Let a message vote. Which edges surround it follows from the line, not from what came first.
+
+        A receiver may pulse anywhere before it knows the time, and move its pulses when it does: a line whose edges
+        have ended is no ground to name a second on.
+        """
+        if train.labeller.label is None and said.host_ns - train.last_host_ns > NAMED_WITHIN_NS:
+            return False
         place = train.index_at(said.host_ns)
         index = math.floor(place)
         if index < 0:

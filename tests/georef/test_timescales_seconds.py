@@ -19,6 +19,7 @@ from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 from georef.timescales import PpsClock, TimeState
 from tests.georef.clock_run import Outcome, run
 from tests.georef.clock_simulation import (
+    HOST_START_NS,
     NS,
     Edges,
     Oscillator,
@@ -243,6 +244,53 @@ def test_receiver_restart_off_phase() -> None:
     assert outcome.counts(1010, 1098) == {HOLDOVER: 88}
     assert outcome.counts(1110)[LOCKED] == len(outcome.states) - 1110
     assert outcome.codes == ["second_known"]
+
+
+@pytest.mark.parametrize("sender", ["bound to the edge before", "bound to the next edge", "NMEA"])
+@pytest.mark.parametrize("phase_s", [0.2, 0.45, 0.55, 0.8])
+@pytest.mark.parametrize("found_s", [5, 7, 12, 40])
+def test_a_receiver_that_pulses_before_it_knows_the_time(sender: str, phase_s: float, found_s: int) -> None:
+    """At any phase until it has the time, its messages invalid; then on the second: none is named by former pulses."""
+    known: dict[str, Any] = {"valid": lambda s: s >= found_s}
+    senders = {
+        "bound to the edge before": [Sender("TIME", week_tag(), bound=True, delay_s=0.1, **known)],
+        "bound to the next edge": [
+            Sender("TIM-TP", week_tag(), names_edge=NamesEdge.NEXT, bound=True, delay_s=0.1, **known)
+        ],
+        "NMEA": nmea(**known),
+    }[sender]
+    edges = Edges(late_s=lambda s: phase_s if s < found_s else 0.0)
+    _, outcome = simulate(senders, edges, seconds=300)
+    assert np.abs(outcome.errors_ns).max() < 2e6
+    assert outcome.counts(found_s + 60) == {LOCKED: len(outcome.states) - found_s - 60}
+    assert "second_ambiguous" not in outcome.codes
+
+
+def contradicted(free_s: int, seconds: int) -> Outcome:
+    """A receiver that calls its time valid while its pulses are still anywhere, and then moves them by 0.8 s."""
+    edges = Edges(late_s=lambda s: 0.2 if s < free_s else 0.0)
+    return simulate([Sender("TIME", week_tag(), bound=True, delay_s=0.1)], edges, seconds=seconds)[1]
+
+
+def test_edges_that_have_ended_are_held_against_new_ones_for_as_long_as_they_said_more() -> None:
+    """Told once, not with every edge; the new ones take over, aloud, when they have been there for twice as long."""
+    outcome = contradicted(100, 600)
+    assert outcome.codes == ["second_known", "second_ambiguous", "relabelled"]
+    (_, at), (taken_over_s, text) = [(s, text) for s, code, text in outcome.events if code != "second_known"]
+    assert "-0.8 s off" in at
+    assert 280 < taken_over_s < 330
+    assert "-0.8 s" in text
+    assert outcome.counts(120, taken_over_s - 1) == {COARSE: taken_over_s - 121}
+    assert outcome.counts(taken_over_s + 1)[LOCKED] == len(outcome.states) - taken_over_s - 1
+    late = np.array(outcome.seconds) > taken_over_s
+    assert np.abs(np.array(outcome.errors_ns)[late]).max() < 1e5
+
+
+def test_what_was_labelled_by_edges_that_were_given_up_is_doubtful_in_post_processing() -> None:
+    outcome = contradicted(100, 600)
+    host_ns = np.array([HOST_START_NS + 50 * NS, HOST_START_NS + 500 * NS])
+    _, sigma_ns = outcome.clock.gps_from_host(host_ns)
+    assert sigma_ns[0] >= 1e9 > 1e5 > sigma_ns[1]
 
 
 def test_edges_at_a_new_phase_with_time() -> None:
