@@ -48,11 +48,16 @@ class Synced:
 
 @dataclass
 class Cut:
-    """What is left of a flight that ended in the dark, its journal replayed."""
+    """What is left of a flight that ended in the dark, its journal replayed.
+
+    Attributes:
+        begun_ns: of the last sync that began, whether it ended or not.
+    """
 
     logs: Path
     turns: list[aircraft.Turn]
     syncs: list[Synced]
+    begun_ns: int
 
     def log(self) -> Path:
         """The log of the flight."""
@@ -74,7 +79,10 @@ class Cut:
 
     def bound_s(self) -> float:
         """The sync period, 250 ms and the sync under way; the machine's own stalls, as its sender saw them."""
-        sync_s = max((sync.ended_ns - sync.began_ns) * 1e-9 for sync in self.syncs) if self.syncs else 0.0
+        syncs_ns = [sync.ended_ns - sync.began_ns for sync in self.syncs]
+        if self.syncs and self.begun_ns > self.syncs[-1].ended_ns:
+            syncs_ns.append(self.turns[-1].monotonic_ns - self.begun_ns)
+        sync_s = max(syncs_ns, default=0) * 1e-9
         pairs = zip(self.turns, self.turns[1:], strict=False)
         stall_s = max((after.monotonic_ns - before.monotonic_ns) * 1e-9 for before, after in pairs)
         return FSYNC_S + CHUNK_OPEN_S + sync_s + stall_s
@@ -108,7 +116,9 @@ def fly_and_cut(folder: Path, disk: Path, after_s: float, *, syncs: bool = True)
     machine.replay_journal(disk)
     logs = folder / "logs"
     machine.copy_from_disk(disk, LOGS_ON_DISK, logs)
-    return Cut(logs, aircraft.sent(shared), synced(shared / "durable"))
+    begun = shared / "durable.begun"
+    begun_ns = [int(line) for line in begun.read_text().split("\n")[:-1]] if begun.exists() else []
+    return Cut(logs, aircraft.sent(shared), synced(shared / "durable"), max(begun_ns, default=0))
 
 
 def synced(path: Path) -> list[Synced]:

@@ -3,8 +3,9 @@
     witness.py LOGS FILE
 
 A line of FILE is ``<CLOCK_MONOTONIC in ns at the sync's begin> <at its end> <bytes> <log>``: bytes that the log had
-before the sync began, so that its end makes them durable. The kernel's tracing is the witness, not the recorder; it is
-switched on by the kernel's command line: a switch rewrites running code, which the emulator at times does not notice.
+before the sync began, so that its end makes them durable. FILE.begun has the begin of each, also of one that the power
+did not let end. The kernel's tracing is the witness, not the recorder; it is switched on by the kernel's command line:
+a switch rewrites running code, which the emulator at times does not notice.
 """
 
 from __future__ import annotations
@@ -35,9 +36,14 @@ def newest(logs: Path) -> Path | None:
     return max(made, key=lambda path: path.stat().st_mtime_ns, default=None)
 
 
+def written(path: str) -> int:
+    """A file to be written to, empty."""
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+
+
 def main() -> None:
     """Watch until the power goes."""
-    logs, told = Path(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    logs, told, begun = Path(sys.argv[1]), written(sys.argv[2]), written(sys.argv[2] + ".begun")
     pipe = begin()
     sizes: list[tuple[int, int, str]] = []
     began_ns, rest = 0, ""
@@ -59,6 +65,7 @@ def main() -> None:
             at_ns = round(float(found["time"]) * 1e9)
             if not found["end"]:
                 began_ns = at_ns
+                os.write(begun, f"{began_ns}\n".encode())
                 continue
             known = [(size, name) for stat_ns, size, name in sizes if stat_ns < began_ns]
             if known:
