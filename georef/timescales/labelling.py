@@ -42,6 +42,15 @@ class LeapTrust(IntEnum):
     SAID = 2  # a receiver said it, or the message needs none
 
 
+class Said(NamedTuple):
+    """A message as it votes: arrival, voter, second named, trust in its leap count."""
+
+    host_ns: int
+    key: VoterKey
+    second: int
+    leap: LeapTrust
+
+
 class Vote(NamedTuple):
     """offset: second − edge number; age_s: of the message since the edge before it; leap: behind its second."""
 

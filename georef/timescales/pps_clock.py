@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from georef.timescales.gps_time import (
 )
 from georef.timescales.history import gps_of_trains
 from georef.timescales.label_keeper import LabelKeeper, outranks
-from georef.timescales.labelling import LeapTrust, Verdict, Vote, VoterKey
+from georef.timescales.labelling import LeapTrust, Said, Verdict, Vote, VoterKey
 from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds
 
 WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
@@ -42,15 +41,6 @@ SAME_SECOND_NS = SECOND_NS // 2
 PHASE_JUMP_NS = 1_000_000
 NAMED_WITHIN_NS = 2_500_000_000  # of an edge that was taken: one may be missing. What has ended is given no name
 OUTLIVES = 2  # edges of a train against those of an ended one whose label it contradicts
-
-
-class _Said(NamedTuple):
-    """A message as it votes: arrival, voter, second named, trust in its leap count."""
-
-    host_ns: int
-    key: VoterKey
-    second: int
-    leap: LeapTrust
 
 
 class PpsClock:
@@ -84,7 +74,7 @@ class PpsClock:
         self._leap: LeapSeconds | None = None
         self._edges: deque[int] = deque(maxlen=RECENT_EDGES)
         self._edges_unlocked = 0
-        self._messages: deque[_Said] = deque(maxlen=RECENT_MESSAGES)
+        self._messages: deque[Said] = deque(maxlen=RECENT_MESSAGES)
         self._quantisation: tuple[int, int, float] | None = None  # host ns, second, ns
         self._events = EventLog()
         self._labels = LabelKeeper(self.leaps, self._wall, self._events)
@@ -223,7 +213,7 @@ class PpsClock:
         names_next = (self._names_edge or message.names_edge) is NamesEdge.NEXT
         self._note_quantisation(message, second, names_next)
         key = VoterKey(source, message.message, names_next, tag.scale is TimeScale.UTC, message.bound)
-        said = _Said(message.host_time_ns, key, second, trust)
+        said = Said(message.host_time_ns, key, second, trust)
         self._messages.append(said)
         self._coarse.add(said.host_ns, (second - names_next) * SECOND_NS)
         for train in (self._train, self._candidate):
@@ -274,7 +264,7 @@ class PpsClock:
         if train is not None and train.labeller.label == second - train.bank.knot.index:
             train.amend_last(-message.quantisation_ns)
 
-    def _vote(self, train: EdgeTrain, said: _Said) -> bool:
+    def _vote(self, train: EdgeTrain, said: Said) -> bool:
         """Let a message vote. Which edges surround it follows from the line, not from what came first.
 
         A receiver may pulse anywhere before it knows the time, and move its pulses when it does: a line whose edges
@@ -299,7 +289,7 @@ class PpsClock:
         seconds = change.now - change.before
         said = LeapTrust.SAID
         self._messages = deque(
-            (m if m.leap is said else _Said(m.host_ns, m.key, m.second + seconds, said) for m in self._messages),
+            (m if m.leap is said else Said(m.host_ns, m.key, m.second + seconds, said) for m in self._messages),
             maxlen=RECENT_MESSAGES,
         )
         if not self._coarse_is_gps():
