@@ -223,8 +223,8 @@ def stamping() -> Iterator[None]:
 
     It does so only while some socket of the machine wants it, and begins a while after the first one asks
     (net_enable_timestamp of net/core/dev.c leaves it to a work queue). What arrived before that is stamped when it is
-    read, tens of milliseconds late, and nothing in the stamp tells. Where no datagram comes back from this machine's
-    own address it is not waited for.
+    read, late by what a reader waits for company, and nothing in the stamp tells. Where no datagram comes back from
+    this machine's own address it is not waited for.
     """
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):

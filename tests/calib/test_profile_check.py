@@ -127,7 +127,8 @@ def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: Tr
     for one in checked.comparisons:
         assert abs(one.normalised) < 3.0, one
         assert one.told_sigma > 0.9 * one.adjusted_sigma  # the adjustment sees more
-    # and what is wrong by more than that is seen, also by profiles at other places that know it half as well again
+    # and what is wrong by more than that is seen; points that moved are profiled elsewhere, where a sigma is up to half
+    # as large again: of 12 are 8 left, less the 3 that are allowed above
     start = adjusted.calibrations["left"]
     for parameter in ("omega_rad", "phi_rad"):
         sigma = next(one.difference_sigma for one in checked.comparisons if one.parameter == parameter)
