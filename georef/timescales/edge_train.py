@@ -60,12 +60,13 @@ def _chain_noise_ns(chain: Sequence[tuple[int, int]], edges: Sequence[int]) -> f
     """
     seconds = np.array([index for index, _ in chain], dtype=np.float64)
     phase = np.array([host - chain[0][1] - index * SECOND_NS for index, host in chain], dtype=np.float64)
-    line = np.polyfit(seconds, phase, 1)
-    residual = phase - np.polyval(line, seconds)
+    away, middle = seconds - seconds.mean(), phase.mean()
+    slope = float(away @ phase) / float(away @ away)  # by hand: LAPACK is not otherwise touched while recording
+    residual = phase - middle - slope * away
     chosen = math.sqrt((float(residual @ residual) + 2 * FIRST_NOISE_NS**2) / len(chain))
     since = np.array(edges, dtype=np.int64) - chain[0][1]
     whole = np.rint(since / SECOND_NS)
-    off = np.abs(since - whole * SECOND_NS - np.polyval(line, whole))
+    off = np.abs(since - whole * SECOND_NS - middle - slope * (whole - seconds.mean()))
     near = off[off < NOISY_TOLERANCE_NS]
     return FIRST_NOISE_FACTOR * max(chosen, 1.4826 * float(np.median(near)))
 
