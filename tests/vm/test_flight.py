@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -220,6 +221,8 @@ def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines
                 lines.connect()
                 _, trouble = flying.communicate(timeout=HANGS_S)
                 assert flying.returncode == 0, trouble
+                # beside what fails: for a recorder that stood still, it says where each thread stood
+                sys.stdout.write(computer.told("journalctl -b -o short-monotonic -u swathd --no-pager", 200))
                 computer.told("sleep 3; systemctl stop swathd; sync", 200)
                 yield computer, lines
     machine.replay_journal(disk)
