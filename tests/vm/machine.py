@@ -41,6 +41,12 @@ for ((number = 1; ; number++)); do
 done
 """  # a command for `start`: what `Machine.shell` asks, one after the other, until the power goes
 _SYSTEMD = "/lib/systemd/systemd"
+# what udev would load for the processor and for what the board has: seconds where the processor is emulated
+_NOT_LOADED = (
+    *("kvm", "kvm_amd", "kvm_intel", "acpi_cpufreq", "powernow_k8", "aesni_intel", "ghash_clmulni_intel"),
+    *("crct10dif_pclmul", "crc32_pclmul", "sha512_ssse3", "ccp", "button", "psmouse", "pcspkr", "lpc_ich", "iTCO_wdt"),
+    *("i2c_i801", "ahci", "libata"),
+)
 
 
 @dataclass(frozen=True)
@@ -217,7 +223,8 @@ def start(
     init = _SYSTEMD if systemd else "/vm/stage2"
     modules = (CACHE / "kernel").resolve() / "lib/modules"
     words = [
-        "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable clocksource=tsc",
+        "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable clocksource=tsc init_on_alloc=0",
+        f"module_blacklist={','.join(_NOT_LOADED)}",
         f"vm.init={init} vm.modules={modules} vm.tree={TREE} vm.layers={len(layers)}",
         *(["systemd.unit=vm.target systemd.show_status=0"] if systemd else []),
         *kernel,
@@ -230,7 +237,8 @@ def start(
     ]:
         arguments += ["-fsdev", f"local,id={tag},path={folder},security_model=none{more}"]
         arguments += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
-    machine = ["-M", "q35,usb=off", "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
+    board = "q35,usb=off,sata=off,smbus=off"
+    machine = ["-M", board, "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
     fixed = ["-nodefaults", "-no-user-config", "-no-reboot", "-device", "virtio-rng-pci"]
     # setpriv: the machine does not outlive a test run that is killed
     line = [
@@ -312,6 +320,11 @@ def _prepare(shared: Path, command: str, overlay: Path | None, systemd: bool) ->
         for name in (GUEST / "masked").read_text().split():
             if not (units / name).is_symlink():
                 (units / name).symlink_to("/dev/null")
+        generators = root / "etc/systemd/system-generators"
+        generators.mkdir(parents=True)
+        for path in Path("/lib/systemd/system-generators").iterdir():
+            if path.name != "systemd-fstab-generator":
+                (generators / path.name).symlink_to("/dev/null")
         for unit in ("vm.target", "vm-command.service"):
             shutil.copy(GUEST / unit, units / unit)
     for folder in (root, *(path for path in root.rglob("*") if path.is_dir() and not path.is_symlink())):
