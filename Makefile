@@ -12,6 +12,7 @@ PYTEST := $(BIN)/python -m pytest -p no:cacheprovider
 DESTDIR ?=
 PREFIX ?= /opt/swath
 
+MAKEFLAGS += --no-print-directory
 unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
@@ -26,7 +27,7 @@ demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through rea
 	@$(BIN)/python -m demo
 
 test: $(VENV)/.tests $(VENV)/.tools ## install and run everything: style, types, import rules, tests
-	@$(MAKE) --no-print-directory -j 2 --output-sync=target lint ready
+	@$(MAKE) -j 2 --output-sync=target lint ready
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone and not peers"
 	$(PYTEST) -n 0 -m "alone and not long"
 
