@@ -32,10 +32,10 @@ test: $(VENV)/.tests $(VENV)/.tools ## install and run everything: style, types,
 	$(PYTEST) -n 0 -m "alone and not long"
 
 test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it installs (root, apt, npm)
-	@command -v gpsd >/dev/null || apt-get install -qy --no-install-recommends gpsd
-	@command -v npm >/dev/null || apt-get install -qy --no-install-recommends nodejs npm
+	@for program in gpsd npm; do command -v $$program >/dev/null || \
+		{ apt-get -qq update && apt-get -qq install -y --no-install-recommends $$program >/dev/null; } || exit; done
 	npm ci --silent --no-audit --no-fund --prefix tests/peers
-	$(PYTEST) -n 0 -m peers
+	$(PYTEST) -n 0 -v tests/peers
 
 test-vm: $(VENV)/.tests ## on real CAN, PPS, systemd and power cuts, in a virtual machine that it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
