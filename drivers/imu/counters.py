@@ -19,7 +19,8 @@ class CounterUnwrapper:
     """Unwraps a counter of ``bits`` bits at ``tick_hz`` by its differences, and by host time across long gaps.
 
     A step that disagrees with host time by more than 2 s + 1 % (or goes back) is a restart of the device: the count
-    begins anew from the value read, which later stages see as a new segment of its clock.
+    begins anew from the value read, which later stages see as a new segment of its clock. So it does where a counter
+    that wraps within 4 s seems to have wrapped unseen: host stamps that were late by a stall look the same.
     """
 
     def __init__(self, bits: int, tick_hz: float) -> None:
@@ -52,12 +53,16 @@ class CounterUnwrapper:
         span_s = host_step_ns / NS_PER_S
         expected = span_s * self._tick_hz
         steps: Int64Array = (raw[1:] - raw[:-1]).view(np.int64)
+        unsure = np.zeros(len(steps), np.bool_)
         if self._bits < 63:
             wrap = 1 << self._bits
             steps = steps & (wrap - 1)
-            steps = steps + np.maximum(np.rint((expected - steps) / wrap), 0).astype(np.int64) * wrap
+            wraps = np.maximum(np.rint((expected - steps) / wrap), 0).astype(np.int64)
+            steps = steps + wraps * wrap
+            if wrap < 2 * RESTART_TOLERANCE_S * self._tick_hz:
+                unsure = wraps > 0
         tolerance = (RESTART_TOLERANCE_S + RESTART_TOLERANCE_RATE * np.abs(span_s)) * self._tick_hz
-        return steps, (steps < 0) | (np.abs(expected - steps) > tolerance)
+        return steps, unsure | (steps < 0) | (np.abs(expected - steps) > tolerance)
 
     def _accumulate(self, steps: Int64Array, restart: NDArray[np.bool_], raw: Int64Array) -> Int64Array:
         """Running counts; each restart begins at its own raw value."""

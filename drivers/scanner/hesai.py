@@ -139,7 +139,7 @@ class HesaiParser(PacketParser):
             host_time_ns, packets, second_ns = host_time_ns[good], packets[good], second_ns[good]
         if not len(packets):
             return []
-        number, fresh = self._follow(packets, second_ns)
+        number, fresh = self._follow(host_time_ns, packets, second_ns)
         if not fresh.all():
             host_time_ns, packets = host_time_ns[fresh], packets[fresh]
             second_ns, number = second_ns[fresh], number[fresh]
@@ -179,11 +179,14 @@ class HesaiParser(PacketParser):
             self.counters.bad_messages += count
             self.counters.bytes_skipped += count * length
 
-    def _follow(self, packets: StructArray, second_ns: Int64Array) -> tuple[Int64Array, BoolArray]:
+    def _follow(
+        self, host_time_ns: Int64Array, packets: StructArray, second_ns: Int64Array
+    ) -> tuple[Int64Array, BoolArray]:
         """Running number of each packet, and False where it repeats the one before."""
         if "sequence" in (packets.dtype.names or ()):
             stamp_ns = second_ns + packets["microsecond"].astype(np.int64) * 1000
-            return self._tracker.follow(packets["sequence"], stamp_ns, np.zeros(len(packets), dtype=np.uint32))
+            none = np.zeros(len(packets), dtype=np.uint32)
+            return self._tracker.follow(packets["sequence"], stamp_ns, none, host_time_ns)
         number = self._unnumbered + np.arange(len(packets), dtype=np.int64)
         self._unnumbered += len(packets)
         return number, np.ones(len(packets), dtype=np.bool_)

@@ -173,7 +173,7 @@ class OusterParser(PacketParser):
         if not len(packets):
             return []
         records: list[Record] = list(self._health.read(host_time_ns, packets))
-        unwrapped, fresh = self._follow(packets)
+        unwrapped, fresh = self._follow(host_time_ns, packets)
         if not fresh.all():
             host_time_ns, packets, unwrapped = host_time_ns[fresh], packets[fresh], unwrapped[fresh]
         clock = self._clock(host_time_ns, packets)
@@ -204,7 +204,7 @@ class OusterParser(PacketParser):
         criteria.append(("bad_timestamp", np.all((columns["time_ns"] < np.uint64(1 << 63)) | ~valid, axis=1)))
         return criteria
 
-    def _follow(self, packets: StructArray) -> tuple[Int64Array, BoolArray]:
+    def _follow(self, host_time_ns: Int64Array, packets: StructArray) -> tuple[Int64Array, BoolArray]:
         """Number the packets (n,), gaps left open; False for one that repeats the one before."""
         place = self.layout.first_id(packets["columns"]) // self.head.columns_per_packet
         sequence = self.layout.frame_id(packets) * (int(self._rank.max()) + 1) + self._rank[place]
@@ -216,8 +216,8 @@ class OusterParser(PacketParser):
             if self._init_id is not None and int(init_id[start]) != self._init_id:
                 self._tracker.restart(int(sequence[start]), int(time_ns[start]))
             self._init_id = int(init_id[start])
-            none = np.zeros(stop - start, dtype=np.int64)
-            parts.append(self._tracker.follow(sequence[start:stop], time_ns[start:stop], none))
+            part, none = slice(start, stop), np.zeros(stop - start, dtype=np.int64)
+            parts.append(self._tracker.follow(sequence[part], time_ns[part], none, host_time_ns[part]))
         return np.concatenate([at for at, _ in parts]), np.concatenate([new for _, new in parts])
 
     def _first_times(self, columns: StructArray) -> Int64Array:

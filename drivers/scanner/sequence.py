@@ -26,6 +26,7 @@ class _Last:
     unwrapped: int
     first_time_ns: int
     pps_count: int
+    host_time_ns: int
 
 
 class SequenceTracker:
@@ -52,12 +53,19 @@ class SequenceTracker:
         """The device says itself that it began anew: the datagram of this counter will follow without a gap."""
         if self._last is not None:
             self._errors["restart"] += 1
-            self._remember((sequence - 1) % self._modulus, self._last.unwrapped, first_time_ns, 0)
+            before = (sequence - 1) % self._modulus
+            self._remember(before, self._last.unwrapped, first_time_ns, 0, self._last.host_time_ns)
 
     def follow(
-        self, sequence: NDArray[np.integer], first_time_ns: Int64Array, pps_count: NDArray[np.integer]
+        self,
+        sequence: NDArray[np.integer],
+        first_time_ns: Int64Array,
+        pps_count: NDArray[np.integer],
+        host_time_ns: Int64Array,
     ) -> tuple[Int64Array, BoolArray]:
-        """Take consecutive datagrams, all arrays (n,); ``first_time_ns`` is the device time of their first pulse.
+        """Take consecutive datagrams, all arrays (n,).
+
+        Args: their numbers, device time of their first pulse, number of their latest edge, and when they came.
 
         Returns:
             unwrapped: (n,) int64, the counter without wraps, never used twice.
@@ -69,11 +77,11 @@ class SequenceTracker:
             start = 0 if self._last is None else self._last.unwrapped + 1
             offset = int(sequence[0]) if self._last is None else start
             unwrapped = offset + np.arange(len(sequence), dtype=np.int64)
-            self._remember(int(sequence[-1]), int(unwrapped[-1]), int(first_time_ns[-1]), int(pps_count[-1]))
+            ends = (array[-1] for array in (sequence, unwrapped, first_time_ns, pps_count, host_time_ns))
+            self._remember(*(int(end) for end in ends))
             return unwrapped, np.ones(len(sequence), dtype=np.bool_)
-        steps = [
-            self._step(*row) for row in zip(sequence.tolist(), first_time_ns.tolist(), pps_count.tolist(), strict=True)
-        ]
+        columns = (array.tolist() for array in (sequence, first_time_ns, pps_count, host_time_ns))
+        steps = [self._step(*row) for row in zip(*columns, strict=True)]
         return np.array([at for at, _ in steps], dtype=np.int64), np.array([new for _, new in steps], dtype=np.bool_)
 
     def _regular(
@@ -93,17 +101,21 @@ class SequenceTracker:
             and (pps_count[1:] >= pps_count[:-1]).all()
         )
 
-    def _step(self, sequence: int, first_time_ns: int, pps_count: int) -> tuple[int, bool]:
+    def _step(self, sequence: int, first_time_ns: int, pps_count: int, host_time_ns: int) -> tuple[int, bool]:
         """One datagram: its unwrapped number and whether it is a new one."""
         last = self._last
         if last is None:
-            return self._remember(sequence, sequence, first_time_ns, pps_count), True
+            return self._remember(sequence, sequence, first_time_ns, pps_count, host_time_ns), True
         ahead = (sequence - last.sequence - 1) % self._modulus
         behind = self._modulus - 1 - ahead
         if behind == 0 and first_time_ns == last.first_time_ns:
             self._errors["duplicate"] += 1
             return last.unwrapped, False
-        if 0 < behind <= LATE_DATAGRAMS and 0 < last.first_time_ns - first_time_ns < LATE_NS:
+        if (
+            0 < behind <= LATE_DATAGRAMS
+            and 0 < last.first_time_ns - first_time_ns < LATE_NS
+            and host_time_ns - last.host_time_ns < LATE_NS  # else it was switched off and on soon after its first pulse
+        ):
             return self._late(last.unwrapped - behind)
         set_anew = self._largest_gap is not None and ahead > self._largest_gap
         if pps_count < last.pps_count or first_time_ns < last.first_time_ns or set_anew:
@@ -118,7 +130,7 @@ class SequenceTracker:
         oldest = newest - LATE_DATAGRAMS
         self._missing = {at for at in self._missing if at >= oldest}
         self._missing.update(range(max(last.unwrapped + 1, oldest), newest))
-        return self._remember(sequence, newest, first_time_ns, pps_count), True
+        return self._remember(sequence, newest, first_time_ns, pps_count, host_time_ns), True
 
     def _late(self, at: int) -> tuple[int, bool]:
         """A datagram behind the newest: late, or come before."""
@@ -129,8 +141,8 @@ class SequenceTracker:
         self._errors["out_of_order"] += 1
         return at, True
 
-    def _remember(self, sequence: int, unwrapped: int, first_time_ns: int, pps_count: int) -> int:
-        self._last = _Last(sequence, unwrapped, first_time_ns, pps_count)
+    def _remember(self, sequence: int, unwrapped: int, first_time_ns: int, pps_count: int, host_time_ns: int) -> int:
+        self._last = _Last(sequence, unwrapped, first_time_ns, pps_count, host_time_ns)
         return unwrapped
 
 

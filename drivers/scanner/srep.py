@@ -147,8 +147,9 @@ class SrepParser(PacketParser):
         if not len(units):
             return []
         self.counters.messages["srep"] += len(units)
+        first_time_ns = nanoseconds(header["first_ticks"], header["tick_hz"])
         unwrapped, fresh = self._tracker.follow(
-            header["sequence"], nanoseconds(header["first_ticks"], header["tick_hz"]), header["pps_count"]
+            header["sequence"], first_time_ns, header["pps_count"], units.host_time_ns
         )
         keep = fresh & chosen
         if not keep.any():

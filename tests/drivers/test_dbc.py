@@ -22,6 +22,7 @@ from drivers.core.can_frames import (
 )
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser
 from drivers.core.registry import find_driver
+from drivers.imu.counters import CounterUnwrapper
 from drivers.imu.dbc import DbcParser, make_clock_parser
 from georef.records import ChunkBatch, DeviceClockSamples, Record, StructArray
 from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
@@ -213,6 +214,18 @@ def test_a_late_reader_is_no_restart() -> None:
     parser = make("last", "pps_ticks")
     _run(parser, [0, 5000, 10_000, 15_000], [0.0, 1.5, 1.5, 1.5])
     assert parser.counters.errors["restart"] == 0
+
+
+def test_a_fast_counter_that_may_have_wrapped_unseen_begins_anew() -> None:
+    """One stamp that is late by 40 ms, of a counter that wraps in 65: no whole wrap is made of it."""
+    unwrapper = CounterUnwrapper(16, 1e6)
+    ticks = np.arange(40, dtype=np.uint64) * 5000
+    host_ns = np.arange(40) * 5_000_000
+    host_ns[10:18] = 18 * 5_000_000  # read at once, after a stall
+    counts, restart = unwrapper.unwrap(ticks & np.uint64(0xFFFF), host_ns)
+    assert np.flatnonzero(restart).tolist() == [10]
+    assert set(np.diff(counts[10:]).tolist()) == set(np.diff(counts[:10]).tolist()) == {5000}
+    assert unwrapper.restarts == 1
 
 
 @pytest.mark.parametrize("rule", ["last", "first"])

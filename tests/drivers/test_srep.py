@@ -307,6 +307,21 @@ def test_restart_begins_a_segment_without_a_gap(cut: int) -> None:
     assert (rows["pulse_id"] >> np.uint64(16)).tolist() == list(range(900, 912))
 
 
+@pytest.mark.parametrize("before", [1, 2, 40, 64, 66])
+@pytest.mark.parametrize("off_s", [1.5, 10.0])
+def test_a_scanner_that_is_switched_off_and_on_soon_after_its_start_is_no_network_that_repeats(
+    before: int, off_s: float
+) -> None:
+    """Its second beginning has the numbers and the times of its first; only when they come is another."""
+    datagrams = [*(line(at, 1000 * at + 10) for at in range(before)), *(line(at, 1000 * at) for at in range(100))]
+    host_s = [*(at * 1e-4 for at in range(before)), *(off_s + at * 1e-4 for at in range(100))]
+    units = np.frombuffer(b"".join(datagrams), dtype=np.uint8).reshape(len(datagrams), -1)
+    parser = make_parser()
+    rows = returns_of(parser.feed_batch(ChunkBatch(SOURCE, np.rint(np.array(host_s) * 1e9).astype(np.int64), units)))
+    assert parser.counters.errors == {"restart": 1}
+    assert (rows["pulse_id"] >> np.uint64(16)).tolist() == list(range(before + 100))
+
+
 def test_layouts_of_equal_length_in_one_batch() -> None:
     """N = 2, R = 2 and N = 3, R = 1 are both 100 bytes; tick rates differ too."""
     other = encode_datagram(
