@@ -188,7 +188,9 @@ class UbxParser(StreamParser):
             return []
         self._leap_seconds = message.current
         tag = TimeTag(TimeScale.GPS, message.itow_ms * MS_NS, leap_seconds=message.current)
-        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, message="NAV-TIMELS")]
+        # its own flag is of the leap seconds alone
+        valid = self._vouched is not False
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-TIMELS")]
 
     def _nav_hpposllh(self, host_time_ns: int, frame: bytes) -> list[Record]:
         return self._add(host_time_ns, "NAV-HPPOSLLH", _checked(ubx.NAV_HPPOSLLH.decode(frame)))

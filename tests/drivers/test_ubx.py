@@ -344,6 +344,13 @@ def test_leap_seconds_come_from_valid_messages_only() -> None:
     ]
 
 
+def test_a_count_of_leap_seconds_that_holds_vouches_for_no_time() -> None:
+    timels = ubx.encode_nav_timels(ubx.NavTimels(NOON_MS, 0, 2, 18, 0, 0, 0, 0, 0, ubx.TIMELS_CURRENT))
+    unsure = pvt(NOON_MS, valid=ALL_VALID & ~ubx.PVT_FULLY_RESOLVED)
+    records, _ = parse(timels, unsure, timels, pvt(NOON_MS), timels)
+    assert [message.valid for message in times(records)] == [True, False, False, True, True]
+
+
 def test_leap_seconds_that_itow_and_utc_do_not_bear_out_are_not_passed_on() -> None:
     """The first NAV-PVT after an insertion comes before the first message with the new count."""
     late = pvt(NOON_MS + 1000, itow_ms=NOON_MS + 2000)  # UTC one second behind what 18 s would give
