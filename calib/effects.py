@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Tangent
+from georef.beams import SpinningGeometry
 from georef.calibration import INDEX, PARAMETERS
 from georef.records import Int64Array
 from georef.rotations import rot_from_quaternion
@@ -86,12 +87,14 @@ class SeenFrom:
         trajectories: of the body.
         flown: of each strip, the index of its trajectory.
         scan_rate: of each strip, |θ̇| in rad/s, typical; 0: not known.
+        rot_b_from_s: of each strip, (3, 3), how its scanner is mounted; directions of the scan are about its x axis.
     """
 
     frame: Tangent
     trajectories: Sequence[Trajectory]
     flown: Sequence[int]
     scan_rate: Sequence[float]
+    rot_b_from_s: Sequence[FloatArray]
 
     @classmethod
     def of(cls, flight: Flight) -> SeenFrom:
@@ -100,7 +103,12 @@ class SeenFrom:
             0.0 if swath.encoder_rate is None or not len(swath) else float(np.median(np.abs(swath.encoder_rate[::97])))
             for swath in flight.swaths
         ]
-        return cls(flight.frame, flight.trajectories, [swath.flown for swath in flight.swaths], rates)
+        mounted = [
+            # a head that spins has its own axis, and no angle that such a column is of
+            np.eye(3) if isinstance(head.geometry, SpinningGeometry) else head.start.installation_matrix
+            for head in (flight.heads[swath.head] for swath in flight.swaths)
+        ]
+        return cls(flight.frame, flight.trajectories, [swath.flown for swath in flight.swaths], rates, mounted)
 
 
 def effect_columns(
@@ -129,8 +137,10 @@ def effect_columns(
         arm = np.einsum("nji,nj->ni", rot_t_from_b, arm_t)  # forward, right, down
         velocity = np.einsum("nji,nj->ni", rot_t_from_b, poses.velocity_e @ seen.frame.rot_t_from_e.T)
         turning = velocity + np.cross(poses.rate_eb_b, arm)
-        by_angle = np.stack([np.zeros(len(arm)), arm[:, 2], -arm[:, 1]], axis=1)
-        angle = np.arctan2(arm[:, 1], arm[:, 2])[:, np.newaxis]
+        arm_s = arm @ seen.rot_b_from_s[number]
+        by_angle_s = np.stack([np.zeros(len(arm)), arm_s[:, 2], -arm_s[:, 1]], axis=1)
+        by_angle = by_angle_s @ seen.rot_b_from_s[number].T
+        angle = np.arctan2(arm_s[:, 1], arm_s[:, 2])[:, np.newaxis]
         in_b = np.stack(
             [
                 np.cross([1.0, 0.0, 0.0], arm),

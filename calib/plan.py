@@ -241,6 +241,9 @@ def _crossings(
     count = int((line.end_ns - line.begin_ns) // _COARSE_NS) + 2
     grid = line.begin_ns + np.rint(np.linspace(0, line.end_ns - line.begin_ns, count)).astype(np.int64)
     origin_e, ahead_e = _plane_of_scan(trajectory, calibration, grid)
+    # a scanner that looks back has its axis against the flight
+    forward = -1.0 if ahead_e.mean(axis=0) @ (origin_e[-1] - origin_e[0]) < 0.0 else 1.0
+    ahead_e *= forward
     ahead = points_e @ ahead_e.T - np.sum(origin_e * ahead_e, axis=1)
     passed = (ahead[:, :-1] > 0.0) & (ahead[:, 1:] <= 0.0)
     crossed = np.asarray(passed.any(axis=1), dtype=np.bool_)
@@ -250,7 +253,7 @@ def _crossings(
     for _ in range(_STEPS):
         since = low + (high - low) * before / (before - behind)
         origin_e, ahead_e = _plane_of_scan(trajectory, calibration, grid[step] + np.rint(since).astype(np.int64))
-        found = np.sum((points_e[at] - origin_e) * ahead_e, axis=1)
+        found = forward * np.sum((points_e[at] - origin_e) * ahead_e, axis=1)
         front = found > 0.0
         before, behind = np.where(front, found, 0.5 * before), np.where(front, 0.5 * behind, found)
         low, high = np.where(front, since, low), np.where(front, high, since)

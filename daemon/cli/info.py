@@ -95,7 +95,10 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
-    else:
+    untold = [source for source, values in numbers["sources"].items() if not values["told"]]
+    if untold:
+        console.print(f"no status of {_plain(', '.join(untold))}: what was lost is not known", highlight=False)
+    if not unaccounted and len(untold) < max(1, len(numbers["sources"])):
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
     for event in numbers["marks"]:
         told = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"
@@ -130,7 +133,7 @@ def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
         rate,
         str(values["gaps"]),
         f"{values['longest_gap_s']:.2f} s",
-        losses if losses == "0/0/0" else f"[red]{losses}[/]",
+        ("" if not values["told"] else losses) if losses == "0/0/0" else f"[red]{losses}[/]",
         _time(values),
     )
 

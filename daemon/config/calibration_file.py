@@ -5,6 +5,7 @@ The full model is read by calib; the recorder only keeps a copy, and refuses to 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def check_calibration(path: Path, scanner: str, table: ScannerConfig) -> Iterato
     yield from _check_header(header, scanner, table)
     for key in NEEDED_PARAMETERS:
         value = parameters.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             yield f"parameters.{key}: {'missing' if value is None else 'not a number'}; want a number"
 
 

@@ -165,6 +165,9 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
             yield f'{section}.transport: got "{table.transport}", want the name of a [gnss.<name>]; there are: {known}'
         elif spec.kind not in driver.transports:
             yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
+        elif spec.kind == "gnss" and config.gnss[spec.address].protocol != table.protocol:
+            theirs = config.gnss[spec.address].protocol
+            yield f'{section}.protocol: got "{table.protocol}", want "{theirs}" as of [gnss.{spec.address}], which it is in'
     if isinstance(table, ScannerConfig) and table.auxiliary:
         try:
             auxiliary = parse_transport(table.auxiliary)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import json
 from collections.abc import Mapping, Sequence
@@ -31,6 +32,8 @@ _TYPE_WANTED = {
     "dict_type": "a table",
     "model_type": "a table",
     "finite_number": "a finite number",
+    "date_type": "a date without quotes, 2025-01-31",
+    "date_from_datetime_inexact": "a date without a time, 2025-01-31",
 }
 _BOUND_SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
 
@@ -52,7 +55,7 @@ def load_config(path: str | Path) -> Config:
     if len(content) > MAX_CONFIG_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_CONFIG_BYTES} bytes; want a TOML file of keys")
     try:
-        text = content.decode("utf-8")
+        text = content.removeprefix(codecs.BOM_UTF8).decode("utf-8")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise ConfigError(f"{file}: line {line}: not UTF-8 text; want a TOML file") from error
@@ -136,7 +139,11 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
     if kind in ("too_short", "too_long") and kind == "too_short" and context.get("min_length") == 1:
         return "at least one"
     if kind in ("too_short", "too_long"):
-        return f"{context.get('min_length', context.get('max_length'))} of them"
+        # lists of numbers and of names have one length, those of tables a greatest
+        at_most = "at most " if kind == "too_long" and field is not None and _model_in(field.annotation) else ""
+        return f"{at_most}{context.get('min_length', context.get('max_length'))} of them"
+    if kind == "string_too_long":
+        return f"at most {context['max_length']} characters"
     if kind == "string_too_short":
         return "text that is not empty"
     if kind == "string_pattern_mismatch":

@@ -227,7 +227,9 @@ class GimbalStage(Section):
 class GimbalConfig(Section):
     """``[scanner.<name>.gimbal]``: a stabilised or pointed mount."""
 
-    stages: list[GimbalStage] = Field(min_length=1, max_length=4, description="outermost first")
+    stages: list[GimbalStage] = Field(
+        default_factory=list, max_length=4, description="at most 4, outermost first; none: a rigid mount"
+    )
 
 
 class ScannerConfig(Section):

@@ -170,7 +170,9 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
         return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
 
     flown = [_flown(look, number, trajectories) for number in range(len(look.names))]
-    return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names)), place
+    # the files' directions are to the body's right and left, whatever the mounting
+    mounted = [np.eye(3)] * len(look.names)
+    return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names), mounted), place
 
 
 def _mapping_of(crs: dict[str, Any]) -> Mapping:

@@ -174,6 +174,10 @@ def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[
         if not isinstance(value, list | tuple) or len(value) != 3:
             raise DriverSettingsError(f"signals.{key} must name three signals, x, y and z, as MESSAGE.signal")
         found[key] = [find_signal(database, str(path), file_name) for path in value]
+    axes = [str(path) for key in VECTORS for path in names[key]]
+    twice = next((path for path in axes if axes.count(path) > 1), None)
+    if twice is not None:
+        raise DriverSettingsError(f"signals: {twice} is named for two axes; want another signal for each")
     for key in SCALARS:
         if key in names:
             found[key] = [find_signal(database, str(names[key]), file_name)]

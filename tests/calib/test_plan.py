@@ -36,13 +36,16 @@ FloatArray = NDArray[np.float64]
 DEG = float(np.radians(1.0))
 
 
-def test_returns_lie_on_the_planes() -> None:
+@pytest.mark.parametrize("looks", ["ahead", "back"])
+def test_returns_lie_on_the_planes(looks: str) -> None:
     """With a boresight, an offset and scales: within a micrometre of where they were aimed, within the scan."""
     values = {
         "omega_rad": 0.3 * DEG, "phi_rad": -0.5 * DEG, "kappa_rad": 0.8 * DEG, "range_offset_m": 0.4,
         "range_scale": 3e-5, "scan_angle_scale": 2e-4, "scan_angle_offset_rad": 0.1 * DEG, "time_offset_s": 2e-3,
     }  # fmt: skip
     head, (trajectory, lines) = scanner("left", **values), path(ONE_HEIGHT)
+    if looks == "back":
+        head = replace(head, start=replace(head.start, installation_matrix=np.diag([-1.0, -1.0, 1.0])))
     pieces = surfaces()
     flight, features = planned(FRAME, [head], [Scan(20.0 * DEG, 1e5)], [trajectory], lines, pieces)
     normals_t = {piece.name: piece.normal_t for piece in pieces}
@@ -52,6 +55,7 @@ def test_returns_lie_on_the_planes() -> None:
         np.testing.assert_allclose(flight.place(swath, head.start), swath.points_t, atol=1e-6)
         angle = flight.rays(swath, head.start).angle_rad
         assert np.abs(angle).max() < 20.001 * DEG
+    assert len(flight.swaths) == len(lines)
     for plane in features.planes:
         assert len(plane.patches) > 1
         for patch in plane.patches:

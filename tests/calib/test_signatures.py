@@ -18,6 +18,7 @@ from calib.strips import differences
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
 from georef.jacobian import parameter_columns_e
+from georef.rotations import rot_x
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -44,8 +45,32 @@ def wrong(made: Cast, **values: float) -> Flight:
     return made.flight.placed({"left": made.truth.changed(**values)})
 
 
-def test_columns_are_those_of_the_sensor_model(made: Cast) -> None:
-    flight = made.flight
+def mounted(flight: Flight, rot_b_from_s: FloatArray, offset_rad: float) -> Flight:
+    """The same returns seen by a head that is mounted otherwise."""
+    turn = rot_b_from_s[1, 1] / abs(rot_b_from_s[1, 1])
+    (head,) = flight.heads
+    start = replace(head.start, installation_matrix=rot_b_from_s)
+    swaths = []
+    for swath in flight.swaths:
+        rows = swath.rows.copy()
+        rows["encoder_rad"] = turn * rows["encoder_rad"] + offset_rad
+        rate = None if swath.encoder_rate is None else turn * swath.encoder_rate
+        swaths.append(replace(swath, rows=rows, encoder_rate=rate))
+    again = replace(flight, heads=(replace(head, start=start),), swaths=tuple(swaths)).placed({"left": start})
+    assert again.swaths[1].points_t == pytest.approx(flight.swaths[1].points_t, abs=1e-6, nan_ok=True)
+    return again
+
+
+MOUNTINGS = {
+    "ahead": (np.eye(3), 0.0),
+    "back": (np.diag([-1.0, -1.0, 1.0]), 0.0),
+    "oblique": (rot_x(math.radians(20.0)), math.radians(20.0)),
+}
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_columns_are_those_of_the_sensor_model(made: Cast, mounting: str) -> None:
+    flight = mounted(made.flight, *MOUNTINGS[mounting])
     swath, head = flight.swaths[2], flight.heads[0]
     at = np.arange(100, len(swath), 5000)
     rays = flight.rays(swath, head.start, at)
@@ -57,8 +82,9 @@ def test_columns_are_those_of_the_sensor_model(made: Cast) -> None:
     by_model = {"roll": 0, "pitch": 1, "heading": 2, "torsion": 6, "time": 11, "range": 3}
     for name, column in by_model.items():
         assert columns[:, NAMES.index(name)] == pytest.approx(from_model[:, column], rel=2e-3, abs=0.2)
-    latency = 7.0 * columns[:, NAMES.index("roll")]  # θ̇ τ moves a beam as a roll of −θ̇ τ does
-    assert columns[:, NAMES.index("scan direction")] == pytest.approx(-latency, rel=1e-2, abs=30.0)
+    # θ̇ τ moves a beam as a roll of −θ̇ τ does, of a head that looks ahead
+    latency = -7.0 * math.copysign(1.0, head.start.installation_matrix[0, 0]) * columns[:, NAMES.index("roll")]
+    assert columns[:, NAMES.index("scan direction")] == pytest.approx(latency, rel=1e-2, abs=30.0)
     assert errors[:, 3:] == pytest.approx(columns[:, :3])
     assert errors[:, :3] == pytest.approx(np.broadcast_to(np.eye(3), errors[:, :3].shape))
 
@@ -87,6 +113,16 @@ def test_a_true_calibration_shows_nothing(made: Cast) -> None:
     assert levels["scan direction"] == "not told"
     assert whole.variance_factor == pytest.approx(0.93, abs=0.1)  # Huber's weights take from the tails
     assert whole.left_rms_m == pytest.approx(whole.rms_m, rel=0.01)
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_torsion_is_told_from_roll_however_the_head_is_mounted(made: Cast, mounting: str) -> None:
+    flight = mounted(made.flight, *MOUNTINGS[mounting])
+    start = flight.heads[0].start
+    found = found_in(flight.placed({"left": start.changed(scan_angle_scale=1e-3)}))
+    assert found["torsion"].value == pytest.approx(-1e-3, abs=3.5 * found["torsion"].sigma)
+    assert found["torsion"].level == "significant"
+    assert found["roll"].level in ("none", "not told", "small"), found["roll"].words
 
 
 @pytest.mark.parametrize(

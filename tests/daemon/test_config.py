@@ -20,6 +20,7 @@ from daemon.config.checks import rotation_problem, same_wire
 from daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
 from daemon.errors import ConfigError, ExitCode, UserError
 from daemon.log_parsers import stored_parsers
+from daemon.processing.models import mount_of
 from drivers.core.registry import all_drivers
 from drivers.transports.uri import parse_transport
 
@@ -52,6 +53,15 @@ def with_session(text: str) -> str:
 
 
 class TestWholeFile:
+    def test_an_empty_gimbal_is_a_rigid_mount_and_a_byte_order_mark_no_part_of_the_text(self, tmp_path: Path) -> None:
+        text = with_session(
+            '[scanner.left]\ntransport = "udp:0.0.0.0:2368"\nprotocol = "srep"\nmirror_factor = 1.0\n'
+            "[scanner.left.gimbal]\n"
+        )
+        (tmp_path / "windows.toml").write_text(text, encoding="utf-8-sig")
+        config = load_config(tmp_path / "windows.toml")
+        assert mount_of(config.scanner["left"].gimbal).stages == ()
+
     def test_the_example_is_valid_and_keeps_its_values(self) -> None:
         config = load_config(AIRCRAFT)
         assert config.session.name == "thurgau-north"

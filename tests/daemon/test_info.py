@@ -108,7 +108,7 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
 
     lost = {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0}
     source: dict[str, object] = {"units": 1_234_567, "bytes": 1, "rate_hz": 20000.0, "gaps": 0, "longest_gap_s": 0.0}
-    source |= {"lost": lost, "account_errors": 0, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
+    source |= {"lost": lost, "account_errors": 0, "told": True, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
     source |= {"trouble": {"bus_off": 2, "error_frames": 1_500}}
     numbers: dict[str, object] = {
         "missing_parts": [],
