@@ -30,6 +30,7 @@ FEET = 1.0 / 0.3048
 OUTSIDE_M = 30.0
 THINNED_TO = 20_000  # returns of a swath that say where it is
 SURE_SIGMAS = 5.0
+SWATHS_APART = 0.5  # of what the slopes say: swaths that differ by more say nothing of control
 GEOIDS = ((3855, "EGM2008"), (5773, "EGM96"))
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
@@ -169,9 +170,10 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
     numbers = sorted({one.point for one in grounds})
     if len(numbers) < FEWEST_FOR_SHIFT:
         return ()
-    rows, above = [], []
+    rows, above, apart = [], [], []
     for number in numbers:
         own = [one for one in grounds if one.point == number]
+        apart += [one.above_m - own[0].above_m for one in own[1:]]
         normal = np.mean([one.plane.normal_t for one in own], axis=0)
         rows.append([normal[0] / normal[2], normal[1] / normal[2], 1.0])
         above.append(np.median([one.above_m for one in own]))
@@ -185,6 +187,8 @@ def _shift(points: Sequence[ControlPoint], grounds: Sequence[Ground]) -> tuple[D
     left, before = _middle(heights - design @ solution)[1], _middle(heights)[1]
     if not size > SURE_SIGMAS * sigma_m or left > 0.7 * before:
         return ()
+    if apart and np.median(np.abs(apart)) > SWATHS_APART * np.median(np.abs(heights - np.median(heights))):
+        return ()  # a boresight that is wrong moves each swath its own way, another datum moves control alone
     way = COMPASS[round(math.degrees(math.atan2(shift[0], shift[1])) / 45.0) % 8]
     text = (
         f"control lies {size:.2f} m (± {sigma_m:.2f} m) to the {way} of where the laser sees the same slopes, as "

@@ -54,7 +54,7 @@ def _header(plan: Plan, scanner: str, table: ScannerTable, which: str) -> dict[s
         "scanner_model": table.model,
         "scanner_serial": table.serial,
         "imu_serial": "",
-        "installation": f"virtual/{scanner}",
+        "installation": f"virtual/{flight.name}",
         "installation_matrix": table.installation,
         "mirror_factor": mirror_factor(table),
         "ranges": air.ranges,

@@ -238,6 +238,15 @@ def test_another_datum_is_found_by_the_slopes() -> None:
     assert found == pytest.approx(0.9 * np.sqrt(2.0), abs=0.2)
 
 
+def test_swaths_that_disagree_say_nothing_of_a_datum() -> None:
+    """What a boresight that is wrong does: each swath beside its place, and their middle too."""
+    points = surveyed(np.zeros(1), np.zeros(3), count=30)
+    beside = surface_flight(
+        [lambda east, north: rolling(east + 2.5, north + 2.5), lambda east, north: rolling(east - 0.7, north - 0.7)]
+    )
+    assert not any(doubt.kind == "shift" for doubt in doubts(beside, points, undulation=unknown))
+
+
 def test_on_level_ground_no_shift_is_claimed() -> None:
     level = surface_flight([lambda east, north: 0.0 * east])
     places = np.random.default_rng(2).uniform(-50.0, 50.0, (20, 2))
