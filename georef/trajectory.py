@@ -316,16 +316,18 @@ class Trajectory:
     def at_body(self, offset_b: ArrayLike) -> Trajectory:
         """Brought to the body's origin from a point (antenna, scanner) at offset_b (3,) from it, m in b.
 
-        The velocity loses what the turn gives that point; the sigmas stay.
+        The velocity loses what the turn gives that point, by the turn over the intervals beside an epoch, gaps aside;
+        an epoch alone keeps its own. The sigmas stay.
         """
         self.require_attitude()
         offset = np.asarray(offset_b, dtype=np.float64)
+        near = np.diff(self.time_ns) <= self.max_gap_ns
+        counted = np.r_[0, near] + np.r_[near, 0]
         rate = np.zeros((len(self), 3))
-        if len(self) > 1:
-            of_intervals = self.turn_rates_b()
-            rate[:-1] += of_intervals / 2
-            rate[1:] += of_intervals / 2
-            rate[[0, -1]] = of_intervals[[0, -1]]
+        of_intervals = self.turn_rates_b() * near[:, np.newaxis]
+        rate[:-1] += of_intervals
+        rate[1:] += of_intervals
+        rate /= np.maximum(counted, 1)[:, np.newaxis]
         return self._with(
             position_e=self.position_e - rotated(self.q_e_from_b, np.broadcast_to(offset, rate.shape)),
             velocity_e=self.velocity_e - rotated(self.q_e_from_b, np.cross(rate, offset)),

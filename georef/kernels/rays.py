@@ -287,6 +287,7 @@ def cast(
     begun, ended, per_turn_ns, turn_fate, turning, turn, phi, phi2, arms = turn_at(model, time_ns[0] + turn_ns, FIRST)
     level = level_at(track, turning)
     block = new_block()
+    with_axes = axes is not None
     if doubt is not None:
         interval, doubted = interval_at(doubt.flown, at), at
     if scanning.select == ONE:
@@ -323,14 +324,15 @@ def cast(
         factors(block, n, phi2)
         to_e(block, n, (place, way), (turn, phi), arms, mounted.shifted)
         hand_out(block, n, here, level, out)
-        if axes is not None:
-            turn_axes(block, n, k, scanning.kind, mounted, True)
-            fill_axes(block, n, k, track, axes, turning, at, phi2)
         if doubt is not None:
-            turn_axes(block, n, k, scanning.kind, mounted, not doubt.known.along_only)
+            turn_axes(block, n, k, scanning.kind, mounted, with_axes or not doubt.known.along_only)
             if at != doubted:
                 interval, doubted = interval_at(doubt.flown, at), at
             if not doubt.known.along_only:
                 take_readings(block, n, part, scanning, rate[here], acceleration[here])
             fill_covariance(block, n, k, part, track, turning, interval, doubt)
+        if axes is not None:
+            if doubt is None:
+                turn_axes(block, n, k, scanning.kind, mounted, True)
+            fill_axes(block, n, k, track, axes, turning, at, phi2)  # last: it works on the block's own rows
         k += n

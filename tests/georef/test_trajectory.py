@@ -315,6 +315,18 @@ def test_velocity_of_the_body_is_not_the_antennas_in_a_turn() -> None:
     antenna = wild(n, time_ns=times, velocity_l=speed, heading_rad=heading, **still, **level)
     np.testing.assert_allclose(antenna.velocity_l()[100], [0, 0.2, 0], atol=1e-12)
     np.testing.assert_allclose(antenna.at_body([2.0, 0, 0]).velocity_l(), 0, atol=1e-6)
+    # the turn over a gap is no turn rate of the epochs beside it
+    kept = np.r_[0:80, 150:n]
+    gap = wild(
+        len(kept),
+        time_ns=times[kept],
+        velocity_l=speed[kept],
+        heading_rad=np.where(kept < 100, heading[kept], heading[kept] + 1.0),
+        max_gap_ns=10 * MS,
+        **{key: values[kept] for key, values in (still | level).items()},
+    )
+    turned = np.linalg.norm(gap.velocity_e - gap.at_body([2.0, 0, 0]).velocity_e, axis=1)
+    np.testing.assert_allclose(turned, 0.2, atol=1e-6)
 
 
 def test_deflection_tilts_the_attitude_as_the_formula_sheet_says() -> None:

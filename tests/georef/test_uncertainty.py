@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from georef.beams import LineGeometry
 from georef.calibration import PARAMETERS, Calibration, nominal
+from georef.jacobian import observation_columns_e, parameter_columns_e
+from georef.mount import Mount, Stage
+from georef.points import Fate
 from georef.records import RETURN_DTYPE
 from georef.sensor_model import SensorModel
 from georef.trajectory import Trajectory
@@ -193,6 +196,32 @@ def test_every_element_agrees_with_draws_of_all_inputs() -> None:
         sigma = np.sqrt(np.diag(predicted))
         worst = max(worst, np.abs((sample - predicted) / np.outer(sigma, sigma)).max())
     assert worst < 0.04
+
+
+@pytest.mark.parametrize("stages", [0, 1])
+def test_covariances_and_axes_asked_together_are_those_asked_alone(stages: int) -> None:
+    rng = np.random.default_rng(5)
+    geometry = random_geometry(rng, random_correlation(rng))
+    count = 300  # more than a block of the kernel
+    rows = np.zeros(count, RETURN_DTYPE)
+    rows["range_m"], rows["encoder_rad"] = rng.uniform(300.0, 2000.0, count), rng.uniform(-0.6, 0.6, count)
+    rows["return_number"] = rows["number_of_returns"] = 1
+    mount = Mount((Stage(np.array([0.1, -0.05, 0.3]), np.array([0.2, 0.1, 0.3])),) * stages)
+    model = SensorModel(geometry.calibration, LineGeometry(), mount=mount)
+    given = (rows, START_NS + rng.integers(1_400_000, 1_600_000, count), geometry.trajectory())
+    motion = {"encoder_rate": np.full(count, 40.0), "encoder_acceleration": np.full(count, -2000.0)}
+    uncertainty = Uncertainty(geometry.calibration, NOISE)
+    both = model.rays(*given, **motion, uncertainty=uncertainty, with_axes=True)
+    with_axes = model.rays(*given, **motion, with_axes=True)
+    with_covariances = model.rays(*given, **motion, uncertainty=uncertainty)
+    assert with_covariances.covariance_e is not None
+    assert both.covariance_e is not None
+    assert (both.fate == Fate.GEOREFERENCED).all()
+    np.testing.assert_array_equal(both.covariance_e, with_covariances.covariance_e)
+    for columns_e in (parameter_columns_e, observation_columns_e):
+        alone = columns_e(with_axes, model, given[2])
+        assert np.isfinite(alone).all()
+        np.testing.assert_array_equal(columns_e(both, model, given[2]), alone)
 
 
 def level(calibration: Calibration) -> Geometry:
