@@ -132,9 +132,11 @@ def adjust_strips(
         row_weight: (n,) of the rows on planes, in the order of `calib.rows`, as the calibration left them; None: 1.
 
     Raises:
-        StripError: an unknown model or criterion; `FlightError`: there is no strip.
+        StripError: an unknown model or criterion, or features that hold no observation; `FlightError`: there is no strip.
     """
     _check(settings)
+    if not features.ties and not any(plane.points for plane in features.planes):
+        raise StripError("no planes or ties that several strips see: nothing says how to correct them")
     knots = knots_of(flight, settings.knot_s)
     free = TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, np.eye(ERRORS * len(knots)))
     case = _Equations(flight, features, calibrations, free, settings, row_weight)

@@ -55,6 +55,11 @@ def off_planes(flight: Flight, features: Features, strip: int) -> float:
     return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
 
+def test_without_features_nothing_is_adjusted(clean: tuple[Flight, Features]) -> None:
+    with pytest.raises(StripError, match="no planes or ties that several strips see"):
+        adjusted(clean[0], Features(()))
+
+
 def test_a_sound_flight_gets_no_corrections(clean: tuple[Flight, Features]) -> None:
     """And its misclosures are as large as its noise."""
     flight, features = clean
