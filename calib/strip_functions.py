@@ -132,7 +132,7 @@ def adjust_strips(
         row_weight: (n,) of the rows on planes, in the order of `calib.rows`, as the calibration left them; None: 1.
 
     Raises:
-        StripError: an unknown model or criterion, or features that hold no observation; `FlightError`: there is no strip.
+        StripError: an unknown model or criterion, or no features; `FlightError`: there is no strip.
     """
     _check(settings)
     if not features.ties and not any(plane.points for plane in features.planes):

@@ -103,6 +103,7 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
     yield from _check_rotations(section, table)
     if isinstance(table, ScannerConfig):
         yield from _check_calibration(config, name, table)
+        yield from _check_gimbal(config, name, table)
     try:
         driver = find_driver(kind, table.protocol)
     except UnknownProtocolError as error:
@@ -166,8 +167,8 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
         elif spec.kind not in driver.transports:
             yield f'{section}.transport: got "{table.transport}"; {driver.protocol} comes by: {allowed}'
         elif spec.kind == "gnss" and config.gnss[spec.address].protocol != table.protocol:
-            theirs = config.gnss[spec.address].protocol
-            yield f'{section}.protocol: got "{table.protocol}", want "{theirs}" as of [gnss.{spec.address}], which it is in'
+            wanted = f'"{config.gnss[spec.address].protocol}" as of [gnss.{spec.address}], whose stream it is in'
+            yield f'{section}.protocol: got "{table.protocol}", want {wanted}'
     if isinstance(table, ScannerConfig) and table.auxiliary:
         try:
             auxiliary = parse_transport(table.auxiliary)
@@ -200,6 +201,15 @@ def rotation_problem(rows: list[list[float]]) -> str | None:
     if np.linalg.det(matrix) < 0.0:
         return "not a rotation but a mirroring (determinant -1): turn the sign of one axis"
     return None
+
+
+def _check_gimbal(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:
+    """Who tells a stage's angles must be there; whether it can, is seen when they are used."""
+    sources = [f"gnss/{one}" for one in config.gnss] + [f"imu/{one}" for one in config.imu]
+    for number, stage in enumerate(table.gimbal.stages if table.gimbal is not None else []):
+        if stage.source is not None and stage.source not in sources:
+            key = f"scanner.{name}.gimbal.stages[{number}].source"
+            yield f'{key}: got "{stage.source}", want one of: {", ".join(sources) or "none is configured"}'
 
 
 def _check_calibration(config: Config, name: str, table: ScannerConfig) -> Iterator[str]:

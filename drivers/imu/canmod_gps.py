@@ -101,11 +101,12 @@ class CanmodGpsParser(DbcParser):
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
         """Args: the device's table; ``time_only``: give time messages only, for the recorder."""
         contents = settings.files.get("dbc") or DBC_PATH.read_bytes()
-        config: dict[str, Any] = {**settings.config, "signals": IMU_SIGNALS, "dbc": DBC_PATH.name}
+        file_name = str(settings.config.get("dbc") or DBC_PATH.name)
+        config: dict[str, Any] = {**settings.config, "signals": IMU_SIGNALS, "dbc": file_name}
         super().__init__(DeviceSettings(settings.source, config, {"dbc": contents}))
         database = load_database(contents)
-        self._imu_valid = find_signal(database, IMU_VALID, DBC_PATH.name)
-        self._gnss = {name: _gnss_message(database, name) for name in GNSS_SIGNALS}
+        self._imu_valid = find_signal(database, IMU_VALID, file_name)
+        self._gnss = {name: _gnss_message(database, name, file_name) for name in GNSS_SIGNALS}
         self._time_only = time_only
         self._time: TimeTag | None = None
         self._status: dict[str, float] = {}
@@ -189,9 +190,9 @@ class CanmodGpsParser(DbcParser):
         )
 
 
-def _gnss_message(database: Any, name: str) -> GnssMessage:
+def _gnss_message(database: Any, name: str, file_name: str) -> GnssMessage:
     """Layouts of one GNSS message."""
-    found = {key: find_signal(database, f"{name}.{key}", DBC_PATH.name) for key in GNSS_SIGNALS[name]}
+    found = {key: find_signal(database, f"{name}.{key}", file_name) for key in GNSS_SIGNALS[name]}
     layouts = {key: signal.layout for key, signal in found.items()}
     needs = max(layout.needs_bytes for layout in layouts.values())
     return GnssMessage(next(iter(found.values())).can_id, needs, layouts)

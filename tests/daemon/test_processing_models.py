@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from daemon.config import Config
 from daemon.config.tables import GimbalConfig, ScannerConfig
+from daemon.errors import ConfigError
 from daemon.processing.models import (
     connect,
     geometry_of,
@@ -93,11 +94,16 @@ def test_sources_of_gimbals(tmp_path: Path) -> None:
     assert list(gimbal_sources(logged(tmp_path / "logged", "gnss/rover"), "left")) == [(0, "gnss/rover")]
 
 
-@pytest.mark.parametrize("source", ["imu/main", "imu/nobody", "scanner/left"])
-def test_a_source_without_an_ins_is_refused_in_one_line(tmp_path: Path, source: str) -> None:
-    with pytest.raises(ValueError, match=f'^gimbal.stages.0..source: "{source}" tells no angles') as caught:
-        georeferencer(logged(tmp_path, source), "srep")
+def test_a_source_without_an_ins_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r'^gimbal.stages.0..source: "imu/main" tells no angles') as caught:
+        georeferencer(logged(tmp_path, "imu/main"), "srep")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("source", ["imu/nobody", "scanner/left"])
+def test_a_source_that_is_not_configured_is_refused_before_the_flight(tmp_path: Path, source: str) -> None:
+    with pytest.raises(ConfigError, match=f'gimbal.stages.0..source: got "{source}", want one of: gnss/rover, imu/ma'):
+        logged(tmp_path, source)
 
 
 def test_who_cannot_wait_for_logged_angles_says_so(tmp_path: Path) -> None:
