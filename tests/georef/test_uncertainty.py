@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ def test_covariances_and_axes_asked_together_are_those_asked_alone(stages: int) 
     mount = Mount((Stage(np.array([0.1, -0.05, 0.3]), np.array([0.2, 0.1, 0.3])),) * stages)
     model = SensorModel(geometry.calibration, LineGeometry(), mount=mount)
     given = (rows, START_NS + rng.integers(1_400_000, 1_600_000, count), geometry.trajectory())
-    motion = {"encoder_rate": np.full(count, 40.0), "encoder_acceleration": np.full(count, -2000.0)}
+    motion: dict[str, Any] = {"encoder_rate": np.full(count, 40.0), "encoder_acceleration": np.full(count, -2000.0)}
     uncertainty = Uncertainty(geometry.calibration, NOISE)
     both = model.rays(*given, **motion, uncertainty=uncertainty, with_axes=True)
     with_axes = model.rays(*given, **motion, with_axes=True)
