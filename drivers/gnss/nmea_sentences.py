@@ -22,6 +22,7 @@ MPS_PER_KMPH = 1.0 / 3.6
 
 TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d*))?")
 NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d*)?|\.\d+)")
+DEGREES_MINUTES = re.compile(r"(\d{1,3})([0-5]\d(?:\.\d*)?)")
 DATE_DDMMYY = re.compile(r"\d{6}")
 
 
@@ -76,13 +77,17 @@ class Sentence:
             return None
         if self.text("lat_dir") not in ("N", "S") or self.text("lon_dir") not in ("E", "W"):
             raise FieldError("hemisphere")
-        try:
-            latitude, longitude = float(self._message.latitude), float(self._message.longitude)
-        except ValueError as error:
-            raise FieldError(str(error)) from None
-        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-            raise FieldError(f"position {latitude} {longitude}")
-        return math.radians(latitude), math.radians(longitude)
+        latitude, longitude = self._degrees("lat", 90.0), self._degrees("lon", 180.0)
+        south, west = self.text("lat_dir") == "S", self.text("lon_dir") == "W"
+        return math.radians(-latitude if south else latitude), math.radians(-longitude if west else longitude)
+
+    def _degrees(self, name: str, most: float) -> float:
+        """Of degrees and minutes; point and digits behind it may be missing (NMEA 0183)."""
+        text = self.text(name)
+        match = DEGREES_MINUTES.fullmatch(text)
+        if match is None or (degrees := float(match[1]) + float(match[2]) / 60.0) > most:
+            raise FieldError(f"{name} {text!r}")
+        return degrees
 
     def date_ddmmyy(self) -> dt.date | None:
         """RMC's date; two digits of the year are 1980 to 2079."""

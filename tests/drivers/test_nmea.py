@@ -213,13 +213,31 @@ def test_times_that_cannot_be_are_bad_messages(time: str) -> None:
         "GPRMC,120000.00,A,4700.0,X,00830.0,E,1.0,2.0,211126,,,A",
         "GPGGA,120000.00,9100.0,N,00830.0,E,1,08,1.0,400.0,M,47.0,M,,",
         "GPGGA,120000.00,4700.0,N,00830.0,E,1,08,1.0,nan,M,47.0,M,,",
-        "GPGGA,120000.00,4700,N,00830.0,E,1,08,1.0,400.0,M,47.0,M,,",
+        "GPGGA,120000.00,4760.0,N,00830.0,E,1,08,1.0,400.0,M,47.0,M,,",
+        "GPGGA,120000.00,47,N,00830.0,E,1,08,1.0,400.0,M,47.0,M,,",
         "GPGST,120000.00,,,,,1e999,1.0,1.0",
     ],
 )
 def test_fields_that_cannot_be_are_bad_messages(body: str) -> None:
     records, parser = parse(nmea.encode_sentence(body))
     assert (of_type(records, GnssFix), parser.counters.bad_messages) == ([], 1)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "degrees"),
+    [
+        ("4730", "00845", (47.5, 8.75)),
+        ("4730.", "00845.", (47.5, 8.75)),
+        ("4759.9999999", "17959.9999999", (48.0, 180.0)),
+        ("9000.0", "18000.0", (90.0, 180.0)),
+    ],
+)
+def test_digits_behind_the_point_may_be_missing(latitude: str, longitude: str, degrees: tuple[float, float]) -> None:
+    body = f"GPGGA,120000.00,{latitude},S,{longitude},W,1,08,1.0,500.0,M,48.0,M,,"
+    (fix,) = fixes(parse(nmea.encode_sentence(body))[0])
+    assert fix.lat_rad is not None
+    assert fix.lon_rad is not None
+    assert (-np.degrees(fix.lat_rad), -np.degrees(fix.lon_rad)) == pytest.approx(degrees, abs=1e-8)
 
 
 def test_no_fix_is_normal() -> None:
