@@ -164,11 +164,9 @@ def adjust_strips(
 
 
 def _check(settings: Settings) -> None:
-    if not settings.models:
-        raise StripError(f"strip model: got none at all, want some of {', '.join(MODELS)}")
-    for model in settings.models:
-        if model not in MODELS:
-            raise StripError(f"strip model: got {model!r}, want some of {', '.join(MODELS)}")
+    wrong = [repr(model) for model in settings.models if model not in MODELS]
+    if wrong or not settings.models:
+        raise StripError(f"strip model: got {', '.join(wrong) or 'none at all'}, want some of {', '.join(MODELS)}")
     if settings.criterion not in ("bic", "aicc"):
         raise StripError(f"criterion: got {settings.criterion!r}, want bic or aicc")
 

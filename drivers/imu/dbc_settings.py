@@ -137,6 +137,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
     grouped = len(parts.parts)
     numbers |= {key: [parts.number(signal) for signal in found[key]] for key in SCALARS[1:] if key in found}
     factors = _factors(config, found, file_name)
+    _refuse_axis_twice(config["signals"])
 
     def scalar(key: str) -> MappedSignal | None:
         return MappedSignal(found[key][0].layout, numbers[key][0]) if key in found else None
@@ -174,10 +175,6 @@ def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[
         if not isinstance(value, list | tuple) or len(value) != 3:
             raise DriverSettingsError(f"signals.{key} must name three signals, x, y and z, as MESSAGE.signal")
         found[key] = [find_signal(database, str(path), file_name) for path in value]
-    axes = [str(path) for key in VECTORS for path in names[key]]
-    twice = next((path for path in axes if axes.count(path) > 1), None)
-    if twice is not None:
-        raise DriverSettingsError(f"signals: {twice} is named for two axes; want another signal for each")
     for key in SCALARS:
         if key in names:
             found[key] = [find_signal(database, str(names[key]), file_name)]
@@ -185,6 +182,13 @@ def _find_all(config: Mapping[str, Any], database: Any, file_name: str) -> dict[
         if key in found and found[key][0].layout.is_float:
             raise DriverSettingsError(f"signals.{key}: {names[key]} is a float; a {kind} must be an integer")
     return found
+
+
+def _refuse_axis_twice(names: Mapping[str, Any]) -> None:
+    axes = [str(path) for key in VECTORS for path in names[key]]
+    twice = next((path for path in axes if axes.count(path) > 1), None)
+    if twice is not None:
+        raise DriverSettingsError(f"signals: {twice} is named for two axes; want another signal for each")
 
 
 def _factors(
