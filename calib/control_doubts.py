@@ -30,7 +30,7 @@ FEET = 1.0 / 0.3048
 OUTSIDE_M = 30.0
 THINNED_TO = 20_000  # returns of a swath that say where it is
 SURE_SIGMAS = 5.0
-SWATHS_APART = 0.5  # of what the slopes say: swaths that differ by more say nothing of control
+SWATHS_APART = 0.5  # of what the slopes say: opposite swaths that are off by a quarter of the shift, to either side
 GEOIDS = ((3855, "EGM2008"), (5773, "EGM96"))
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Tangent
+from calib.flight import Flight, Head, Swath, Tangent
 from georef.beams import SpinningGeometry
 from georef.calibration import INDEX, PARAMETERS
 from georef.records import Int64Array
@@ -103,12 +103,16 @@ class SeenFrom:
             0.0 if swath.encoder_rate is None or not len(swath) else float(np.median(np.abs(swath.encoder_rate[::97])))
             for swath in flight.swaths
         ]
-        mounted = [
-            # a head that spins has its own axis, and no angle that such a column is of
-            np.eye(3) if isinstance(head.geometry, SpinningGeometry) else head.start.installation_matrix
-            for head in (flight.heads[swath.head] for swath in flight.swaths)
-        ]
+        mounted = [_rot_b_from_s(flight.heads[swath.head], swath) for swath in flight.swaths]
         return cls(flight.frame, flight.trajectories, [swath.flown for swath in flight.swaths], rates, mounted)
+
+
+def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
+    """(3, 3) in the middle of a swath, where the mount moves."""
+    if isinstance(head.geometry, SpinningGeometry) or not len(swath):
+        return np.eye(3)  # a head that spins has its own axis, and no angle that such a column is of
+    turned: FloatArray = head.mount.poses(swath.time_ns[len(swath) // 2 :][:1])[0][0]
+    return turned @ head.start.installation_matrix
 
 
 def effect_columns(

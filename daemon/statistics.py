@@ -105,7 +105,7 @@ class SourceNumbers:
             "trouble": {key: count for key in _TROUBLE if (count := _count(status, key))},
             "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
-            "told": self.status is not None,
+            "has_status": self.status is not None,
         }
         if self.time_states:
             numbers["time_state"] = status.get("time_state")

@@ -95,10 +95,10 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     unaccounted = _unaccounted(numbers)
     if unaccounted:
         console.print(f"[red]{unaccounted} status messages do not account for all units[/]")
-    untold = [source for source, values in numbers["sources"].items() if not values["told"]]
+    untold = [source for source, values in numbers["sources"].items() if not values["has_status"]]
     if untold:
         console.print(f"no status of {_plain(', '.join(untold))}: what was lost is not known", highlight=False)
-    if not unaccounted and len(untold) < max(1, len(numbers["sources"])):
+    if not unaccounted and not untold:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
     for event in numbers["marks"]:
         told = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"
@@ -124,7 +124,7 @@ def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
 
 def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
     lost = values["lost"]
-    losses = f"{lost['lost_kernel']}/{lost['lost_queue']}/{lost['lost_write']}"
+    losses = f"{lost['lost_kernel']}/{lost['lost_queue']}/{lost['lost_write']}" if values["has_status"] else ""
     rate = "" if values["rate_hz"] is None else f"{values['rate_hz']:,.1f}"
     return (
         _plain(source),
@@ -133,7 +133,7 @@ def _row(source: str, values: dict[str, Any]) -> tuple[str, ...]:
         rate,
         str(values["gaps"]),
         f"{values['longest_gap_s']:.2f} s",
-        ("" if not values["told"] else losses) if losses == "0/0/0" else f"[red]{losses}[/]",
+        losses if losses in ("", "0/0/0") else f"[red]{losses}[/]",
         _time(values),
     )
 

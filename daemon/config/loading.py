@@ -32,8 +32,7 @@ _TYPE_WANTED = {
     "dict_type": "a table",
     "model_type": "a table",
     "finite_number": "a finite number",
-    "date_type": "a date without quotes, 2025-01-31",
-    "date_from_datetime_inexact": "a date without a time, 2025-01-31",
+    "date_type": "a date, without quotes and without a time: 2025-01-31",
 }
 _BOUND_SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
 

@@ -59,7 +59,7 @@ class CounterUnwrapper:
             steps = steps & (wrap - 1)
             wraps = np.maximum(np.rint((expected - steps) / wrap), 0).astype(np.int64)
             steps = steps + wraps * wrap
-            if wrap < 2 * RESTART_TOLERANCE_S * self._tick_hz:
+            if wrap < 2 * RESTART_TOLERANCE_S * self._tick_hz:  # a stall may be half a wrap, which is rounded to one
                 unsure = wraps > 0
         tolerance = (RESTART_TOLERANCE_S + RESTART_TOLERANCE_RATE * np.abs(span_s)) * self._tick_hz
         return steps, unsure | (steps < 0) | (np.abs(expected - steps) > tolerance)

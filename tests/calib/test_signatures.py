@@ -18,6 +18,7 @@ from calib.strips import differences
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
 from georef.jacobian import parameter_columns_e
+from georef.mount import Mount, Stage
 from georef.rotations import rot_x
 from tests.calib.cast_flight import Cast, cast_flight
 
@@ -113,6 +114,13 @@ def test_a_true_calibration_shows_nothing(made: Cast) -> None:
     assert levels["scan direction"] == "not told"
     assert whole.variance_factor == pytest.approx(0.93, abs=0.1)  # Huber's weights take from the tails
     assert whole.left_rms_m == pytest.approx(whole.rms_m, rel=0.01)
+
+
+def test_a_gimbal_turns_the_scan_too(made: Cast) -> None:
+    (head,) = made.flight.heads
+    turned = replace(head, mount=Mount((Stage(np.array([0.0, 0.0, math.pi])),)))
+    for rot_b_from_s in SeenFrom.of(replace(made.flight, heads=(turned,))).rot_b_from_s:
+        assert rot_b_from_s == pytest.approx(np.diag([-1.0, -1.0, 1.0]), abs=1e-12)
 
 
 @pytest.mark.parametrize("mounting", MOUNTINGS)

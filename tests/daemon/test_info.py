@@ -98,8 +98,11 @@ def test_no_log_is_one_line(tmp_path: Path, command: str) -> None:
         assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("has_status", [True, False])
 @pytest.mark.parametrize(("origin", "told"), [("recording", "swath 1 on h\n"), ("import", "swath 1 on h (import)\n")])
-def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str, told: str) -> None:
+def test_a_long_name_and_a_wide_sigma_fit_and_what_is_not_known_is_not_told(
+    origin: str, told: str, has_status: bool
+) -> None:
     import io
 
     from rich.console import Console
@@ -108,7 +111,8 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
 
     lost = {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0}
     source: dict[str, object] = {"units": 1_234_567, "bytes": 1, "rate_hz": 20000.0, "gaps": 0, "longest_gap_s": 0.0}
-    source |= {"lost": lost, "account_errors": 0, "told": True, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
+    source |= {"lost": lost, "account_errors": 0, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
+    source |= {"has_status": has_status}
     source |= {"trouble": {"bus_off": 2, "error_frames": 1_500}}
     numbers: dict[str, object] = {
         "missing_parts": [],
@@ -123,6 +127,8 @@ def test_a_long_name_and_a_wide_sigma_fit_and_only_an_import_is_told(origin: str
     _print_session(Console(file=page, width=80), numbers)
     text = page.getvalue()
     assert told in text
+    assert ("0/0/0" in text, "every unit is accounted for" in text) == (has_status, has_status)
+    assert ("no status of scanner/left-front/aux: what was lost is not known" in text) != has_status
     assert "…" not in text
     assert "57.7µs" in text
     assert "  ? mark: [x]\n" in text
