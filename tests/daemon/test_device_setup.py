@@ -258,8 +258,8 @@ class TestCommand:
             text = gnss(device.path, "ubx")
             with Recorder(tmp_path / "recorder", session_table(tmp_path / "logs") + text) as recorder:
                 descriptors = Path(f"/proc/{recorder.process.pid}/fd")
-                wait_until(
-                    lambda: any(os.readlink(link) == device.path for link in descriptors.iterdir()),
+                wait_until(  # realpath: a descriptor that is closed meanwhile is no error
+                    lambda: any(os.path.realpath(link) == device.path for link in descriptors.iterdir()),
                     "the recorder has the port open",
                 )
                 run = swath("setup", self.write(tmp_path, text), "--apply")
