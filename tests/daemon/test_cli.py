@@ -208,8 +208,8 @@ class TestErrors:
 def _has_open(pid: int, path: Path) -> bool:
     """Whether a process has a file open: it has got as far as listening."""
     folder = Path(f"/proc/{pid}/fd")
-    links = [os.readlink(link) for link in folder.iterdir() if link.is_symlink()] if folder.exists() else []
-    return str(path) in links
+    links = [os.path.realpath(link) for link in folder.iterdir()] if folder.exists() else []
+    return os.path.realpath(path) in links
 
 
 class TestDevices:
