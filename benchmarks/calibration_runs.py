@@ -32,7 +32,7 @@ from daemon.processing.flights import Wish as Logs
 from daemon.processing.flown import TrajectoryWish
 from daemon.processing.setup import Options
 from georef.calibration import Calibration, read_calibration
-from georef.navigation.cross_covariance import ErrorChain, error_chain
+from georef.navigation.cross_covariance import ErrorChain
 from georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
@@ -111,10 +111,10 @@ def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[R
     compact, features = own_returns(flight, features)
     compact, features, sigmas = consistent(compact, features, truth)
     assert kept.logged[0].navigated is not None
-    run = kept.logged[0].navigated.legs[0].solved.run
+    solved = kept.logged[0].navigated.legs[0].solved
     knots, nodes = knots_of(flight, KNOT_S), knots_of(flight, NODE_S, 1_000_000)
-    prior = from_smoother(flight, [error_chain(run, knots.time_ns)], KNOT_S)
-    chain = error_chain(run, nodes.time_ns)
+    prior = from_smoother(flight, [solved.error_chain(knots.time_ns)], KNOT_S)
+    chain = solved.error_chain(nodes.time_ns)
     covariance = chain.covariance()
     nodes = Knots(np.zeros(len(chain), np.int64), chain.time_ns, np.zeros(len(chain), np.int64), NODE_S, False)
     reference = Reference(compact, features, truth, prior, sigmas, nodes, walked(chain, covariance))

@@ -208,7 +208,8 @@ class Separation:
         time_ns: (k,) compared epochs.
         position_m, velocity_mps, attitude_rad: (k, 3) north, east, down; roll, pitch, heading.
         position_sigma_m, velocity_sigma_mps, attitude_sigma_rad: (k, 3); nan where the filter's and the smoother's
-            sigmas hardly differ and the difference says nothing.
+            sigmas hardly differ and the difference says nothing. Where a time offset was estimated the positions' is
+            too large along the track: the smoother's is that of GNSS's time.
     """
 
     time_ns: Int64Array

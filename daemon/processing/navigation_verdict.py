@@ -164,7 +164,7 @@ def _arm(key: str) -> Measure:
 def _offset_ms(figures: Figures) -> Iterator[tuple[str, float | None]]:
     found = figures["time_offset"]
     if found is not None and found["significant"]:
-        yield ("late" if found["estimate_s"] > 0 else "early"), abs(1e3 * found["estimate_s"])
+        yield ("early" if found["estimate_s"] > 0 else "late"), abs(1e3 * found["estimate_s"])
 
 
 NOISE = "the noise in [imu.NAME.noise] (grade, or its single keys)"

@@ -23,6 +23,7 @@ from georef.navigation.error_model import E_ATTITUDE, E_POSITION, MOVED
 from georef.navigation.filter import FilterRun
 from georef.navigation.filter_types import Nodes
 from georef.navigation.inputs import NavigationError
+from georef.navigation.strapdown import VELOCITY
 from georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
@@ -80,7 +81,7 @@ def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
 
     Args:
         run: of the filter, with its nodes; the last one that was smoothed.
-        time_ns: GPS times, in any order.
+        time_ns: in any order, in the run's time: the inertial unit's.
 
     Raises:
         NavigationError: the run has no nodes.
@@ -103,7 +104,7 @@ def error_chain(run: FilterRun, time_ns: ArrayLike) -> ErrorChain:
             if slot < len(wanted):
                 chain.ways[slot] = way
             slot, way = slot - 1, np.eye(n)
-            covariance, rows = _unpacked(block.covariance[k], n), _rows_l(block.after[k, :3], n)
+            covariance, rows = _unpacked(block.covariance[k], n), _rows_l(block.after[k], n, run.layout.time_offset)
             chain.left[slot] = rows @ covariance
             chain.right[slot] = rows.T - information @ (covariance @ rows.T)
         way = way @ closed
@@ -146,11 +147,13 @@ def _unpacked(packed: FloatArray, n: int) -> FloatArray:
     return full + np.tril(full, -1).T
 
 
-def _rows_l(position_e: FloatArray, n: int) -> FloatArray:
-    """(6, n) what takes position and attitude out of the errors, turned to l."""
-    lat, lon, _ = geodetic_from_e(position_e)
+def _rows_l(state: FloatArray, n: int, late: int) -> FloatArray:
+    """(6, n) what takes position and attitude out of the errors, turned to l; the position in GNSS's time, r + v τ."""
+    lat, lon, _ = geodetic_from_e(state[:3])
     rot_l_from_e = rot_e_from_l(lat, lon).T
     rows = np.zeros((ERRORS, n))
     rows[:3, E_POSITION : E_POSITION + 3] = rot_l_from_e
+    if late >= 0:
+        rows[:3, late] = rot_l_from_e @ state[VELOCITY : VELOCITY + 3]
     rows[3:, E_ATTITUDE : E_ATTITUDE + 3] = rot_l_from_e
     return rows

@@ -264,6 +264,9 @@ class Start:
 class Solution:
     """A navigated trajectory of the body's origin.
 
+    One of `georef.navigation.solve` is in GNSS's time where a time offset was estimated; of the smoothed one the
+    positions' sigmas are those of that time, of the forward one those of where the filter had it then.
+
     Attributes:
         time_ns: (n,) epochs.
         position_e, velocity_e: (n, 3) m, m/s relative to the earth.

@@ -23,11 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.compiled import kept, kernel
-from georef.kernels.rotations import rot_of
+from georef.kernels.rotations import dot, rot_of
 from georef.navigation.error_model import (
     E_ACCEL_LEAN,
     E_ATTITUDE,
     E_GYRO_LEAN,
+    E_POSITION,
     E_SENSORS,
     MOVED,
     Layout,
@@ -50,6 +51,7 @@ from georef.navigation.strapdown import (
     LEVER_ARM,
     STATE_SIZE,
     TIME_OFFSET,
+    VELOCITY,
     copy_into,
     put,
     three,
@@ -238,6 +240,21 @@ def _separate(x: FloatArray, error: FloatArray, out: FloatArray) -> None:
         out[6 + i] = -(by[i][0] * error[6] + by[i][1] * error[7] + by[i][2] * error[8])
 
 
+@kernel
+def _position_sigmas_in_gnss_time(x: FloatArray, p: FloatArray, late: int, sigma: FloatArray) -> None:
+    """sigma (3,) ← of r + v τ, north, east, down, with τ the time offset, whose place among the errors is ``late``.
+
+    GNSS sees this sum, so that it is known better than r at a moment of the inertial unit's time. How far speed and
+    attitude change within τ's sigma is left out: in a flight with turns that is well below a millisecond.
+    """
+    axes = level_axes(x)
+    for i in range(3):
+        speed = dot(axes[i], three(x, VELOCITY))
+        shared = dot(axes[i], (p[late, E_POSITION], p[late, E_POSITION + 1], p[late, E_POSITION + 2]))
+        variance = sigma[i] * sigma[i] + speed * (2.0 * shared + speed * p[late, late])
+        sigma[i] = math.sqrt(max(variance, 0.0))
+
+
 @kept
 def _backward(
     nodes: Nodes, layout: Layout, adjoint: FloatArray, information: FloatArray, state: FloatArray, sigma: FloatArray,
@@ -266,6 +283,8 @@ def _backward(
             for j in range(n):
                 p[i, j] -= twice[i, j]
         level_sigmas(state[k], p, sigma[k])
+        if layout.time_offset >= 0:
+            _position_sigmas_in_gnss_time(state[k], p, layout.time_offset, sigma[k])
         for i in range(MOVED, n):
             sensor_sigma[k, i - MOVED] = math.sqrt(max(p[i, i], 0.0))
         for i in range(end - 1, nodes.first[k] - 1, -1):

@@ -2,7 +2,8 @@
 
 The filter is linear about its own state, which is poor while the heading is hardly known: a pass that begins with the
 smoothed attitude has small errors from its first sample on, and with the prior sigmas kept it learns nothing twice that
-matters. A GNSS time offset is taken out of the observations' times likewise, so that what is left of it is small.
+matters. A GNSS time offset is taken out of the observations' times likewise, so that what is left of it is small. The
+solutions are in GNSS's time, in which the laser fires too: the epochs of the inertial unit less the whole offset.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from georef.earth import geodetic_from_e, rot_e_from_l
+from georef.navigation.cross_covariance import ErrorChain, error_chain
 from georef.navigation.filter import FilterRun, run_filter
 from georef.navigation.inputs import Inertial, Kind, Setup, Solution, Start
 from georef.navigation.noise import NoiseFound, by_moments, find_noise, scaled
@@ -59,13 +61,20 @@ class Solved:
     """A flight: by what was known at each moment, and by all of it.
 
     Attributes:
-        run: of the filter, that was smoothed.
+        forward, smoothed: in GNSS's time, by the offset that the whole flight tells.
+        run: of the filter, that was smoothed; in the inertial unit's time.
     """
 
     forward: Solution
     smoothed: Solution
     report: Report
     run: FilterRun
+
+    def error_chain(self, time_ns: ArrayLike) -> ErrorChain:
+        """How the smoothed errors at the nodes nearest to some times (GNSS's) go together; see `error_chain`."""
+        offset_ns = round(self.report.time_offset_s * SECOND_NS)
+        chain = error_chain(self.run, np.asarray(time_ns, dtype=np.int64) + offset_ns)
+        return replace(chain, time_ns=chain.time_ns - offset_ns)
 
 
 def solve(
@@ -100,8 +109,9 @@ def solve(
         run = run_filter(inertial, _shifted(observations, offset_s), setup, start, storage=storage)
         nodes = smooth_nodes(run)
         changes.append(_change(nodes))
-    smoothed = _unshifted(solution_of(run, nodes), offset_s)
-    whole_s = float(smoothed.time_offset_s[0])
+    whole_s = offset_s + float(nodes.state[0, TIME_OFFSET])
+    flown = _in_gnss_time(flown, 0.0, whole_s)
+    smoothed = _in_gnss_time(solution_of(run, nodes), offset_s, whole_s)
     report = Report(len(changes), tuple(changes), found, whole_s, _weak(smoothed, setup), setup)
     return Solved(flown, smoothed, report, run)
 
@@ -158,14 +168,25 @@ def _shifted(observations: StructArray, offset_s: float) -> StructArray:
     return rows
 
 
-def _unshifted(solution: Solution, offset_s: float) -> Solution:
-    """Innovations at the observations' own times, the whole offset in the estimates."""
-    if offset_s == 0.0:
+def _in_gnss_time(solution: Solution, taken_s: float, whole_s: float) -> Solution:
+    """A solution in the inertial unit's time, put into GNSS's: its epochs less the whole offset.
+
+    Args:
+        solution: its innovations of GNSS are at the observations' times and what was taken.
+        taken_s: that had been added to the observations' times.
+        whole_s: what is added to GNSS's time to get the unit's.
+    """
+    if taken_s == whole_s == 0.0:
         return solution
+    earlier_ns = round(whole_s * SECOND_NS)
+    innovations = _shifted(solution.innovations, -taken_s)
+    innovations["time_ns"][~_of_gnss(innovations["kind"])] -= earlier_ns
     return replace(
         solution,
-        innovations=_shifted(solution.innovations, -offset_s),
-        time_offset_s=solution.time_offset_s + offset_s,
+        time_ns=solution.time_ns - earlier_ns,
+        node_time_ns=solution.node_time_ns - earlier_ns,
+        innovations=innovations,
+        time_offset_s=solution.time_offset_s + taken_s,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,10 @@ from georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
 from georef.records import FixType
 from georef.rotations import quaternion_from_rot, rot_l_from_b
 from georef.timescales.gps_time import SECOND_NS
+from tests.georef.navigation.vehicles import NAVIGATION
 
 Array = NDArray[Any]
-FILE = Path(__file__).parents[3] / "shared" / "fixtures" / "navigation" / "reference_flight" / "tactical.npz"
+FILE = NAVIGATION / "reference_flight" / "tactical.npz"
 WEEK, WEEK_S = 2376, 604_800
 GNSS_SIGMA_M = np.array([0.01, 0.01, 0.02])
 VELOCITY_SIGMA_MPS = np.array([0.02, 0.02, 0.04])

@@ -220,7 +220,7 @@ def test_lever_arm_and_time_offset(sound: Flight) -> None:
     found = told(replace(sound, smoothed=best, setup=setup))
     assert found["lever arm moved"] == "the antenna was found 0.24 m from where lever_arm_m has it (y)"
     assert found["lever arm unseen"].startswith("lever arm z")  # and its 0.3 m are within three sigmas
-    assert found["time offset"].startswith("GNSS stamps are 125.0 ms late")
+    assert found["time offset"].startswith("GNSS stamps are 125.0 ms early")
 
 
 def test_no_position_at_all(sound: Flight) -> None:

@@ -104,12 +104,12 @@ def of_maxima(t: FloatArray, size_m: FloatArray, spans_s: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(largest))))
 
 
-def off_fixes(solution: Solution, fixes: FloatArray, offset_s: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def off_fixes(solution: Solution, fixes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Times and (n, 3) found − fixed north, east, down of antennas in the body's origin, at the fixes' own times."""
-    shifted = ns(fixes[:, 0] + offset_s)
-    inside = (shifted >= solution.time_ns[0]) & (shifted <= solution.time_ns[-1])
+    at_ns = ns(fixes[:, 0])
+    inside = (at_ns >= solution.time_ns[0]) & (at_ns <= solution.time_ns[-1])
     lat, lon = np.radians(fixes[inside, 1:3].T)
     place = e_from_geodetic(lat, lon, fixes[inside, 3])
     level = rot_e_from_l(lat, lon)
-    found = solution.trajectory().poses(shifted[inside]).position_e
+    found = solution.trajectory().poses(at_ns[inside]).position_e
     return fixes[inside, 0], np.einsum("nji,nj->ni", level, found - place)

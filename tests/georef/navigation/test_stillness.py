@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,8 +10,9 @@ from georef.earth import e_from_geodetic
 from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
 from georef.timescales import SECOND_NS
+from tests.georef.navigation.vehicles import NAVIGATION
 
-FLIGHT = Path(__file__).parents[4] / "shared" / "fixtures" / "navigation" / "reference_flight" / "mems.npz"
+FLIGHT = NAVIGATION / "reference_flight" / "mems.npz"
 EPOCH_NS = 1_447_000_000 * SECOND_NS
 RATE_HZ = 100
 
