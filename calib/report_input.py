@@ -20,7 +20,7 @@ Pair = tuple[str, str]
 
 
 class Difference(Protocol):
-    """Height differences of two strips, second − first, metres; RMS² = mean² + std² (FORMULAS 8)."""
+    """Height differences of two strips, first − second, metres; RMS² = mean² + std² (FORMULAS 8)."""
 
     @property
     def mean_m(self) -> float: ...

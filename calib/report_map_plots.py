@@ -86,7 +86,7 @@ def difference_picture(report: ReportInput) -> Picture | None:
             _words(axes)
         canvas.legend(_difference_legend(), 3 if form.narrow else 9)
 
-    words = "Height differences of overlapping strips, cell by cell, second − first."
+    words = "Height differences of overlapping strips, cell by cell, first − second."
     return Picture("Difference maps", words, height_in, draw)
 
 

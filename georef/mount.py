@@ -11,7 +11,7 @@ boresight is that between gimbal and body.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,11 @@ class AngleSeries:
         new = time_ns > newest[:-1]
         return cls(time_ns[new], angles[new], max_gap_ns)
 
+    def joined(self, other: AngleSeries) -> AngleSeries:
+        """With those of another recording; what both tell of is this one's."""
+        time_ns, first = np.unique(np.concatenate([self.time_ns, other.time_ns]), return_index=True)
+        return AngleSeries(time_ns, np.concatenate([self.angles_rad, other.angles_rad])[first], self.max_gap_ns)
+
     @cached_property
     def _unwrapped(self) -> FloatArray:
         return np.unwrap(self.angles_rad, axis=0)
@@ -101,6 +106,12 @@ class Stage:
     lever_arm: FloatArray = field(default_factory=_zeros)
     series: AngleSeries | None = None
 
+    def joined(self, other: Stage) -> Stage:
+        """The same stage in two recordings."""
+        if self.series is None or other.series is None:
+            return self
+        return replace(self, series=self.series.joined(other.series))
+
 
 @dataclass(frozen=True, eq=False)
 class Mount:
@@ -112,6 +123,10 @@ class Mount:
     def moves(self) -> bool:
         """Whether a stage has angles over time."""
         return any(stage.series is not None for stage in self.stages)
+
+    def joined(self, other: Mount) -> Mount:
+        """The same mount in two recordings: its stages' angles over the time of both."""
+        return Mount(tuple(one.joined(again) for one, again in zip(self.stages, other.stages, strict=True)))
 
     def poses(self, time_ns: Int64Array) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
         """Of the innermost stage at GPS times (n,): rotations (m, 3, 3), origins (m, 3), where both are known (m,).

@@ -129,6 +129,15 @@ class SensorModel:
             covariance_e=covariance_e,
         )
 
+    def offsets_by_rate_m(self, rows: StructArray, prf_hz: float | None) -> FloatArray:
+        """(n,) of returns (n,): those of the calibration's range offsets that hold at this pulse rate only."""
+        of_all, of_rate = (_range_offsets(self.calibration, rate) for rate in (None, prf_hz))
+        added = of_rate - of_all
+        if len(added) == 1:
+            return np.zeros(len(rows))
+        offsets: FloatArray = added[rows["return_number"], rows["mta_zone"]]
+        return offsets
+
     def _model(
         self,
         time_ns: Int64Array,

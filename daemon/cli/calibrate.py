@@ -25,8 +25,13 @@ def command(
         list[str] | None, typer.Option(metavar="NAME", help="Only this one; may be repeated. Default: all.")
     ] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="SBET, Waypoint text, .pos or CSV; default: the log's own.")
+        Path | None,
+        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the log's IMU and GNSS, navigated."),
     ] = None,
+    at: Annotated[
+        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+    ] = "body",
+    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
     control: Annotated[
         Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
     ] = None,
@@ -70,7 +75,7 @@ def command(
     """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
 
     What this flight cannot determine is held, and said. Exit code 1 where no calibration could be made that would
-    be worth its name; then no file is written.
+    be worth its name, then no file is written; or where its verdict is "Not to be used".
     """
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from daemon.cli.georef import calibrations_given
@@ -91,7 +96,7 @@ def command(
         logs=Wish(
             logs=logs,
             output=output,
-            trajectory=TrajectoryWish(trajectory, navigate=True),
+            trajectory=TrajectoryWish(trajectory, week, at, navigate=True),
             options=Options(
                 crs=crs,
                 datum=datum,
@@ -119,6 +124,8 @@ def command(
     with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
         told = write_products(wish, calibrate(wish, Path(folder), tell), tell)
     print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
+    if told.record["verdict"]["level"] == "unusable":
+        raise UserError(f"{output}: {one_line(told.record['verdict']['sentence'])}")
 
 
 def _refuse(output: Path, observe: str, *, overwrite: bool) -> None:

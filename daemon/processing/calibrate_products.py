@@ -24,12 +24,11 @@ from calib.strips import Numbers, StripReport, differences
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
-from daemon.processing.calibrate_run import Calibrated, CalibrateWish
+from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.trajectory_files import write_whole
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
-OUTCOME = "calibration.json"
 MAP_CELLS = 400  # across a map of differences
 
 
@@ -55,7 +54,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
         texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
     except CalibrationFileError as error:
         raise UserError(str(error)) from error
-    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in _paths(wish, headers).items()}
+    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in paths_of(wish, headers).items()}
     report = _report(wish, done, headers, before, after, inputs)
     verdict = judge(report)
     record = _record(done, headers, before, after, inputs) | {
@@ -78,12 +77,6 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
 
 def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:
     return replace(done.adjusted.calibrations[name], id=headers[name].id, method=headers[name].method)
-
-
-def _paths(wish: CalibrateWish, headers: Mapping[str, Header]) -> dict[str, Path]:
-    if len(headers) == 1 and not wish.output.is_dir():
-        return dict.fromkeys(headers, wish.output)
-    return {name: wish.output / f"{name}.toml" for name in headers}
 
 
 def _write(files: Mapping[Path, bytes]) -> None:

@@ -12,7 +12,7 @@ All files are made out of sight and put in their place at the end: what looks li
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +36,7 @@ from calib.prealign import PrealignError, prealign
 from calib.profile_check import Check, check
 from calib.record_values import Plain
 from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
-from daemon.errors import UserError
+from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
@@ -44,7 +44,6 @@ from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
 from georef.calibration import Calibration
 from georef.mapping import MappingError
-from georef.navigation.cross_covariance import error_chain
 from georef.strips import StripError
 from georef.trajectory import TrajectoryError
 
@@ -53,6 +52,7 @@ if TYPE_CHECKING:
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 KNOT_S = 0.4
+OUTCOME = "calibration.json"  # of a report
 # All returns of a patch share what the attitude does between two knots, some millimetres: the mean of 25 is as good as
 # that, and the mean of thousands would be taken for better than it is.
 PLANES = PlaneSettings(most_points=25)
@@ -145,7 +145,9 @@ def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
 
 
 def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+    _refuse_existing(wish, [])  # the report's, before the logs are read
     kept = read_flight(wish.logs, folder, tell)
+    _refuse_existing(wish, [head.name for head in kept.flight.heads])
     _refuse_one_strip(kept)
     points = _control(wish, kept.flight)
     workers = wish.logs.workers
@@ -199,6 +201,23 @@ def _aligned(flight: Flight) -> dict[str, Calibration]:
         name: found.changed(range_offset_m=starts[name].value("range_offset_m"))
         for name, found in prealign(flight).items()
     }
+
+
+def _refuse_existing(wish: CalibrateWish, scanners: Sequence[str]) -> None:
+    """UserError where a calibration of a scanner or a report is there and may not be replaced."""
+    files = paths_of(wish, scanners).values() if wish.output.is_dir() else ()
+    reports = () if wish.report is None else (wish.report / OUTCOME,)
+    for path in (*files, *reports):
+        if path.exists() and not wish.overwrite:
+            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+
+
+def paths_of(wish: CalibrateWish, scanners: Iterable[str]) -> dict[str, Path]:
+    """Where each scanner's calibration goes."""
+    names = list(scanners)
+    if len(names) == 1 and not wish.output.is_dir():
+        return dict.fromkeys(names, wish.output)
+    return {name: wish.output / f"{name}.toml" for name in names}
 
 
 def _refuse_one_strip(kept: KeptFlight) -> None:
@@ -269,7 +288,7 @@ def prior_of(kept: KeptFlight) -> TrajectoryPrior:
         legs = [] if flight.navigated is None else flight.navigated.legs
         if len(legs) != 1:
             return gauss_markov(kept.flight)
-        chains.append(error_chain(legs[0].solved.run, knots.time_ns[knots.flown == number]))
+        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.flown == number]))
     return from_smoother(kept.flight, chains, KNOT_S)
 
 

@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Head, Swath, Tangent
+from daemon.config.config import Config
+from daemon.config.tables import ScannerConfig
+from daemon.errors import UserError
 from daemon.processing.feed import LogFeed
 from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import Wish, read_flights
@@ -127,7 +130,10 @@ def _job(flight: LoggedFlight, number: int, tile: Segment, folder: Path) -> Job:
 
 
 def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
-    """Of all sessions, which are of one installation; a scanner's settings are those of its first."""
+    """Of all sessions, which are of one installation; a scanner's settings are those of its first.
+
+    What a gimbal's angles were is of the time of all.
+    """
     found: dict[str, Head] = {}
     for flight in logged:
         for name in flight.setup.scanners:
@@ -136,9 +142,24 @@ def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
             noise = Noise(
                 table.range_sigma_m, np.radians(table.angle_sigma_deg), divergence_rad=1e-3 * table.divergence_mrad
             )
-            head = Head(name, model.calibration, model.geometry, noise, model.range_gate, model.mount, model.air)
-            found.setdefault(name, head)
+            start = _under(flight.setup.config, table, model.calibration)
+            head = Head(name, start, model.geometry, noise, model.range_gate, model.mount, model.air)
+            there = found.setdefault(name, head)
+            if len(there.mount.stages) != len(head.mount.stages):
+                raise UserError(
+                    f"{flight.log}: scanner.{name}.gimbal: has {len(head.mount.stages)} stages, in {logged[0].log} "
+                    f"{len(there.mount.stages)}; want logs of one installation"
+                )
+            if there is not head:
+                found[name] = replace(there, mount=there.mount.joined(head.mount))
     return tuple(found.values())
+
+
+def _under(config: Config, table: ScannerConfig, calibration: Calibration) -> Calibration:
+    """A calibration with the settings it is used under, so that one estimated from it is refused under others."""
+    factor = calibration.mirror_factor if table.mirror_factor is None else table.mirror_factor
+    air = config.atmosphere
+    return replace(calibration, ranges=air.ranges, refraction=air.refraction, mirror_factor=factor)
 
 
 def _swaths(job: Job, result: JobResult, heads: Sequence[Head], flight: LoggedFlight) -> list[Swath]:
@@ -197,20 +218,25 @@ def replaced(
 # ---------------------------------------------------------------------- a strip
 
 
-class _Keeper:
-    """Stands where points are made: places returns in t and keeps them, as they came, with their points."""
+class _Keeper(Georeferencer):
+    """Stands where points are made: places returns in t and keeps them, with their points, as they came.
+
+    Range offsets by pulse rate are nobody's unknowns: the ranges that are kept have them, so that who places returns
+    anew need not know their rates.
+    """
 
     def __init__(self, georeferencer: Georeferencer, frame: Tangent, given: GivenMotion, files: dict[str, BinaryIO]):
-        self._model, self._frame, self._given, self._files = georeferencer.model, frame, given, files
+        super().__init__(georeferencer.model)
+        self._frame, self._given, self._files = frame, given, files
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
         """No points; the fate of every row."""
-        given = self._given
-        rays = self._model.rays(
+        given, rows = self._given, self._with_offsets_by_rate(rows)
+        rays = self.model.rays(
             rows, time_ns, trajectory, encoder_rate=given.rate, encoder_acceleration=given.acceleration
         )
-        if self._model.air is not None:
-            self._model.air.apply(rays.origin_e, rays.points_e)
+        if self.model.air is not None:
+            self.model.air.apply(rays.origin_e, rays.points_e)
         kept = rays.fate == Fate.GEOREFERENCED
         values = {
             "rows": rows,
@@ -222,6 +248,15 @@ class _Keeper:
         for name, column in values.items():
             self._files[name].write(np.ascontiguousarray(column[kept]).tobytes())
         return Points.empty(0, with_sigmas=False), rays.fate
+
+    def _with_offsets_by_rate(self, rows: StructArray) -> StructArray:
+        if self.rates is None or all(row.prf_hz is None for row in self.model.calibration.range_offsets):
+            return rows
+        rows = rows.copy()
+        for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"]):
+            part = slice(start, stop)
+            rows["range_m"][part] += self.model.offsets_by_rate_m(rows[part], prf_hz)
+        return rows
 
 
 def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:

@@ -16,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 from calib.features import Features, Plane
 from calib.parameters import Wish
 from daemon.cli.main import run_app
-from daemon.errors import UserError
+from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_run import refuse_no_planes
 from daemon.processing.calibration_plan import PlanWish, plan_calibration
 from daemon.processing.warm_calibration import warm_calibration
@@ -95,6 +95,19 @@ def test_the_truth_is_within_the_sigmas(made: Made, products: Path) -> None:
         assert 0.0 < sigma < (0.02 if name == "range_offset_m" else math.radians(0.01)), name
         assert abs(found.value(name) - made.truth.value(name)) < 3.0 * sigma, name
     assert found.method == "combined"
+    assert (found.ranges, found.refraction) == ("corrected", "none")
+
+
+def test_a_calibration_is_refused_under_other_settings_than_its_own(
+    made: Made, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (made.flown.folder / "swath.toml").read_text()
+    config = made.flown.folder / "vacuum.toml"
+    assert 'ranges = "corrected"' in text
+    config.write_text(text.replace('ranges = "corrected"', 'ranges = "vacuum"'))
+    given = ["--config", str(config), "--calibration", str(products / "left.toml"), "--trajectory-datum", "same"]
+    assert run_app(["georef", str(made.flown.log), "-o", str(tmp_path / "points"), *given]) == ExitCode.USAGE
+    assert 'was estimated with ranges = "corrected", [atmosphere] says "vacuum"' in capsys.readouterr().err
 
 
 def list_of(name: str) -> int:

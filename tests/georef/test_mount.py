@@ -118,3 +118,17 @@ def test_angles_a_device_tells_are_the_stages_own() -> None:
     assert angles[2, 2] == pytest.approx(0.5 * (6.2 + 0.1 + 2 * math.pi))
     with pytest.raises(MountError, match="at least two epochs"):
         AngleSeries.of_solutions(rows[:1])
+
+
+def test_angles_of_two_recordings_are_of_the_time_of_both() -> None:
+    """Whatever was recorded first; nothing is known between them."""
+    early = AngleSeries(np.array([0, 10]) * MS, np.full((2, 3), 0.1), max_gap_ns=20 * MS)
+    late = AngleSeries(np.array([100, 110]) * MS, np.full((2, 3), 0.2), max_gap_ns=20 * MS)
+    still = Stage(angles_rad=np.array([0.0, 0.0, 0.5]))
+    for first, second in ((early, late), (late, early)):
+        mount = Mount((Stage(series=first), still)).joined(Mount((Stage(series=second), still)))
+        rotations, _, known = mount.poses(np.array([5, 50, 105]) * MS)
+        assert known.tolist() == [1, 0, 1]
+        for rotation, series in ((rotations[0], early), (rotations[2], late)):
+            alone, _, _ = Mount((Stage(series=series), still)).poses(series.time_ns[:1])
+            np.testing.assert_array_equal(rotation, alone[0])

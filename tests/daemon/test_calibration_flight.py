@@ -1,0 +1,82 @@
+"""What a calibration keeps of a log: the ranges it adjusts are those that `swath georef` places."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.flight import Flight
+from daemon.processing.calibration_flight import read_flight
+from daemon.processing.flights import Wish
+from daemon.processing.flown import TrajectoryWish, offset_of
+from daemon.processing.setup import Options, Setup
+from tests.calib.village import Made, village
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+PRF_HZ, OFFSET_M = 2_000.0, 0.05
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return village(tmp_path_factory.mktemp("village"), prf_hz=PRF_HZ, lines=(0, 1))
+
+
+def kept_with(made: Made, folder: Path, more: str) -> Flight:
+    """As read with the true calibration and these lines behind it."""
+    text = (made.flown.folder / "left.true.toml").read_text() + more
+    options = Options(datum="same", uncertainty=False, calibrations={"left": (text, "start.toml")})
+    trajectory = TrajectoryWish(made.flown.folder / "true_trajectory.csv")
+    folder.mkdir()
+    return read_flight(Wish([made.flown.log], folder, trajectory, options), folder, lambda *_: None).flight
+
+
+@pytest.mark.parametrize(("rate_hz", "added_m"), [(PRF_HZ, OFFSET_M), (2 * PRF_HZ, 0.0)])
+def test_a_range_offset_by_pulse_rate_counts_once(made: Made, tmp_path: Path, rate_hz: float, added_m: float) -> None:
+    plain = kept_with(made, tmp_path / "plain", "")
+    row = f"\n[[range_offset]]\nprf_hz = {rate_hz}\noffset_m = {OFFSET_M}\n"
+    flight = kept_with(made, tmp_path / "offset", row)
+    [head] = flight.heads
+    assert [offset.prf_hz for offset in head.start.range_offsets] == [rate_hz]
+    for before, swath in zip(plain.swaths, flight.swaths, strict=True):
+        np.testing.assert_allclose(swath.rows["range_m"] - before.rows["range_m"], added_m, atol=1e-12)
+        np.testing.assert_allclose(flight.place(swath, head.start), swath.points_t, atol=1e-9)
+        rays = head.model(head.start).rays(
+            before.rows,
+            before.time_ns,
+            flight.trajectories[swath.flown],
+            encoder_rate=before.encoder_rate,
+            encoder_acceleration=before.encoder_acceleration,
+            prf_hz=PRF_HZ,
+        )  # as swath georef places them
+        np.testing.assert_allclose(flight.frame.t_from_e(rays.points_e), swath.points_t, atol=1e-8)
+
+
+def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_path: Path) -> None:
+    found = []
+    for at in ("body", "antenna"):
+        (tmp_path / at).mkdir()
+        options = Options(datum="same", uncertainty=False)
+        wish = Wish([made.flown.log], tmp_path / at, TrajectoryWish(navigate=True, at=at), options)
+        kept = read_flight(wish, tmp_path / at, lambda *_: None)
+        found.append((kept.flight.trajectories[0].position_e, kept.logged[0].troubles))
+    (plain, before), (asked, told) = found
+    assert made.flown.config.gnss["rover"].lever_arm_m != [0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(plain, asked)
+    assert [line for line in told if line not in before] == [
+        f"{made.flown.log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at"
+    ]
+
+
+def test_the_scanners_point_is_its_calibrations(made: Made) -> None:
+    text = (made.flown.folder / "left.true.toml").read_text()
+    moved = re.sub(r"lever_arm_y_m = .*", "lever_arm_y_m = 0.75", text, count=1)
+    assert moved != text
+    config = made.flown.config
+    files = {name: data for name, _, data in config.attachments()}
+    setup = Setup(config, files, Options(datum="same", calibrations={"left": (moved, "moved.toml")}))
+    given = config.scanner["left"].lever_arm_m
+    assert offset_of("scanner", setup) == pytest.approx((given[0], 0.75, given[2]))
