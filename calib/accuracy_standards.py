@@ -107,7 +107,11 @@ def _kept(measured: dict[str, float | None], limits: dict[str, float]) -> dict[s
 
 
 def _asprs(measured: dict[str, float | None]) -> Judged:
-    """The smallest class that is kept, or the largest there is."""
+    """The smallest class that is kept, or the largest there is.
+
+    Its limit within strips is one of the largest difference, which a repeatability (RMS) says nothing of.
+    """
+    measured = measured | {"within_m": None}
     for size in ASPRS_CLASSES_M:
         limits = {
             "within_m": ASPRS_WITHIN * size,

@@ -23,6 +23,7 @@ from georef.records import Int64Array
 FloatArray = NDArray[np.float64]
 
 OVERLAP_SLOPE_DEG = 10.0  # USGS: overlap is judged on gentler slopes only
+GENTLE = math.cos(math.radians(OVERLAP_SLOPE_DEG))  # least vertical part of their normals
 FLOOR_M = 0.003  # of the noise of a difference: no natural plane is better
 
 
@@ -63,7 +64,7 @@ class Checks:
     @property
     def gentle(self) -> NDArray[np.bool_]:
         """(n,) slopes on which specifications judge heights."""
-        return np.asarray(self.normal[:, 2] >= math.cos(math.radians(OVERLAP_SLOPE_DEG)))
+        return np.asarray(self.normal[:, 2] >= GENTLE)
 
     def take(self, which: Any) -> Checks:
         """Some rows."""
@@ -131,6 +132,8 @@ class StripReport:
         refused: cells of pairs that were not compared, by reason.
         cell_m: side of the cells.
         checks: behind it.
+        repeatability_m: by strip, of single returns on its smoothest quarter of gentle ground, rough or not: what is
+            held against a specification's limit within strips. (Roughness leaves out what is rougher than is compared.)
     """
 
     names: tuple[str, ...]
@@ -140,6 +143,7 @@ class StripReport:
     refused: Counter[str]
     cell_m: float
     checks: Checks = field(repr=False)
+    repeatability_m: dict[str, float] = field(default_factory=dict)
 
 
 def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
@@ -163,7 +167,25 @@ def report_of(names: Sequence[str], gathered: Gathered, rules: StripRules, cell_
         for number, name in enumerate(names)
         if (good := (planes.strip == number) & (planes.reason == 0)).any()
     }
-    return StripReport(tuple(names), tuple(pairs), _pair("", "", checks), rms, refused, cell_m, checks)
+    repeats = {
+        name: value for number, name in enumerate(names) if (value := _repeatability(planes, number)) is not None
+    }
+    return StripReport(tuple(names), tuple(pairs), _pair("", "", checks), rms, refused, cell_m, checks, repeats)
+
+
+def _repeatability(planes: _Planes, strip: int) -> float | None:
+    """Sigma of single returns about a hard surface; None: there is no gentle ground.
+
+    By the lower quartile of the planes' variances, which what grows on the rest does not move. Quartile of χ²: Wilson
+    and Hilferty (1931).
+    """
+    gentle = planes.normal[:, 2] >= GENTLE
+    own = (planes.strip == strip) & gentle & ((planes.reason == 0) | (planes.reason == 1))
+    if not own.any():
+        return None
+    spread = 2.0 / (9.0 * np.maximum(planes.count[own] - 3, 1))
+    quartile = (1.0 - spread - 0.67449 * np.sqrt(spread)) ** 3
+    return float(np.sqrt(np.quantile(planes.rms_m[own] ** 2 / quartile, 0.25)))
 
 
 def _pair(first: str, second: str, checks: Checks) -> PairReport:

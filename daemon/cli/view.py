@@ -86,7 +86,9 @@ def _make(
             console.print(one_line(f"swath: {source.path}: {source.damage}; the page is of that part"))
             damaged = True
     if as_json:
-        print(json.dumps(numbers_of(look) | {"page": str(page)}, indent=2))
+        from daemon.processing.strips_run import finite
+
+        print(json.dumps(finite(numbers_of(look)) | {"page": str(page)}, indent=2, allow_nan=False))
     else:
         print(f"{len(look.strips)} strip{'s' * (len(look.strips) != 1)}, {look.surface.points:,} points: {page}")
     return damaged

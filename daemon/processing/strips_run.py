@@ -186,7 +186,14 @@ class Judgement:
         gridded = {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
         return {
             "input": self.strips.what,
-            "strips": [{"name": name, "roughness_m": self.report.roughness_m.get(name)} for name in self.report.names],
+            "strips": [
+                {
+                    "name": name,
+                    "roughness_m": self.report.roughness_m.get(name),
+                    "repeatability_m": self.report.repeatability_m.get(name),
+                }
+                for name in self.report.names
+            ],
             "cell_m": self.report.cell_m,
             "pairs": [
                 {
@@ -272,7 +279,7 @@ def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:
         )
     found = None if strips.seen is None else signatures(report.checks, strips.seen)
     all_pairs = strips.look.overlap.numbers()
-    within = list(report.roughness_m.values())
+    within = list(report.repeatability_m.values())
     judged = judge(
         overlap_rms_m=None if all_pairs is None else all_pairs["rms_m"],
         overlap_max_m=None if all_pairs is None else all_pairs["max_m"],

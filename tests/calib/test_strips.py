@@ -175,6 +175,16 @@ def test_the_second_strip_higher_is_a_negative_difference_with_all_its_numbers()
     assert report.roughness_m["01"] == pytest.approx(0.02, rel=0.02)
 
 
+@pytest.mark.parametrize("noise_m", [0.02, 0.08])
+def test_repeatability_is_the_noise_also_beyond_what_is_compared(noise_m: float) -> None:
+    """Planes rougher than 6 cm are not compared; what is left of 8 cm of noise would keep any limit of 6."""
+    report = differences(surface_flight([level, level], noise_m=noise_m), RULES)
+    assert report.repeatability_m["01"] == pytest.approx(noise_m, rel=0.06)
+    assert report.repeatability_m["02"] == pytest.approx(noise_m, rel=0.06)
+    judged = {one.level: one for one in judge(overlap_rms_m=0.01, within_rms_m=report.repeatability_m["01"])}
+    assert judged["QL2"].kept["within_m"] is (noise_m < 0.06)
+
+
 def test_differences_of_heights_are_those_of_gentle_slopes_only() -> None:
     def roof(east: FloatArray, north: FloatArray) -> FloatArray:
         return np.where(east > 0.0, 0.5 * east, 0.0) + 0.0 * north
@@ -277,6 +287,12 @@ def test_a_level_is_kept_when_rms_and_largest_difference_are(
     assert best_of(judged) == best
     assert (judged[-1].standard, judged[-1].level) == (ASPRS_2014, asprs)
     assert [one.level for one in judged if one.standard == USGS] == ["QL0", "QL1", "QL2", "QL3"]
+
+
+def test_a_repeatability_says_nothing_of_a_limit_of_the_largest_difference() -> None:
+    judged = judge(overlap_rms_m=0.02, overlap_max_m=0.05, within_rms_m=0.029)
+    assert judged[-1].kept["within_m"] is None
+    assert judged[0].kept["within_m"] is True
 
 
 def test_what_was_not_measured_is_neither_kept_nor_broken() -> None:
