@@ -7,7 +7,7 @@ never a reason to restart: a restart would only cost the data of the others.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from daemon.acquire import Receiver
 from daemon.recorder import WriterHealth, Writing
@@ -30,6 +30,11 @@ def stuck_threads(receivers: Iterable[Receiver], writer: WriterHealth, now_ns: i
     if writer.status_ns < limit - int(1e9):
         stuck.append("writer")
     return stuck
+
+
+def a_restart_helps_nobody(stuck: Collection[str], receivers: Iterable[Receiver]) -> bool:
+    """Whether all that is stuck is being opened: it has nothing to lose yet, and opens no sooner by a restart."""
+    return {receiver.source for receiver in receivers if receiver.opening}.issuperset(stuck)
 
 
 def duration_text(seconds: float) -> str:

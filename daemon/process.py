@@ -17,7 +17,7 @@ from daemon.block_queue import QueueItem
 from daemon.control import Control
 from daemon.errors import ExitCode, UserError
 from daemon.events import Severity
-from daemon.health import sentence, stuck_threads
+from daemon.health import a_restart_helps_nobody, sentence, stuck_threads
 from daemon.host_clock import read_clock_discipline, read_clock_sample
 from daemon.journal import threads_text
 from daemon.recorder import Writing
@@ -153,10 +153,12 @@ class RecorderProcess:
         while not self._must_end():
             await asyncio.sleep(period_s)
             stuck = stuck_threads(self._assembly.receivers, self._assembly.recorder.health)
-            if not stuck:
-                self._service.notify(WATCHDOG="1", STATUS=self._sentence())
+            told = f"STUCK: {', '.join(stuck)}" if stuck else ""
+            if a_restart_helps_nobody(stuck, self._assembly.receivers):
+                self._service.notify(WATCHDOG="1", STATUS="; ".join(filter(None, [self._sentence(), told])))
             elif stuck != self._stuck:
-                self._service.notify(STATUS=f"STUCK: {', '.join(stuck)}")
+                self._service.notify(STATUS=told)
+            if stuck and stuck != self._stuck:
                 text = f"no progress in {', '.join(stuck)}"
                 self._assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)
                 log.critical("%s", threads_text())  # before a restart wipes it out

@@ -16,7 +16,7 @@ from dataclasses import fields
 from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
-from drivers.transports.base import Transport, TransportCounters, TransportError
+from drivers.transports.base import PpsSource, Transport, TransportCounters, TransportError
 
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0
@@ -103,7 +103,7 @@ class Session(Generic[UnitT]):
         source = self._make_source()
         try:
             source.open()
-        except TransportError as error:
+        except OSError as error:  # `TransportError`, and what a driver did not foresee: another try may succeed
             self._fail(error)
             return
         with self._lock:
@@ -130,7 +130,7 @@ class Session(Generic[UnitT]):
             self._wait_s = FIRST_WAIT_S
         return units
 
-    def _fail(self, error: TransportError) -> None:
+    def _fail(self, error: OSError) -> None:
         now_s = self._monotonic_s()
         if self.state is SessionState.OPEN and now_s - self._opened_at_s > LONGEST_WAIT_S:
             self._wait_s = FIRST_WAIT_S
@@ -145,7 +145,7 @@ class Session(Generic[UnitT]):
             if source is None:
                 return
             source.close()
-            if isinstance(source, Transport):
+            if isinstance(source, Transport | PpsSource):
                 self._past = _sum(self._past, source.poll_counters())
 
     def _change(self, state: SessionState, reason: str = "") -> None:
@@ -171,7 +171,9 @@ class Session(Generic[UnitT]):
         """The kernel's counts over all openings; the buffer sizes are those of the present or last one."""
         with self._lock:
             source = self._source
-            return _sum(self._past, source.poll_counters()) if isinstance(source, Transport) else self._past
+            if isinstance(source, Transport | PpsSource):
+                return _sum(self._past, source.poll_counters())
+            return self._past
 
     def close(self) -> None:
         """End the session; a blocked `receive` returns, every later one gives nothing."""

@@ -93,7 +93,9 @@ build_program() {
     done
     documents="$building/share/doc/swath"
     mkdir -p "$documents"
-    cp -R "$source/README.md" "$source/LICENSE" "$source/docs" "$documents/"
+    cp -R "$source/README.md" "$source/LICENSE" "$source/CHANGELOG.md" "$source/docs" "$documents/"
+    mkdir -p "$documents/fixtures/config"
+    cp "$source/fixtures/config/aircraft.toml" "$documents/fixtures/config/"
 }
 
 put_in_place() {
@@ -125,7 +127,10 @@ activate() {
     systemd-tmpfiles --create "$1"
     sysctl -q -p "$2"
     systemctl daemon-reload
-    ! command -v udevadm >/dev/null || udevadm control --reload || echo "udev is not running; its rules hold from the next start"
+    if command -v udevadm >/dev/null; then # devices that are there get their names and rights now
+        udevadm control --reload && udevadm trigger --subsystem-match=pps --subsystem-match=tty ||
+            echo "udev is not running; its rules hold from the next start"
+    fi
     echo "edit /etc/swath/swath.toml, then: swath check /etc/swath/swath.toml && systemctl enable --now swathd"
 }
 

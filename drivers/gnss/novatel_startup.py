@@ -26,7 +26,9 @@ RAW_LOGS = (
     "GALFNAVEPHEMERISB ONNEW",
     "BDSEPHEMERISB ONNEW",
 )
-IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVAXB ONTIME 0.1", "INSCONFIGB ONCHANGED")
+# INSPVAS has no sigmas, INSPVAX says them once a second; georeferencing that takes the INS's attitude as it is logged
+# interpolates between epochs, so they are 20 ms apart
+IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVASB ONTIME 0.02", "INSPVAXB ONTIME 1", "INSCONFIGB ONCHANGED")
 SAVE = "SAVECONFIG"
 
 

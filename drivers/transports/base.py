@@ -132,6 +132,10 @@ class PpsSource(ABC):
     def receive(self, timeout_s: float) -> list[RawEdge]:
         """Wait at most ``timeout_s`` for edges not yet handed over; an empty list on silence."""
 
+    def poll_counters(self) -> TransportCounters:
+        """What came and is no edge; nothing, of a source that gives edges only."""
+        return TransportCounters()
+
     @abstractmethod
     def close(self) -> None:
         """Close; a second call does nothing."""

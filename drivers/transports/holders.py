@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_UDP_TABLE = Path("/proc/net/udp")
+_UDP_TABLE = Path("/proc/self/net/udp")  # /proc/net is hidden where a service's /proc holds processes only
 
 
 def process_holding(target: str) -> str:
@@ -21,8 +21,12 @@ def process_holding(target: str) -> str:
 
 
 def udp_port_holder(port: int) -> str:
-    """Name and id of a process that has a UDP socket on local ``port``."""
-    for line in _UDP_TABLE.read_text(encoding="ascii").splitlines()[1:]:
+    """Name and id of a process that has a UDP socket on local ``port``; "another program" where that cannot be seen."""
+    try:
+        table = _UDP_TABLE.read_text(encoding="ascii")
+    except OSError:
+        return "another program"
+    for line in table.splitlines()[1:]:
         fields = line.split()
         if int(fields[1].partition(":")[2], 16) == port:
             return process_holding(f"socket:[{fields[9]}]")

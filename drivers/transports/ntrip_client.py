@@ -26,6 +26,7 @@ from drivers.transports.uri import TransportSpec, ntrip_position
 
 CONNECT_S = 8.0  # for each address of the caster, and again for its answer
 SLICE_S = 0.1
+OPEN_S = 18.0  # for all of it: name, connection, answer; the watchdog takes 20 s of opening for stuck
 SILENT_S = 60.0  # then the connection is taken for dead
 READ_BYTES = 65536
 MOST_HEADER_BYTES = 16384
@@ -63,11 +64,14 @@ class NtripTransport(DescriptorTransport):
         self._heard_s = self._told_s = 0.0
 
     def _open_device(self) -> int:
-        attempt = _Attempt(self._connect)
+        attempt, limit_s = _Attempt(self._connect), time.monotonic() + OPEN_S
         while not attempt.wait(SLICE_S):
-            if self._stopped():
+            if self._stopped() and not attempt.wait(0.0):
                 attempt.leave()
-                raise TransportError(f"{self.name}: not connected before the end")
+                raise TransportError(f"{self.name}: not connected in the time")
+            if time.monotonic() > limit_s:
+                attempt.leave()
+                raise TransportError(f"{self.name}: no connection within {OPEN_S:g} s; is the network there?")
         self._sock = attempt.result()
         self._heard_s = time.monotonic()
         self._told_s = -math.inf

@@ -12,7 +12,7 @@ import stat
 import threading
 import time
 
-from drivers.transports.base import PpsSource, RawEdge, TransportError
+from drivers.transports.base import PpsSource, RawEdge, TransportCounters, TransportError
 from drivers.transports.descriptor import Gate
 
 READ_BYTES = 65536
@@ -141,6 +141,10 @@ class FixedPps(PpsSource):
                 return RawEdge(realtime_ns, sequence, self._edge)
         self.garbage_lines += 1
         return None
+
+    def poll_counters(self) -> TransportCounters:
+        """Lines that are no edge, as ``refused``."""
+        return TransportCounters(refused=self.garbage_lines)
 
     def close(self) -> None:
         """Wake a blocked `receive` and close."""

@@ -8,6 +8,7 @@ broadcasts too; bound to one address of this machine it does not.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import socket
@@ -52,11 +53,15 @@ class UdpTransport(DescriptorTransport):
         self._sock: socket.socket | None = None
         self._drops: DropCounter | None = None
         self._reader: MessageReader | None = None
+        self._interface_index: int | None = None
+        self._looked_s = 0.0
 
     def _open_device(self) -> int:
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
         try:
             self._configure(sock)
+            interface = self._spec.options.get("interface")
+            self._interface_index = None if interface is None else socket.if_nametoindex(interface)
         except OSError as error:
             sock.close()
             raise TransportError(self._why(error)) from error
@@ -107,7 +112,7 @@ class UdpTransport(DescriptorTransport):
             return f"{self.name}: no network interface {self._spec.options['interface']} with an IPv4 address"
         if error.errno == errno.ENODEV:
             return f"{self.name}: no network interface reaches the group; say ?interface=<name>"
-        return f"{self.name}: cannot open: {error.strerror}"
+        return f"{self.name}: cannot open: {error.strerror or error}"
 
     def _close_device(self) -> None:
         if self._sock is not None:
@@ -121,6 +126,7 @@ class UdpTransport(DescriptorTransport):
     def _receive(self, gate: Gate, timeout_s: float) -> list[UnitBlock]:
         deadline_s = time.monotonic() + timeout_s
         if not gate.wait(timeout_s):
+            self._look_after_interface()
             return []
         batch_s = min(self._batch_s, deadline_s - time.monotonic())
         if self.counters.receive_buffer_bytes < SMALL_BUFFER_BYTES:
@@ -128,6 +134,27 @@ class UdpTransport(DescriptorTransport):
         if batch_s > 0:
             time.sleep(batch_s)
         return self._drain()
+
+    def _look_after_interface(self) -> None:
+        """On silence, once a second: a socket hears nothing of an interface that went and came back as another one.
+
+        A group without a named interface is joined again where the route to it leads now.
+        """
+        now_s = time.monotonic()
+        if self._sock is None or now_s < self._looked_s + 1.0:
+            return
+        self._looked_s = now_s
+        interface, group = self._spec.options.get("interface"), self._spec.options.get("group")
+        if interface is not None:
+            try:
+                same = socket.if_nametoindex(interface) == self._interface_index
+            except OSError:
+                same = False
+            if not same:
+                raise TransportError(f"{self.name}: network interface {interface} has gone, or came back as another")
+        elif group is not None:
+            with contextlib.suppress(OSError):  # joined there already, or no route just now
+                self._join(self._sock, group, self._spec.host)
 
     def _drain(self) -> list[UnitBlock]:
         assert self._sock is not None

@@ -411,10 +411,11 @@ def test_bad_lines_are_counted_and_the_rest_is_read(tmp_path: Path) -> None:
     assert "line 3 is longer than 4096 bytes" in tally.first_damage
     assert tally.passed["frames that candump missed"] == 7
     packed = tmp_path / "cut.log.gz"
-    packed.write_bytes(gzip.compress(path.read_bytes())[:-9])
+    packed.write_bytes(gzip.compress(b"(1.000001) can0 123#00\n(1.000003) can0 123#01\n")[:-9])
     tally = CaptureTally()
     list(read_candump(packed, tally=tally))
-    assert "cannot be read on" in tally.first_damage or tally.damage > 1
+    assert tally.damage == 1
+    assert "cannot be read on" in tally.first_damage
 
 
 def test_real_frames_are_written_as_they_were_read(tmp_path: Path) -> None:

@@ -112,9 +112,6 @@ def test_points_agree_with_the_golden_cloud_of_nebula(model: Model) -> None:
     unturned["encoder_rad"] -= turned
     assert are_near(theirs, beam_points(unturned, parser.beams), 1e-4).all()
     assert len(theirs) > 30_000
-    ours = beam_points(rows, parser.beams)
-    apart_m = np.linalg.norm(ours - beam_points(unturned, parser.beams), axis=1)
-    assert (apart_m <= rows["range_m"] * turned).all()
 
 
 @MODELS

@@ -81,6 +81,19 @@ def test_absent_at_start_the_wait_doubles_up_to_its_limit(bench: Bench) -> None:
     assert bench.session.last_error == "switch: there is no device"
 
 
+def test_what_a_driver_did_not_foresee_is_waited_for_too() -> None:
+    """An error of the system while opening ends no thread: the next try may succeed."""
+
+    class Odd(SwitchTransport):
+        def open(self) -> None:
+            raise FileNotFoundError(2, "No such file or directory", "/dev/none")
+
+    session: Session[UnitBlock] = Session(Odd, pause=lambda _: None)
+    assert session.receive(0.1) == []
+    assert state_of(session) == SessionState.WAITING
+    assert session.last_error == "[Errno 2] No such file or directory: '/dev/none'"
+
+
 def test_a_pause_is_never_longer_than_the_time_given(bench: Bench) -> None:
     bench.refuse_open = True
     for _ in range(200):

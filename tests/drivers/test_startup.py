@@ -137,7 +137,7 @@ class TestNovatel:
         logs = re.findall(r"^LOG (\w+)B (?:ONNEW|ONCHANGED|ONTIME \d)", "\n".join(texts(messages)), re.MULTILINE)
         assert len(logs) == len(messages) - 1
         layouts = {layout.name for layout in novatel_layouts.LAYOUTS.values()}
-        decoded = {"TIME", "BESTPOS", "BESTVEL", "MARK1TIME", "MARK2TIME", "HEADING2", "RAWIMUSX", "INSPVAX"}
+        decoded = {"TIME", "BESTPOS", "BESTVEL", "MARK1TIME", "MARK2TIME", "HEADING2", "RAWIMUSX", "INSPVAS", "INSPVAX"}
         assert decoded | {"INSCONFIG"} <= layouts & set(logs)
         raw = {log.split()[0].removesuffix("B") for log in novatel_startup.RAW_LOGS}
         assert set(logs) - raw <= layouts

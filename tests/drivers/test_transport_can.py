@@ -294,8 +294,9 @@ def test_virtual_bus_without_a_descriptor() -> None:
     transport.close()
 
 
-@pytest.mark.parametrize("text", [MULTICAST.format(43119), "can:virtual:swath-blocked"])
-def test_close_from_another_thread_ends_a_blocked_receive(text: str) -> None:
+@pytest.mark.parametrize("kind", [MULTICAST, "can:virtual:swath-blocked"])
+def test_close_from_another_thread_ends_a_blocked_receive(kind: str) -> None:
+    text = kind.format(free_port())
     transport = open_transport(parse_transport(text))
     transport.open()
     got: list[object] = []

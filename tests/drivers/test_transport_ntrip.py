@@ -11,6 +11,7 @@ import time
 import pynmea2
 import pytest
 
+from drivers.transports import ntrip_client
 from drivers.transports.base import Transport, TransportError
 from drivers.transports.ntrip_client import NtripTransport, gga_sentence
 from drivers.transports.uri import TransportSpec, open_transport, parse_transport
@@ -172,10 +173,29 @@ def test_a_caster_that_says_nothing_holds_nobody_up() -> None:
         spec = parse_transport(f"ntrip:127.0.0.1:{found.port}/A")
         threading.Timer(0.3, stopped.set).start()
         started_s = time.monotonic()
-        with pytest.raises(TransportError, match="before the end"):
+        with pytest.raises(TransportError, match="not connected in the time"):
             NtripTransport(spec, stopped.is_set).open()
         assert time.monotonic() - started_s < 6.0  # of 8 that it would wait
         hold.set()
+
+
+def test_an_opening_has_an_end_however_long_the_network_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Name servers that do not answer: given up before the recorder's watchdog would take it for stuck."""
+    monkeypatch.setattr(ntrip_client, "OPEN_S", 0.3)
+    hold = threading.Event()
+    made: list[socket.socket] = []
+
+    def slow(address: tuple[str, int], timeout: float) -> socket.socket:
+        hold.wait(30.0)
+        made.append(socket.socket())
+        return made[-1]
+
+    monkeypatch.setattr(socket, "create_connection", slow)
+    one = NtripTransport(TransportSpec("ntrip", "caster.example:2101/ZIMM0"))
+    with pytest.raises(TransportError, match=r"caster\.example:2101/ZIMM0: no connection within 0\.3 s"):
+        one.open()
+    one.close()
+    hold.set()
 
 
 def test_a_bad_chunk_is_told() -> None:

@@ -299,3 +299,15 @@ def test_dcd_sequence_shows_a_missed_pulse() -> None:
     second = edge_at_wake_up(12, 14, False)
     after_one_missed = edge_at_wake_up(16, 18, False)
     assert [first[1], second[1], after_one_missed[1]] == [5, 6, 8]
+
+
+def test_lines_that_are_no_edge_are_counted_as_refused(tmp_path: Path) -> None:
+    """A writer that says seconds where nanoseconds are wanted is no silence."""
+    path = tmp_path / "edges"
+    path.write_text("1700000000.5 1\n1700000001000000000 2\n1700000001.5 3\n")
+    session: Session[RawEdge] = Session(lambda: FixedPps(str(path)))
+    session.receive(0.0)
+    assert [edge.sequence for edge in session.receive(1.0)] == [2]
+    assert session.poll_counters().refused == 2
+    session.close()
+    assert session.poll_counters().refused == 2

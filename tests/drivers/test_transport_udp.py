@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.transports import holders
 from drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
 from drivers.transports.udp_socket import UdpTransport
 from drivers.transports.uri import parse_transport
@@ -257,6 +258,37 @@ def test_multicast_group_and_nothing_else(sender: socket.socket, where: str) -> 
     udp.close()
 
 
+@pytest.mark.parametrize("index", [99, None])
+def test_an_interface_that_is_another_one_now_is_gone(monkeypatch: pytest.MonkeyPatch, index: int | None) -> None:
+    """As an adapter that fell off its bus and came back: the socket would stay silent for ever and say nothing."""
+    udp = transport("?interface=lo")
+    udp.open()
+    assert udp.receive(0.05) == []
+
+    def now(name: str) -> int:
+        assert name == "lo"
+        if index is None:
+            raise OSError("no interface with this name")
+        return index
+
+    monkeypatch.setattr(socket, "if_nametoindex", now)
+    udp._looked_s = 0.0
+    with pytest.raises(TransportError, match="network interface lo has gone, or came back as another"):
+        udp.receive(0.05)
+    udp.close()
+
+
+def test_a_group_is_still_heard_after_a_silence() -> None:
+    udp = transport(f"?group={GROUP}")
+    udp.open()
+    udp._looked_s = 0.0
+    assert udp.receive(0.05) == []
+    with multicast_sender("127.0.0.1") as scanner:
+        scanner.sendto(b"group", (GROUP, port_of(udp)))
+        assert payloads(collect(udp, 1)) == [b"group"]
+    udp.close()
+
+
 def test_multicast_source_filter() -> None:
     udp = transport(f"?group={GROUP}&source=127.0.0.3")
     udp.open()
@@ -278,6 +310,16 @@ def test_two_may_listen_to_a_group() -> None:
     assert payloads(collect(first, 1)) == payloads(collect(second, 1)) == [b"to all"]
     first.close()
     second.close()
+
+
+def test_port_in_use_without_a_table_of_ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As under a service whose /proc holds processes only: the device is waited for, not failed on."""
+    monkeypatch.setattr(holders, "_UDP_TABLE", tmp_path / "absent")
+    first = transport()
+    first.open()
+    with pytest.raises(TransportError, match=f"port {port_of(first)} is in use by another program"):
+        transport(port=port_of(first)).open()
+    first.close()
 
 
 def test_port_in_use_names_the_holder() -> None:

@@ -177,6 +177,24 @@ def without_live(service: Machine) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("without_live")
+def test_a_port_in_use_is_waited_for(service: Machine) -> None:
+    """Whose it is the service cannot see; it records the others meanwhile, and the scanner once the port is free."""
+    holder = "import socket, time; s = socket.socket(2, 2); s.bind(('127.0.0.1', 2368)); time.sleep(3600)"
+    service.told("systemctl stop swathd", COMES_BACK_S)
+    service.told(f'systemd-run -q --unit=viewer /usr/bin/python3 -c "{holder}"')
+    service.until("grep -q ':0940 ' /proc/net/udp")
+    service.told("systemctl start swathd", COMES_BACK_S)
+    service.until("systemctl show -P StatusText swathd | grep 'scanner/left absent'", COMES_BACK_S)
+    pid = shown(service, "MainPID")
+    service.told("sleep 10")
+    assert shown(service, "MainPID") == pid
+    assert "port 2368 is in use by another program" in service.told("journalctl -b -o cat -u swathd")
+    service.told("systemctl stop viewer")
+    service.until("systemctl show -P StatusText swathd | grep -v scanner/left | grep ^recording", COMES_BACK_S)
+    assert shown(service, "MainPID") == pid
+
+
+@pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
 def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place: Path, thread: str) -> None:
     """systemd's watchdog ends it; the next one records at once, and repairs the old log beside it."""
