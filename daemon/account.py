@@ -12,6 +12,8 @@ from daemon.host_clock import HostClock
 from daemon.log.encode import EncodedBlock
 from daemon.parts import Parts
 
+STUCK_AFTER_S = 5.0  # without an account; a receiver that lives gives four a second while its device is open
+
 TimeStatus = Callable[[str], "dict[str, object]"]
 
 
@@ -28,6 +30,7 @@ class Account:
     ) -> None:
         self.counts: dict[str, SourceCount] = {}
         self.unwritten: Counter[int] = Counter()
+        self._heard_ns: dict[str, int] = {}
         self._parts = parts
         self._channels = channels
         self._events = events
@@ -38,8 +41,13 @@ class Account:
 
     def add_source(self, source: str) -> None:
         """A source that gets a status."""
-        self.counts[source] = SourceCount()
+        self.note(source, SourceCount())
         self._status_channels[source] = JsonChannel(self._channels, "status", f"/status/{source}", "swath.Status")
+
+    def note(self, source: str, count: SourceCount) -> None:
+        """A receiver's account has come."""
+        self.counts[source] = count
+        self._heard_ns[source] = self._clock.now_ns()
 
     def statuses(self, common: Mapping[str, object]) -> dict[str, dict[str, object]]:
         """A status a source; ``common`` is what is the same for all: queue and disk."""
@@ -64,7 +72,9 @@ class Account:
         count = self.counts[source]
         written, lost_write = self._written_and_lost(source)
         self._check(source, count, written, lost_write)
-        age = None if count.last_unit_ns is None else round((self._clock.now_ns() - count.last_unit_ns) * 1e-9, 3)
+        now_ns = self._clock.now_ns()
+        age = None if count.last_unit_ns is None else round((now_ns - count.last_unit_ns) * 1e-9, 3)
+        quiet = now_ns - self._heard_ns[source] > STUCK_AFTER_S * 1e9
         status: dict[str, object] = {
             "bytes": count.bytes,
             "units": count.units,
@@ -75,7 +85,7 @@ class Account:
             "last_unit_age_s": age,
             "receive_buffer_bytes": count.receive_buffer_bytes,
             **common,
-            "state": count.state,
+            "state": "stuck" if quiet and count.state in ("receiving", "silent") else count.state,
             "stamp_ambiguous": count.stamp_ambiguous,
             **count.trouble,
         }

@@ -10,6 +10,8 @@ from daemon.acquire import WAIT_S, Receiver, Shared
 from daemon.channels import JsonChannel
 from daemon.events import Severity
 from daemon.host_clock import read_clock_pair
+from daemon.log.encode import MESSAGE_HEADER_BYTES
+from daemon.wire_trouble import WireTrouble
 from drivers.session import Session, SessionState
 from drivers.transports.base import RawEdge
 
@@ -36,6 +38,7 @@ class PpsReceiver(Receiver):
         self._edge_seen = edge_seen
         self._channel = JsonChannel(shared.channels, self.source, f"/pps/{name}", "swath.Pps")
         self._overwrites = overwrites
+        self._trouble = WireTrouble(self.source, shared.events)
         self._sequence: int | None = None
         self._openings = 0
 
@@ -59,6 +62,7 @@ class PpsReceiver(Receiver):
     def receive_once(self) -> None:
         """One wait, and what there is to tell of the device."""
         self.take(WAIT_S)
+        self.account.trouble = self._trouble.look(self._session.poll_counters())
         self.tell_state(self._session.state, self._session.last_error)
         self.tell_account()
 
@@ -67,6 +71,7 @@ class PpsReceiver(Receiver):
         if self._session.state is SessionState.OPEN:
             self.drain()
         self._session.close()
+        self.account.trouble = self._trouble.look(self._session.poll_counters())
         self.tell_account(now=True)
 
     def _hand_over(self, edge: RawEdge, host_ns: int) -> None:
@@ -78,7 +83,7 @@ class PpsReceiver(Receiver):
             "realtime_ns": edge.realtime_ns,
         }
         encoded = self._channel.encode(self.shared.clock.now_ns(), value)
-        self.note_units(1, len(encoded.data), host_ns)
+        self.note_units(1, len(encoded.data) - MESSAGE_HEADER_BYTES, host_ns)
         self.hand_over(encoded)
         self._edge_seen(host_ns, edge.sequence)
 

@@ -5,6 +5,7 @@ Nothing is written, nothing is sent. Every wire has its own thread, so all are h
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import threading
@@ -37,16 +38,21 @@ CLOCK_RATE_FACTOR = 5.0  # a counter that runs faster or slower by this is read 
 EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Span:
     """How long to listen: ``seconds``, or until ``stop`` is set."""
 
     seconds: float
     stop: threading.Event = field(default_factory=threading.Event)
+    _ends_s: float = field(default=math.inf, init=False)
+
+    def is_over(self) -> bool:
+        """Whether nobody listens any more."""
+        return self.stop.is_set() or time.monotonic() > self._ends_s
 
     def listen(self, session: Session[Any]) -> Iterable[list[Any]]:
         """What a session hands over until the time is up."""
-        deadline_s = time.monotonic() + self.seconds
+        deadline_s = self._ends_s = time.monotonic() + self.seconds
         while not self.stop.is_set() and (left_s := deadline_s - time.monotonic()) > 0:
             if got := session.receive(min(SLICE_S, left_s)):
                 yield got
@@ -139,7 +145,7 @@ class Wire:
 
     def listen(self, span: Span) -> None:
         """Feed the readings until the time is up; then say what is wrong with the wire."""
-        session = Session(lambda: open_transport(self._spec, span.stop.is_set))
+        session = Session(lambda: open_transport(self._spec, span.is_over))
         for blocks in span.listen(session):
             for block in blocks:
                 batch = _batch(self.report.source, block)
@@ -158,7 +164,10 @@ class Wire:
             if self._spec.kind == "can" and self._spec.interface == "socketcan":
                 report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
             if counters.refused:
-                report.notes.append(f"{counters.refused} datagrams of other senders than the configured source")
+                what = "messages or lines that nobody can read; is the adapter's speed right?"
+                if self._spec.kind == "udp":
+                    what = "datagrams of other senders than the configured source"
+                report.notes.append(f"{counters.refused} {what}")
 
 
 def check_everything(config: Config, seconds: float) -> list[Report]:
@@ -234,6 +243,8 @@ def check_pps(report: Report, edge: str, span: Span) -> None:
     for got in span.listen(session):
         edges += got
     session.close()
+    if refused := session.poll_counters().refused:
+        report.notes.append(f"{refused} lines that are no edge; want 'realtime_ns sequence', both whole numbers")
     report.opens, report.units = session.openings > 0, len(edges)
     report.records["edges"] = len(edges)
     if session.last_error:

@@ -15,6 +15,7 @@ import numpy as np
 from georef.records import Int64Array
 
 STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
+LATER_NS = 1_000_000_000  # a stamp so much later than its reading is of a clock that was stepped on, and back meanwhile
 NEARER = 10  # a step that misses by a tenth of what the other does is the right one
 _BRACKET_NS = 20_000  # two MONOTONIC reads around one of REALTIME, no further apart, bound its error to half of this
 _BRACKET_TRIES = 8
@@ -107,7 +108,9 @@ class StampConverter:
         host = stamps_ns - new_step
         if new_step != old_step:
             host = self._place(stamps_ns, old_step, new_step, previous_read_ns, read_ns)
-        return np.where(stamps_ns == 0, read_ns, host)
+        later = (stamps_ns != 0) & (host > read_ns + LATER_NS)
+        self.ambiguous += int(later.sum())
+        return np.where((stamps_ns == 0) | later, read_ns, host)
 
     def _place(
         self, stamps_ns: Int64Array, old_step: int, new_step: int, previous_read_ns: int, read_ns: int

@@ -243,7 +243,7 @@ class MadeLog:
         self._flush()
         now_ns = self.clock.time_ns
         for name, source in self.sources.items():
-            self._account.counts[name] = self.count_of(source, now_ns)
+            self._account.note(name, self.count_of(source, now_ns))
         for block in self._account.encode(self._account.statuses(_NO_DISK_FIGURES)):
             self._parts.add(block)
         self.lay_told()

@@ -177,7 +177,7 @@ class Recorder(threading.Thread):
         if item.block is not None:
             self._lay(item.block)
         if item.count is not None:
-            self._account.counts[item.source] = item.count
+            self._account.note(item.source, item.count)
 
     def _lay(self, block: EncodedBlock) -> None:
         """Into the current part; where there is none, events wait for the next one and units are counted as lost."""

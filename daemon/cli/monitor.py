@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EVENTS_SHOWN = 8
 FIRST_STATUS_S = 3.0  # a recorder that has just begun tells its first status after a second
-STATE_STYLE = {"receiving": "green", "silent": "red", "absent": "red", "opening": "yellow"}
+STATE_STYLE = {"receiving": "green", "silent": "red", "stuck": "red", "absent": "red", "opening": "yellow"}
 EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording": 2}
 
 

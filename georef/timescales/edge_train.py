@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -184,6 +185,18 @@ class EdgeTrain:
 
 
 KNOT_NUMBERS = 10  # fraction of a ns, drift, three (co)variances, wander, three excess variances, shrink
+
+
+def forget_later(edges: deque[int], train: EdgeTrain | None, host_ns: int) -> bool:
+    """Whether an edge before the latest of some goes on with a train all the same; then those after it are dropped.
+
+    They were none of the train's: an edge that is stamped in the future must stop no clock.
+    """
+    if train is None or host_ns <= train.last_host_ns or (edges and host_ns == edges[-1]):
+        return False
+    while edges and edges[-1] >= host_ns:
+        edges.pop()
+    return True
 
 
 class KnotTable:

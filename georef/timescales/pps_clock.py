@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
 from georef.timescales.clock_status import ClockEvent, ClockStatus, EventLog, Severity, TimeState
 from georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
-from georef.timescales.edge_train import MAX_REFUSED_IN_A_ROW, NOISY_AFTER_EDGES, EdgeTrain, find_chain
+from georef.timescales.edge_train import MAX_REFUSED_IN_A_ROW, NOISY_AFTER_EDGES, EdgeTrain, find_chain, forget_later
 from georef.timescales.gps_time import (
     SECOND_NS,
     gps_ns_from_unix,
@@ -88,7 +88,7 @@ class PpsClock:
         """One edge at a host time. sequence (the kernel's) is not needed: the edge's place is its time."""
         del sequence
         host = int(host_ns) - self._delay_ns
-        if self._edges and host <= self._edges[-1]:
+        if self._edges and host <= self._edges[-1] and not forget_later(self._edges, self._train, host):
             self._refuse_edge("backwards")
             return
         host = self._without_quantisation(host)

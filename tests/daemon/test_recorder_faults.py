@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
 import threading
 import time
 import tty
@@ -387,7 +388,14 @@ def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watch
         numbers.send(1)
         recorder.wait_said("scanner/left receiver_failed")
         if watchdog_s is None:
-            time.sleep(2.0)
+            said: list[subprocess.CompletedProcess[str]] = []
+
+            def is_told() -> bool:
+                said.append(swath("monitor", "--once", str(logs)))
+                return "scanner/left stuck" in said[-1].stdout
+
+            wait_until(is_told, "the monitor tells that a receiver is stuck")
+            assert said[-1].returncode == 1
             assert recorder.process.poll() is None
             assert recorder.stop() == 1
         else:

@@ -10,16 +10,18 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from daemon.acquire import Shared
+from daemon.acquire import Receiver, Shared
 from daemon.acquire_pps import PpsReceiver
 from daemon.block_queue import BlockQueue, QueueItem, SourceCount
 from daemon.channels import ChannelTable
 from daemon.events import Events, Severity
-from daemon.health import sentence, stuck_threads
+from daemon.health import a_restart_helps_nobody, sentence, stuck_threads
 from daemon.host_clock import HostClock
 from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from daemon.log.format import ChannelSpec, SessionInfo
@@ -308,6 +310,23 @@ def test_sentence_says_what_an_operator_must_know() -> None:
     stopped = WriterHealth(state=Writing.RESERVE, reason="3 MB free")
     assert sentence("s", 0, stopped) == "NOT RECORDING: 3 MB free"
     assert "begins" in sentence("s", 0, WriterHealth())
+
+
+def test_a_device_that_is_long_in_opening_is_told_and_restarts_nothing() -> None:
+    """A caster's name that is looked up for a minute must not cost the scanner's data."""
+    now_ns = 100_000_000_000
+    opening = SimpleNamespace(source="corrections/base", opening=True, came_back_ns=now_ns - 60_000_000_000)
+    hangs = SimpleNamespace(source="scanner/left", opening=False, came_back_ns=now_ns - 3_000_000_000)
+    writer = WriterHealth(status_ns=now_ns)
+    for receivers, names, helps_nobody in (([opening], ["corrections/base"], True), ([hangs], ["scanner/left"], False)):
+        threads = cast("list[Receiver]", receivers)
+        stuck = stuck_threads(threads, writer, now_ns)
+        assert stuck == names
+        assert a_restart_helps_nobody(stuck, threads) == helps_nobody
+    threads = cast("list[Receiver]", [opening, hangs])
+    assert not a_restart_helps_nobody(stuck_threads(threads, writer, now_ns), threads)
+    assert not a_restart_helps_nobody(["writer"], threads)
+    assert a_restart_helps_nobody([], threads)
 
 
 def test_a_writer_without_a_recent_status_is_stuck() -> None:

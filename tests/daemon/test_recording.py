@@ -135,7 +135,7 @@ def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: P
             if recorder.notify.count("WATCHDOG") > fed:
                 fed = recorder.notify.count("WATCHDOG")
                 longest, last = max(longest, time.monotonic() - last), time.monotonic()
-        assert longest < limit_s
+        assert max(longest, time.monotonic() - last) < limit_s
         assert "gnss/rover absent" in recorder.notify.last("STATUS")
         assert recorder.stop() == 0
     assert {event["source"] for event in read_log(logs).events("device_absent")} == {"gnss/rover", "pps/main"}

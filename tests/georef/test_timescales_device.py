@@ -45,6 +45,18 @@ def host_clock(seconds: int, *, message_s: float = 0.1, keep_history: bool = Tru
     return clock
 
 
+def test_an_edge_stamped_in_the_future_stops_no_clock() -> None:
+    """One wrong line of a FIFO, an hour ahead: refused, and the edges that come then are taken."""
+    clock = host_clock(30)
+    before = dict(clock.edges_refused)
+    clock.add_edge(int(host_ns(3630.4)))
+    for second in range(30, 45):
+        clock.add_edge(int(host_ns(second)), second)
+    status = clock.status(int(host_ns(45)))
+    assert status.state is TimeState.LOCKED
+    assert clock.edges_refused == before | {"off_prediction": 1}
+
+
 def rows_of(
     true_s: NDArray[np.float64],
     latency_s: NDArray[np.float64] | float = 0.0005,
