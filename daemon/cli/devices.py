@@ -18,7 +18,7 @@ def describe_driver(driver: Driver) -> dict[str, Any]:
         "kind": driver.kind,
         "transports": list(driver.transports),
         "yields": [record.__name__ for record in driver.yields],
-        "gives_time": driver.make_time_parser is not None,
+        "gives_time": driver.kind == "gnss",  # the clock takes its seconds from receivers only
         "names_edge": str(driver.names_edge) if driver.names_edge is not None else None,
         "needs": list(driver.needs),
         "summary": driver.summary,

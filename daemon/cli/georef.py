@@ -18,9 +18,7 @@ def command(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="A folder for the products.")],
     trajectory: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="SBET, Waypoint text, RTKLIB .pos or CSV; without it the log's INS, else IMU and GNSS."
-        ),
+        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; without it the log's INS, else IMU and GNSS."),
     ] = None,
     at: Annotated[
         str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")

@@ -158,8 +158,10 @@ def page(found: dict[str, Any]) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    good = found.get("trouble") == "" and not found.get("live_skipped_s")
-    parts: list[RenderableType] = [Text(found["sentence"], style="bold green" if good else "bold yellow"), Text("")]
+    from daemon.processing.live_status import is_well
+
+    style = "bold green" if is_well(found) else "bold yellow"
+    parts: list[RenderableType] = [Text(found["sentence"], style=style), Text("")]
     if "points" not in found:
         return Group(*parts)
     table = Table(box=None, pad_edge=False, header_style="bold")

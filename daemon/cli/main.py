@@ -6,6 +6,7 @@ line names.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import importlib.metadata
 import importlib.util
@@ -26,6 +27,7 @@ from daemon.memory import keep_freed_memory
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 HELP = """Airborne laser scanning: from the sensors' wires into a log that survives.
 
@@ -134,7 +136,7 @@ def run_app(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+        _drop_output()
         return PIPE_CLOSED
     except SystemExit as leaving:  # how Rich ends on a closed pipe
         if isinstance(leaving.__context__, BrokenPipeError):
@@ -143,6 +145,11 @@ def run_app(arguments: list[str]) -> int:
     except Exception as error:  # the last resort: everything a command did not foresee
         return _end_unforeseen(error)
     return int(result) if isinstance(result, int) else int(ExitCode.OK)
+
+
+def _drop_output() -> None:
+    """Have what is still buffered go nowhere: the interpreter would complain of it as it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _end_unforeseen(error: Exception) -> int:
@@ -155,6 +162,13 @@ def _end_unforeseen(error: Exception) -> int:
         return int(ExitCode.USAGE)
     if isinstance(error, typer.Abort):
         return INTERRUPTED
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        _say(f"{error.filename or 'what it was to write'}: {error.strerror}; make room and run it again")
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _drop_output()
+        return int(ExitCode.IO)
     path = _write_traceback(error)
     what = f"{type(error).__name__}: {error}".splitlines()[0]
     _say(f"internal error: {what} (details in {path})" if path else f"internal error: {what}")

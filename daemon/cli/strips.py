@@ -35,8 +35,13 @@ def command(
     level: Annotated[str | None, typer.Option(help="QL0, QL1, QL2 or QL3, which the strips must keep.")] = None,
     cells: Annotated[int, typer.Option(help="Of the overlap, that are looked into.", min=100)] = 20_000,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text, .pos or CSV.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text or CSV; default: their IMU and GNSS."),
     ] = None,
+    at: Annotated[
+        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+    ] = "body",
+    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
     calibration: Annotated[
         list[str] | None, typer.Option(metavar="[SCANNER=]FILE", help="Of logs: instead of their own.")
     ] = None,
@@ -77,7 +82,7 @@ def command(
     logs = Wish(
         logs=paths,
         output=output or Path(),
-        trajectory=TrajectoryWish(trajectory, navigate=True),
+        trajectory=TrajectoryWish(trajectory, week, at, navigate=True),
         options=Options(datum=datum, calibrations=calibrations_given(calibration or []), uncertainty=False),
         config=None if config is None else load_config(config),
         strips=strips,

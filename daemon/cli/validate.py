@@ -34,8 +34,13 @@ def command(
         typer.Option("--history", metavar="DIR|FILE", help="Calibrations of the same installation: has it moved?"),
     ] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="SBET, Waypoint text, .pos or CSV; default: the log's own.")
+        Path | None,
+        typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the logs' IMU and GNSS, navigated."),
     ] = None,
+    at: Annotated[
+        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+    ] = "body",
+    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
     datum: Annotated[
         str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
     ] = None,
@@ -77,7 +82,7 @@ def command(
         logs=Wish(
             logs=logs or [],
             output=output or Path(),
-            trajectory=TrajectoryWish(trajectory, navigate=True),
+            trajectory=TrajectoryWish(trajectory, week, at, navigate=True),
             options=Options(datum=datum, calibrations=given, uncertainty=False),
             config=None if config is None else load_config(config),
             strips=strips,

@@ -158,7 +158,9 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
     setups = [_setup(wish, session) for session in sessions]
     logs = [session.parts[0].path for session in sessions]
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
-    refusals.refuse_different_settings(configs, wish.options.crs)
+    for session in sessions:
+        refusals.refuse_no_name(session.session_id, session.parts[0].path)
+    refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum)
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.errors import ExitCode, UserError
-from daemon.processing.refusals import refuse_no_overlap, refuse_other_motion
+from daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
 from georef.formats.trajectory_file import read_trajectory
 from georef.stream_path import SHORTEST_TRAJECTORY
 from georef.trajectory import Trajectory, TrajectoryError
 from georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
-    from daemon.config.config import Config
     from daemon.log.reader import Session
     from daemon.processing.feed import LogClocks
     from daemon.processing.navigate import Navigated
@@ -78,6 +77,7 @@ def choose_trajectory(
     solutions: dict[str, int] = {}
     navigated: Navigated | None = None
     both = setup.imu_source is not None and bool(setup.config.gnss)
+    offset = offset_of(wish.at, setup)
     try:
         if wish.file is None:
             trajectory, solutions = _from_device(setup, clocks)
@@ -91,10 +91,13 @@ def choose_trajectory(
             doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
         refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
         trajectory.require_attitude()
+        if navigated is None:
+            doubts += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
-        offset = offset_of(wish.at, setup.config)
-        if offset is not None:
+        if offset is not None and navigated is not None:
+            doubts.append(f"{log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at")
+        elif offset is not None:
             trajectory = trajectory.at_body(offset)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
@@ -147,8 +150,8 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
         raise UserError("\n".join(f"{line}{hint}" for line in error.message.splitlines()), error.exit_code) from error
 
 
-def offset_of(at: str, config: Config) -> Vector | None:
-    """Where a trajectory's point is, from the body's origin in b; None: there.
+def offset_of(at: str, setup: Setup) -> Vector | None:
+    """Where a trajectory's point is, from the body's origin in b; None: there. The scanner's is its calibration's.
 
     Raises:
         UserError: it is no such point.
@@ -156,17 +159,15 @@ def offset_of(at: str, config: Config) -> Vector | None:
     if at == "body":
         return None
     if at == "antenna":
-        arms = [gnss.lever_arm_m for gnss in config.gnss.values()]
+        arms = [gnss.lever_arm_m for gnss in setup.config.gnss.values()]
         if not arms:
             raise UserError("--trajectory-at antenna: the configuration has no [gnss.…]", ExitCode.USAGE)
         return _vector(arms[0])
     if at == "scanner":
-        heads = [scanner.lever_arm_m for scanner in config.scanner.values()]
+        heads = [setup.calibrations[name].lever_arm_b for name in setup.scanners]
         if len(heads) != 1:
-            raise UserError(
-                f"--trajectory-at scanner: the configuration has {len(heads)} scanners; want x,y,z", ExitCode.USAGE
-            )
-        return _vector(heads[0])
+            raise UserError(f"--trajectory-at scanner: there are {len(heads)} scanners; want x,y,z", ExitCode.USAGE)
+        return _vector(heads[0].tolist())
     try:
         x, y, z = (float(part) for part in at.split(","))
     except ValueError:

@@ -160,20 +160,39 @@ def sentence(found: dict[str, Any]) -> str:
         return str(found["state"])
     rate = sum(found["points_per_s"].values())
     parts = [f"{found['state']} {found['session_id']}", f"{sum(found['points'].values()):,} points, {rate:,} a second"]
-    worst = [value["pulse"]["p95"] for value in found["latency_s"].values() if value["pulse"]]
-    if worst:
-        late = "LATE: " if max(worst) > LATE_S else ""
-        parts.append(f"{late}{max(worst):.2f} s behind the pulse")
+    worst_s = _behind_s(found)
+    if worst_s is not None:
+        late = "LATE: " if worst_s > LATE_S else ""
+        parts.append(f"{late}{worst_s:.2f} s behind the pulse")
     left_out = Counter[str]()
     for fates in found["fates"].values():
         left_out.update({fate: count for fate, count in fates.items() if fate != "georeferenced"})
     parts += [f"{count:,} {fate.replace('_', ' ')}" for fate, count in left_out.most_common(3)]
     if found.get("live_skipped_s"):
         parts.append(f"{found['live_skipped_s']:.1f} s SKIPPED, more than {BEHIND_NS / 1e9:.0f} s behind")
-    not_locked = [f"{source} {one['state']}" for source, one in found["time"].items() if one["state"] != "LOCKED"]
-    parts += not_locked[:3]
+    if found.get("damaged_chunks"):
+        parts.append(f"{found['damaged_chunks']} chunks of the log DAMAGED")
+    parts += _not_locked(found)[:3]
     parts += [str(found[key]) for key in ("trouble", "points_file") if found.get(key)]
     return "; ".join(parts)
+
+
+def is_well(found: dict[str, Any]) -> bool:
+    """Whether points come of every scanner, on time, and nothing is wrong: what an operator may take for good."""
+    if "points" not in found:
+        return False
+    wrong = [found.get(key) for key in ("trouble", "points_file", "live_skipped_s", "damaged_chunks")]
+    comes = all(rate > 0 for rate in found["points_per_s"].values()) and (_behind_s(found) or 0.0) <= LATE_S
+    return comes and not any(wrong) and not _not_locked(found)
+
+
+def _behind_s(found: dict[str, Any]) -> float | None:
+    """How far points are behind their pulses, 95 % of the worst scanner's; None: there are none."""
+    return max((value["pulse"]["p95"] for value in found["latency_s"].values() if value["pulse"]), default=None)
+
+
+def _not_locked(found: dict[str, Any]) -> list[str]:
+    return [f"{source} {one['state']}" for source, one in found["time"].items() if one["state"] != "LOCKED"]
 
 
 def write_status(folder: Path, found: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.config.checks import check_antennas
 from daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
 from daemon.config.tables import GnssConfig, ImuConfig, MtaConfig, NoiseConfig, OutputConfig
 from daemon.errors import ConfigError, ExitCode, UserError
@@ -32,7 +33,6 @@ FloatArray = NDArray[np.float64]
 # Receivers' sigmas of positions are those of the noise from epoch to epoch. As much again lasts for a minute or so:
 # multipath, the atmosphere, the orbits. So half of a variance that is twice theirs is time-correlated.
 CORRELATED_SHARE, CORRELATION_S, SIGMA_FACTOR = 0.5, 60.0, math.sqrt(2.0)
-MIN_BASELINE_M = 0.1  # a shorter one tells no heading
 
 
 class NavigationSources:
@@ -152,12 +152,8 @@ class NavigationSources:
         arms = [np.array(self.gnss.lever_arm_m, dtype=np.float64)]
         if self.gnss.secondary_lever_arm_m is not None:
             arms.append(np.array(self.gnss.secondary_lever_arm_m, dtype=np.float64))
-            length_m = float(np.linalg.norm(arms[1] - arms[0]))
-            if length_m < MIN_BASELINE_M:
-                raise ConfigError(
-                    f"gnss.{self.gnss_name}.secondary_lever_arm_m: is {length_m:.2f} m from lever_arm_m; "
-                    f"want the second antenna's place, {MIN_BASELINE_M:g} m or more away, or leave it out"
-                )
+            for problem in check_antennas(f"gnss.{self.gnss_name}", self.gnss):
+                raise ConfigError(problem)
         return filter_setup(noise_of(self.imu.noise), arms, time_sigma_s=time_sigma_s)
 
 

@@ -52,6 +52,7 @@ MAX_TIME_SIGMA_NS = 1e7  # of a sample: a worse time is none
 REALIGN_NS = 30 * SECOND_NS  # of missing samples: after them attitude is found anew
 PAUSE_NS = SECOND_NS // 2  # of arrivals: after it a unit without a counter is taken to have missed samples
 KEPT_NS = 10 * SECOND_NS  # of samples before the start that was found
+EPOCH_LASTS_NS = 2 * SECOND_NS  # messages of one epoch come within it
 NEVER_NS = 1 << 62
 GOOD_STATUS = 3  # as a device's INS says that its solution is good
 
@@ -81,6 +82,7 @@ class Navigator:
         self._fixes: list[GnssFix] = []
         self._headings: list[GnssHeading] = []
         self._said: set[str] = set()  # names of messages
+        self._handed: set[tuple[int, int, int]] = set()  # time, kind, antenna of observations of the last seconds
         self._latest_heading_ns = -(1 << 62)
         self._kept: list[Inertial] = []
         self._kept_rows: list[StructArray] = []
@@ -194,7 +196,16 @@ class Navigator:
             [fix for fix, _ in taken], [at for _, at in taken], len(self._setup.lever_arms_b), self._said
         )
         self.counts.update({f"fix {why.replace('_', ' ')}": count for why, count in found.refused.items()})
-        return sort_observations(np.concatenate([found.rows, self._directions(headings, heading_ns)]))
+        return sort_observations(np.concatenate([self._fresh(found.rows), self._directions(headings, heading_ns)]))
+
+    def _fresh(self, rows: StructArray) -> StructArray:
+        """Without what an earlier tick had of the same epoch: a receiver says it in several messages."""
+        keys = list(zip(rows["time_ns"].tolist(), rows["kind"].tolist(), rows["antenna"].tolist(), strict=True))
+        fresh = np.array([key not in self._handed for key in keys], dtype=np.bool_)
+        self.counts["fix repeated in epoch"] += int((~fresh).sum())
+        newest_ns = max((at_ns for at_ns, _, _ in keys), default=-NEVER_NS)
+        self._handed = {key for key in self._handed if key[0] > newest_ns - EPOCH_LASTS_NS} | set(keys)
+        return rows[fresh]
 
     def _directions(self, headings: list[GnssHeading], time_ns: list[int | None]) -> StructArray:
         """Of a baseline, as far apart as their common errors ask for."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from georef.earth import e_from_geodetic
 from georef.formats.antenna_positions import read_antenna_positions
 from georef.formats.trajectory_columns import TrajectoryColumns
 from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
+from georef.navigation.measurements import POSITION_FLOORS_M
 from georef.records import FixType, StructArray
 from georef.trajectory import TrajectoryError, gps_text
 
@@ -82,10 +84,16 @@ def _observed(columns: TrajectoryColumns) -> Observed:
 
 
 def _fix_types(columns: TrajectoryColumns) -> NDArray[np.uint8]:
-    """Of a file that says none: as of a single receiver, which only matters where it says no sigmas either."""
+    """Of a file that says none: the kind of fix that is as good as its horizontal sigmas; without them a single one."""
     if columns.fix_type is not None:
         return columns.fix_type
-    return np.full(len(columns.time_ns), int(FixType.SINGLE), np.uint8)
+    types = np.full(len(columns.time_ns), int(FixType.SINGLE), np.uint8)
+    if columns.position_sigma_l is not None:
+        sigma_m = columns.position_sigma_l[:, :2].max(axis=1)
+        for better, worse in pairwise((FixType.RTK_FIXED, FixType.RTK_FLOAT, FixType.DIFFERENTIAL, FixType.SINGLE)):
+            of_it = (sigma_m > 0.0) & (sigma_m < POSITION_FLOORS_M[worse]) & (types == int(FixType.SINGLE))
+            types[of_it] = int(better)
+    return types
 
 
 def _rows(

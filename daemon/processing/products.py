@@ -7,6 +7,7 @@ and put in its place at the end, the sidecar last.
 
 from __future__ import annotations
 
+import glob
 import importlib.metadata
 import json
 import shutil
@@ -16,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -26,15 +28,15 @@ from daemon.processing import refusals
 from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
+from daemon.processing.trajectory_files import TrajectoryFiles, put_in_place, write_trajectory
 from daemon.processing.unread import unread_lines
 from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.workers import run_jobs
 from drivers.core.registry import find_driver
 from georef.formats.las import LasSettings
-from georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from georef.formats.trajectory_csv import csv_text
 from georef.mapping import MappingError
 from georef.strips import Segment, StripError, segments
+from georef.timescales.gps_time import table_leap_seconds, utc_from_gps
 
 DROPPED = ".dropped.csv.gz"
 ENDINGS = (".laz", DROPPED)  # of a strip's files
@@ -90,7 +92,8 @@ def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> Ses
     setup = flight.setup
     assert setup.mapping is not None
     protocols = {name: setup.config.scanner[name].protocol for name in setup.scanners}
-    day = np.datetime64(flight.session.info.realtime_ns, "ns").astype("datetime64[D]").item()
+    near, _ = utc_from_gps(flight.span[0], 0)
+    day, _ = utc_from_gps(flight.span[0], table_leap_seconds(near)[0])
     las = LasSettings(
         wkt=setup.mapping.wkt,
         offset=origin,
@@ -130,9 +133,7 @@ def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
 def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
     """A folder for what is not finished, and what puts it in its place; it goes whatever happens. Names of sessions."""
     output, name = wish.output, names[0]
-    sidecar = output / f"{name}.json"
-    if sidecar.exists() and not wish.overwrite:
-        raise UserError(f"{sidecar}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE)
+    _refuse_existing(wish, names)
     output.mkdir(parents=True, exist_ok=True)
     partial = output / f"{name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -141,9 +142,10 @@ def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Call
     def into_place(files: list[Path]) -> None:
         for file in files:
             sync_file(file)
-        sidecar.unlink(missing_ok=True)
-        for old in [file for one in names for file in output.glob(f"{one}_strip*") if file.name.endswith(ENDINGS)]:
-            old.unlink()
+        for one in names:
+            (output / f"{one}.json").unlink(missing_ok=True)
+            for old in _strips(output, one):
+                old.unlink()
         for file in files:
             file.replace(output / file.name)
         try_sync_directory(output)
@@ -152,6 +154,29 @@ def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Call
         yield partial, into_place
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _strips(folder: Path, name: str) -> list[Path]:
+    """Files of a session's strips that are there."""
+    return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
+
+
+def _refuse_existing(wish: Wish, names: Sequence[str]) -> None:
+    """UserError where products of the sessions are there, or a trajectory of theirs that is read."""
+    for name in names:
+        files = TrajectoryFiles.in_folder(wish.output, name, csv=True)
+        trajectories = [path for path in (files.csv, files.sbet, files.smrmsg) if path is not None and path.exists()]
+        read = wish.trajectory.file
+        if read is not None and read.exists() and any(path.samefile(read) for path in trajectories):
+            raise UserError(
+                f"{read}: is read, and would be replaced by what is used of it; want another folder", ExitCode.USAGE
+            )
+        there = [path for path in (wish.output / f"{name}.json", *_strips(wish.output, name)) if path.exists()]
+        if (there or trajectories) and not wish.overwrite:
+            first = [*there, *trajectories][0]
+            raise UserError(
+                f"{first}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE
+            )
 
 
 def _make(
@@ -166,17 +191,22 @@ def _make(
     plans = [_plan(wish, flight, origin) for flight in flights]
     jobs = [job for number, flight in enumerate(flights) for job in _jobs(wish, flight, number, partial)]
     total = sum(job.size for job in jobs)
+    given_up = Event()
     with ThreadPoolExecutor(1) as hasher:
         paths = [part.path for flight in flights for part in flight.session.parts]
-        hashes = hasher.map(sha256_of, paths)
-        results = run_jobs(
-            plans,
-            jobs,
-            workers=wish.workers,
-            scheduler=wish.scheduler,
-            progress=lambda done: tell("points", done, total),
-        )
-        logs = [{"name": path.name, "sha256": digest} for path, digest in zip(paths, hashes, strict=True)]
+        hashes = [hasher.submit(sha256_of, path, given_up.is_set) for path in paths]
+        try:
+            results = run_jobs(
+                plans,
+                jobs,
+                workers=wish.workers,
+                scheduler=wish.scheduler,
+                progress=lambda done: tell("points", done, total),
+            )
+            logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
+        except BaseException:  # an interrupt too: nobody waits for the hashes of large logs then
+            given_up.set()
+            raise
     _note_troubles(flights, results)
     files = {job.segment.strip: _files(job, result) for job, result in zip(jobs, results, strict=True)}
     done = [path for made in files.values() for path in made if path is not None]
@@ -222,12 +252,6 @@ def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
     if flight.setup.deflection_rad is not None:  # to what its own attitude referred to: it may be used again
         xi, eta = flight.setup.deflection_rad
         used = used.with_deflection(-xi, -eta)
-    name = flight.session.session_id
-    contents = {
-        f"{name}_trajectory.csv": csv_text(used).encode(),
-        f"{name}_trajectory.sbet": sbet_bytes(used),
-        f"{name}_trajectory.smrmsg": smrmsg_bytes(used),
-    }
-    for file, data in contents.items():
-        (folder / file).write_bytes(data)
-    return [folder / file for file in contents]
+    written = write_trajectory(TrajectoryFiles.in_folder(folder, flight.session.session_id, csv=True), used, None)
+    put_in_place(written)
+    return sorted(path for _, path in written)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+import numpy as np
 from pyproj import CRS
 
-from daemon.errors import ExitCode, UserError
+from daemon.errors import ExitCode, UserError, one_line
 from georef.points import Fate
 from georef.timescales import TimeState
 from georef.trajectory import gps_text
+from georef.trajectory_buffer import COLUMNS
 
 if TYPE_CHECKING:
     from daemon.config.config import Config
@@ -28,10 +31,19 @@ GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
 MUCH = 0.01  # share of returns without time that is worth a warning
 LATE_S = 0.06  # more than an IMU's samples are late at the host
 UNLIKE = 0.3  # correlation of turn rates below which two motions are hardly one
+LOOKED_AT = 10_000  # epochs, whether the body flies forward and upright
+UNSAID = "a datum that is not said"
+LONGEST_NAME = 200  # bytes of a session's name, whose products' names are longer
+FLIES_MPS = 15.0  # nothing flies so fast sideways
+FORWARD = 0.5  # cosine between nose and course, below which it would
+AXES = (
+    "want the attitude of axes forward, right, down: of a device's INS imu.….rotation_b_imu turns it, as it turns the "
+    "samples"
+)
 
 
-def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -> None:
-    """Logs of one run share the mapping frame, and the antenna their trajectory came from.
+def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None, datum: str | None = None) -> None:
+    """Logs of one run share the mapping frame, and of their trajectory the antenna and the datum.
 
     Raises:
         UserError: they do not.
@@ -45,6 +57,12 @@ def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None) -
                     f"say one with --{key}, or georeference them one by one",
                     ExitCode.USAGE,
                 )
+        if datum is None and (theirs := _datum_of(second)) != (ours := _datum_of(first)):
+            raise UserError(
+                f"{other}: its positions are in {theirs or UNSAID}, those of {one} in {ours or UNSAID} "
+                "(gnss.….datum); say one with --trajectory-datum, or georeference them one by one",
+                ExitCode.USAGE,
+            )
         arms = {name: list(gnss.lever_arm_m) for name, gnss in first.gnss.items()}
         others = {name: list(gnss.lever_arm_m) for name, gnss in second.gnss.items()}
         if arms != others:
@@ -76,6 +94,23 @@ def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
     files = [file for _, file in options.calibrations.values()]
     own = ("output.", "datum", *files) if options.crs or options.datum or options.epoch else ("--", *files)
     return [line if line.startswith(own) else f"{log}: {line}" for line in lines]
+
+
+def _datum_of(config: Config) -> str | None:
+    """As `daemon.processing.setup.Setup` takes it."""
+    return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
+
+
+def refuse_no_name(session_id: str, log: Path) -> None:
+    """A session's name becomes that of its products: a log from elsewhere must not lead out of their folder.
+
+    Raises:
+        UserError: it is no name of a file.
+    """
+    leads = session_id != Path(session_id).name or session_id in ("", ".", "..")
+    if leads or not session_id.isprintable() or len(session_id.encode()) > LONGEST_NAME:
+        shown = one_line(session_id[:80])
+        raise UserError(f'{log}: its session_id "{shown}" is no name of a file; is it a log of Swath\'s?')
 
 
 def _said(value: object) -> str:
@@ -219,3 +254,21 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
             "flight, or imu.….rotation_b_imu be another"
         ]
     return []
+
+
+def attitude_doubts(trajectory: Trajectory, named: str) -> list[str]:
+    """A line where the body would fly on its back or not forward: the attitude is of other axes than b's."""
+    step = max(1, len(trajectory) // LOOKED_AT)
+    seen = replace(trajectory, **{column: getattr(trajectory, column)[::step] for column in COLUMNS})
+    roll, pitch, heading = seen.attitude()
+    north, east, _ = seen.velocity_l().T
+    flies = np.hypot(north, east) > FLIES_MPS
+    lines = []
+    if len(seen) and np.median(np.cos(roll) * np.cos(pitch)) < 0.0:
+        lines.append(f"{named}: its z axis points up, the body would fly on its back; {AXES}")
+    if flies.any():
+        apart = heading[flies] - np.arctan2(east[flies], north[flies])
+        if np.median(np.cos(apart)) < FORWARD:
+            usual_deg = np.degrees(np.arctan2(np.median(np.sin(apart)), np.median(np.cos(apart))))
+            lines.append(f"{named}: its x axis points {usual_deg:+.0f}° beside the course; {AXES}")
+    return lines

@@ -111,9 +111,9 @@ class Setup:
         try:
             config = stored_config(attachments)
         except LogError as error:
-            raise UserError(f"{error}; give another configuration with --config") from error
+            raise UserError(f"{error}; give another with --config, to swath live --replay as CONFIG") from error
         if config is None:
-            raise UserError("the log holds no configuration; give one with --config")
+            raise UserError("the log holds no configuration; give one with --config, to swath live --replay as CONFIG")
         return cls(config, attachments, options)
 
     @classmethod

@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,11 +31,11 @@ UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap
 _HASH_BLOCK = 1 << 20
 
 
-def sha256_of(path: Path) -> str:
-    """Of a file; raises OSError."""
+def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
+    """Of a file, or of some of it where that is given up meanwhile; raises OSError."""
     with path.open("rb") as file:
         digest = hashlib.sha256()
-        while block := file.read(_HASH_BLOCK):
+        while (block := file.read(_HASH_BLOCK)) and not given_up():
             digest.update(block)
     return digest.hexdigest()
 

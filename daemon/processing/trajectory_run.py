@@ -17,6 +17,7 @@ from daemon.processing.event_marks import EventTable, event_table
 from daemon.processing.ins_as_is import ins_as_is
 from daemon.processing.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
 from daemon.processing.navigation_inputs import Mark
+from daemon.processing.refusals import refuse_no_name
 from daemon.processing.trajectory_files import (
     TrajectoryFiles,
     put_in_place,
@@ -73,6 +74,8 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
     with told_in_a_line(wish.output, TrajectoryError):
         passed_over: list[str] = []
         sessions = open_logs(wish.logs, passed_over)
+        for session in sessions:
+            refuse_no_name(session.session_id, session.parts[0].path)
         holes = [f"passed over: {line}" for line in passed_over]
         files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
         if not wish.overwrite:

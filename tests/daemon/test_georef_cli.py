@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -269,6 +270,32 @@ class TestRefusals:
         assert run_app(flown.arguments(products)) == 2
         assert "--overwrite" in capsys.readouterr().err
         assert {path.name: path.stat().st_mtime_ns for path in products.iterdir()} == before
+
+    def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(
+        self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (made,) = products.glob("*_trajectory.csv")
+        there = tmp_path / made.name
+        shutil.copy(made, there)
+        before = there.stat().st_mtime_ns
+        arguments = flown.arguments(tmp_path)
+        assert run_app(arguments) == 2
+        assert f"{there}: is there from an earlier run" in capsys.readouterr().err
+        arguments[arguments.index("--trajectory") + 1] = str(there)
+        assert run_app([*arguments, "--overwrite"]) == 2
+        assert f"{there}: is read, and would be replaced" in capsys.readouterr().err
+        assert [path.name for path in tmp_path.iterdir()] == [made.name]
+        assert there.stat().st_mtime_ns == before
+
+    def test_strips_of_a_run_of_several_sessions_are_kept(
+        self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Whose sidecar has the name of the first session."""
+        (made, *_) = products.glob("*_strip*.laz")
+        shutil.copy(made, tmp_path)
+        assert run_app(flown.arguments(tmp_path)) == 2
+        assert f"{tmp_path / made.name}: is there from an earlier run" in capsys.readouterr().err
+        assert [path.name for path in tmp_path.iterdir()] == [made.name]
 
     @pytest.mark.parametrize(("shift_s", "words"), [(18, "UTC"), (-7 * 86_400, "week"), (3 * 3600, "do not overlap")])
     def test_a_trajectory_of_another_time_is_named(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.text import Text
 
+from daemon.cli.live import page
 from daemon.cli.main import run_app
 from daemon.config import Config, load_config
 from daemon.config.tables import LiveConfig
@@ -245,6 +248,30 @@ class TestStatus:
         assert told.endswith("; free space is down")
         assert "3 no time" in told
         assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
+
+    def test_only_what_is_well_is_green(self, replayed: tuple[Path, Told]) -> None:
+        """At a glance: points of every scanner, on time, every clock locked, nothing damaged or passed over."""
+        found = copy.deepcopy(replayed[1])
+        found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following"}
+        found["points_per_s"] = dict.fromkeys(found["points"], 8000)
+        for one in found["latency_s"].values():
+            if one["pulse"]:
+                one["pulse"]["p95"] = 0.4  # a flight of 7 s, of which most waited for the clock
+        late = copy.deepcopy(found)
+        late["latency_s"]["scanner/left"]["pulse"]["p95"] = 12.0
+        wrong: list[Told] = [
+            {},
+            {"trouble": "free space is down"},
+            {"points_file": "p.npy ends"},
+            {"live_skipped_s": 7.25},
+            {"damaged_chunks": 2},
+            {"points_per_s": found["points_per_s"] | {"right": 0}},
+            {"time": found["time"] | {"pps/main": {"state": "LOST", "sigma_ns": None}}},
+            {"latency_s": late["latency_s"]},
+        ]
+        styles = [str(cast(Text, page(found | one).renderables[0]).style) for one in wrong]
+        assert styles == ["bold green", *["bold yellow"] * (len(wrong) - 1)]
+        assert "2 chunks of the log DAMAGED" in sentence(found | {"damaged_chunks": 2})
 
     def test_a_latency_is_by_the_scanners_clock_as_it_is_now(self) -> None:
         """Which is asked once a second, and says something else each time here."""

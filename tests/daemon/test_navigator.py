@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from daemon.log.chunks import LogBatch
 from daemon.processing.feed import LogFeed
 from daemon.processing.setup import Options, Setup
+from georef.navigation.inputs import OBSERVATION_DTYPE
 from georef.points import Fate, Points
+from georef.timescales import SECOND_NS
 from georef.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short
 
@@ -131,6 +133,19 @@ def test_points_come_of_it(followed: Told) -> None:
 def test_the_same_poses_however_its_messages_come(followed: Told, setup: Setup, flown: Flown) -> None:
     again, _, _ = told(setup, flown, one_by_one(flown.session().batches()))
     assert again.tobytes() == followed[0].tobytes()
+
+
+def test_an_epoch_whose_messages_come_in_two_ticks_is_taken_once(setup: Setup, flown: Flown) -> None:
+    """BESTPOS before a tick and BESTGNSSPOS behind it are one position: their errors are the same."""
+    navigator = LogFeed(setup, setup.live_stream(flown.session().info)).navigator
+    assert navigator is not None
+    rows = np.zeros(3, OBSERVATION_DTYPE)
+    rows["time_ns"], rows["kind"] = [5 * SECOND_NS, 5 * SECOND_NS, 6 * SECOND_NS], [0, 1, 0]
+    assert len(navigator._fresh(rows[:1])) == 1
+    assert navigator._fresh(rows)["time_ns"].tolist() == [5 * SECOND_NS, 6 * SECOND_NS]
+    assert navigator.counts["fix repeated in epoch"] == 1
+    rows["time_ns"] += 3 * SECOND_NS
+    assert len(navigator._fresh(rows)) == 3
 
 
 def test_a_device_s_own_solution_is_taken_as_soon_as_there_is_one(tmp_path_factory: pytest.TempPathFactory) -> None:

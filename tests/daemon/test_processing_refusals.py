@@ -62,6 +62,28 @@ def test_logs_with_different_frames() -> None:
     refusals.refuse_different_settings({A: config(), B: config()}, None)
 
 
+def test_sessions_with_positions_in_different_datums() -> None:
+    other = parse_config(
+        TEXT.format(arm="[0.1, 0.0, -1.2]", crs="EPSG:25832", epoch=2026.5).replace(
+            'protocol = "novatel"', 'protocol = "novatel"\ndatum = "EPSG:7912"'
+        ),
+        Path("swath.toml"),
+    )
+    with pytest.raises(UserError) as refused:
+        refusals.refuse_different_settings({A: config(), B: other}, None)
+    words = ("b.mcap", "in EPSG:7912", "in a datum that is not said", "--trajectory-datum")
+    assert all(word in line(refused) for word in words)
+    refusals.refuse_different_settings({A: config(), B: other}, None, "EPSG:7912")
+    refusals.refuse_different_settings({A: other, B: other}, None)
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/b", "", ".", "..", "a\0b", "a\nb", "x" * 300])
+def test_a_session_whose_name_leads_elsewhere(name: str) -> None:
+    with pytest.raises(UserError, match="is no name of a file"):
+        refusals.refuse_no_name(name, A)
+    refusals.refuse_no_name("flight-20261125T101500Z-ab12", A)
+
+
 def test_sessions_with_different_antennas() -> None:
     with pytest.raises(UserError) as refused:
         refusals.refuse_different_settings({A: config(), B: config(arm="[0.1, 0.0, -1.3]")}, None)
@@ -205,3 +227,37 @@ def test_heights_in_another_unit_than_the_plane_are_warned_of(crs: str, doubts: 
     lines = unit_doubts(cast(Any, flight))
     assert len(lines) == doubts
     assert all("in US survey foot, heights in metre above the ellipsoid: EPSG:6529" in line for line in lines)
+
+
+def level_flight(
+    heading_rad: float, roll_rad: float, course_rad: float = 1.0, speed_mps: float = 50.0, seconds: int = 60
+) -> Trajectory:
+    """A minute, straight on; in one place, which does not matter here."""
+    time_ns = 1_465_549_218_000_000_000 + np.arange(0, seconds * S, S // 10)
+    n = len(time_ns)
+    level, lat, lon, height = (np.full(n, value) for value in (0.0, 0.8, 0.15, 800.0))
+    velocity = np.tile(speed_mps * np.array([np.cos(course_rad), np.sin(course_rad), 0.0]), (n, 1))
+    return Trajectory.from_geodetic(
+        time_ns, lat, lon, height, velocity, np.full(n, roll_rad), level, np.full(n, heading_rad)
+    )
+
+
+@pytest.mark.parametrize(
+    ("flown", "words"),
+    [
+        (level_flight(1.0, 0.1), []),
+        (level_flight(1.0 - np.radians(30.0), 0.0), []),  # as much wind from the side as there is
+        (level_flight(1.0, np.pi - 0.05), ["its z axis points up, the body would fly on its back"]),
+        (level_flight(1.0 + np.pi / 2, 0.0), ["its x axis points +90° beside the course"]),
+        (level_flight(1.0 - np.radians(100.0), 0.0), ["its x axis points -100° beside the course"]),
+        (level_flight(1.0 + np.pi, np.pi), ["its z axis points up", "its x axis points"]),
+        (level_flight(2.0, 0.0, speed_mps=3.0), []),  # hovering, or on the ground
+        (level_flight(1.0, 0.0, seconds=0), []),
+    ],
+)
+def test_an_attitude_of_other_axes_is_doubted(flown: Trajectory, words: list[str]) -> None:
+    lines = refusals.attitude_doubts(flown, "x.out")
+    assert len(lines) == len(words)
+    for line, word in zip(lines, words, strict=True):
+        assert line.startswith(f"x.out: {word}")
+        assert "rotation_b_imu" in line

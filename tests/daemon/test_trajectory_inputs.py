@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from daemon.errors import UserError
+from daemon.config import Config
+from daemon.errors import ConfigError, UserError
 from daemon.log_parsers import stored_config
 from daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
 from daemon.processing.navigation_observations import (
@@ -26,6 +27,7 @@ from daemon.processing.navigation_observations import (
 )
 from daemon.processing.navigation_sources import noise_of
 from daemon.processing.navigation_times import counted_arrivals, imu_times
+from daemon.processing.outside_positions import outside_observations
 from georef.formats.antenna_positions import read_antenna_positions
 from georef.navigation.inputs import GRADES, Kind
 from georef.records import (
@@ -220,7 +222,12 @@ class TestRefusals:
         assert "cannot be read" in self.refused(flown, InputWish(positions=tmp_path / "none.pos"))
 
     def test_antennas_in_one_place(self, flown: Flown) -> None:
-        config = flown.changed("one.toml", **{"[0.9, 0.6, -1.2]": "[0.1, -0.05, -1.2]"})
+        said = r"secondary_lever_arm_m: is 0\.00 m from lever_arm_m"
+        with pytest.raises(ConfigError, match=said):
+            flown.changed("one.toml", **{"[0.9, 0.6, -1.2]": "[0.1, -0.05, -1.2]"})
+        rover = flown.config.gnss["rover"].model_copy(update={"secondary_lever_arm_m": [0.1, -0.05, -1.2]})
+        tables = flown.config.tables.model_copy(update={"gnss": {"rover": rover}})
+        config = Config(tables, flown.config.path, flown.config.text)  # as a log of an earlier version may have it
         assert "secondary_lever_arm_m: is 0.00 m from lever_arm_m" in self.refused(flown, InputWish(config=config))
 
 
@@ -464,3 +471,17 @@ def test_waypoint_text_says_its_quality_too() -> None:
     assert columns.satellites.tolist() == [12, 11, 5]
     assert columns.position_sigma_l[2].tolist() == [1.0, 1.1, 2.0]
     assert np.degrees(columns.lat_rad[0]) == pytest.approx(47.482, abs=1e-9)
+
+
+def test_positions_that_say_no_quality_are_as_good_as_their_sigmas(tmp_path: Path) -> None:
+    """A floor for single receivers would make centimetres of post-processing half a metre."""
+    lines = [line[:65] + line[68:] for line in WAYPOINT.splitlines()]
+    assert " Q " in WAYPOINT
+    assert " Q " not in "\n".join(lines)
+    file = tmp_path / "ppk.txt"
+    file.write_text("\n".join(lines) + "\n")
+    begin_ns = (2423 * 604_800 + 118_820) * S
+    rows = outside_observations(file, (begin_ns, begin_ns + S), None, 18).observed.rows
+    rows = rows[rows["kind"] == Kind.POSITION]
+    assert rows["fix_type"].tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT, FixType.SINGLE]
+    assert rows["sigma"][0].tolist() == [0.010, 0.011, 0.020]
