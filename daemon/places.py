@@ -34,6 +34,8 @@ def log_directory(where: Path) -> Path:
             raise UserError(f"{directory}: no such directory, so no recorder has written there", ExitCode.IO)
     except PermissionError as error:
         raise UserError(f"{error.filename}: not permitted; {_WHO_MAY}", ExitCode.IO) from error
+    except OSError as error:  # a note in the place of a path is longer than a name may be
+        raise UserError(f"{where}: {error.strerror}; {_WANTED}", ExitCode.USAGE) from error
     except ConfigError as error:
         if where.suffix == ".toml":
             raise

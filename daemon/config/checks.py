@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from daemon.config.calibration_file import check_calibration
 from daemon.config.config import Config, DeviceTable
-from daemon.config.tables import CorrectionsConfig, ScannerConfig
+from daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
 from drivers.core.parser import DeviceKind, Driver, DriverSettingsError
 from drivers.core.registry import UnknownProtocolError, find_driver
 from drivers.core.startup import StartupWish
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 WILDCARD = "0.0.0.0"
 ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
+MIN_BASELINE_M = 0.1  # a shorter one tells no heading
 
 
 def check_devices(config: Config) -> list[str]:
@@ -101,6 +102,8 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
         known = ", ".join(config.pps) or "none; add [pps.main]"
         yield f'{section}.pps: got "{table.pps}", want the name of a [pps.<name>]; there are: {known}'
     yield from _check_rotations(section, table)
+    if isinstance(table, GnssConfig):
+        yield from check_antennas(section, table)
     if isinstance(table, ScannerConfig):
         yield from _check_calibration(config, name, table)
         yield from _check_gimbal(config, name, table)
@@ -177,6 +180,18 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
         else:
             if auxiliary.kind != "udp":
                 yield f'{section}.auxiliary: got "{table.auxiliary}", want udp:<address>:<port>'
+
+
+def check_antennas(section: str, table: GnssConfig) -> Iterator[str]:
+    """What is wrong with the places of a receiver's two antennas."""
+    if table.secondary_lever_arm_m is None:
+        return
+    length_m = float(np.linalg.norm(np.subtract(table.secondary_lever_arm_m, table.lever_arm_m)))
+    if length_m < MIN_BASELINE_M:
+        yield (
+            f"{section}.secondary_lever_arm_m: is {length_m:.2f} m from lever_arm_m; "
+            f"want the second antenna's place, {MIN_BASELINE_M:g} m or more away, or leave it out"
+        )
 
 
 def _check_rotations(section: str, table: DeviceTable) -> Iterator[str]:

@@ -47,7 +47,9 @@ class SessionConfig(Section):
     )
     split_size_mb: float = Field(2048.0, ge=1.0, le=1_000_000.0, description="a new part after this size")
     split_minutes: float = Field(30.0, ge=0.01, le=1440.0, description="a new part after this time")
-    fsync_s: float = Field(1.0, ge=0.05, le=60.0, description="how often the log is forced to the disk")
+    fsync_s: float = Field(
+        1.0, ge=0.05, le=60.0, description="how often the log is forced to the disk; each second at the latest"
+    )
     reserve_mb: float = Field(
         512.0, ge=1.0, le=10_000_000.0, description="free space at which recording stops cleanly, and resumes above"
     )
@@ -151,7 +153,10 @@ class ImuConfig(Section):
         None, description="sbg-ellipse: the Sync In that PPS is wired to; its event message latches the counter"
     )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal rate of samples")
-    rotation_b_imu: Matrix = Field(default_factory=_identity, description="b from the IMU's axes, rows of the matrix")
+    rotation_b_imu: Matrix = Field(
+        default_factory=_identity,
+        description="b from the IMU's axes, rows of the matrix; it turns its INS's attitude too",
+    )
     tick_hz: float | None = Field(
         None,
         gt=0.0,
@@ -220,7 +225,7 @@ class GimbalStage(Section):
         default_factory=_zero_vector, description="from this stage's centre to the next inner one"
     )
     source: str | None = Field(
-        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of angles"
+        None, pattern=r"^(gnss|imu|scanner)/[A-Za-z0-9_-]+$", description="a logged source of its angles"
     )
 
 
@@ -281,8 +286,12 @@ class AttitudeConfig(Section):
     """``[attitude]``: what vertical the attitude refers to."""
 
     vertical: Literal["ellipsoid", "plumb"] = Field("ellipsoid", description="plumb needs the two keys below")
-    xi_arcsec: float | None = Field(None, ge=-120.0, le=120.0, description="deflection of the vertical, north")
-    eta_arcsec: float | None = Field(None, ge=-120.0, le=120.0, description="deflection of the vertical, east")
+    xi_arcsec: float | None = Field(
+        None, ge=-120.0, le=120.0, description="deflection of the vertical ξ, north, astronomic − geodetic"
+    )
+    eta_arcsec: float | None = Field(
+        None, ge=-120.0, le=120.0, description="deflection of the vertical η, east, astronomic − geodetic"
+    )
 
     @model_validator(mode="after")
     def _plumb_has_deflection(self) -> Self:
@@ -311,9 +320,12 @@ class AtmosphereConfig(Section):
 class MtaConfig(Section):
     """``[mta]``: pulses in air."""
 
-    terrain: str = Field("", description="coarse DEM, relative to this file; empty: continuity")
+    terrain: str = Field("", description="coarse DEM, GeoTIFF of ellipsoidal heights; empty: continuity")
     height_above_ground_m: float | None = Field(
-        None, gt=0.0, le=12_000.0, description="usual flying height, for the first zone where there is no DEM"
+        None,
+        gt=0.0,
+        le=12_000.0,
+        description="usual flying height, for the first zone where there is no DEM; zone 255 needs one of both",
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.transports.capture_file import read_pcap
+from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table
 from tests.daemon.wires import pty, udp_sender
@@ -59,6 +60,17 @@ def test_no_such_configuration(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "daemon.cli.main", "run", str(tmp_path / "nothing.toml")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert "nothing.toml" in the_line(done, 2)
+
+
+@pytest.mark.parametrize("command", ["mark", "monitor"])
+def test_a_note_in_the_place_of_a_directory(command: str) -> None:
+    """Longer than a name may be: one line all the same."""
+    note = "line 4, clouds below us and turbulence, " * 8
+    done = swath(*((command, "logs", note) if command == "mark" else (command, "--once", note)))
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "; give the log directory or a configuration file" in done.stderr
+    assert "internal error" not in done.stderr
 
 
 def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
