@@ -97,13 +97,12 @@ def test_what_moves_a_profile(flight: Flight, prior: TrajectoryPrior, kind: str)
 
 def test_sigmas_hold_when_the_trajectorys_errors_change_in_time(flight: Flight, prior: TrajectoryPrior) -> None:
     rng = np.random.default_rng(7)
-    normalised, alone = [], []
+    normalised = []
     for _ in range(DRAWS):
         moved = flown_wrong(flight, prior, draw(prior, rng))
         comparisons = check(moved, known(moved), prior, CONTROL).comparisons
         assert {one.parameter for one in comparisons} == set(PARAMETER.values())
         normalised.append([one.normalised for one in comparisons])
-        alone.append([one.difference_sigma for one in comparisons])
     squares = np.square(normalised)
     # 32 draws of χ²(1): their mean is 1 ± 0.25; three sigmas of it
     assert 0.4 < squares.mean() < 1.75

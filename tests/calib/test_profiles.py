@@ -57,9 +57,7 @@ def village(lines: tuple[Line, ...] = LINES, *, rear: bool = False, **true: floa
 
 
 def test_lectures_numbers() -> None:
-    assert 4.8 / 1002.0 == pytest.approx(0.0047904, abs=5e-8)
     assert roll_rad(4.8, 1002.0) == pytest.approx(0.00479038, abs=5e-9)
-    assert 17.92 / 2.0 / 902.5 == pytest.approx(0.0099280, abs=5e-8)
     assert pitch_rad(17.92, 902.5) == pytest.approx(0.00992765, abs=5e-9)
     assert heading_rad(0.61, 493.0) == pytest.approx(0.0012373, abs=5e-8)
 

@@ -237,6 +237,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict
         for command in COMMANDS:
             runs[name, command] = [*command.split(), str(path), *_rest(folder, name, command)]
     before = _files(folder)
+    Path("/tmp/swath-evil").unlink(missing_ok=True)  # of an earlier failure
     (folder / "tmp").mkdir()
     done = subprocess.run(
         [sys.executable, "-c", RUN],

@@ -22,11 +22,16 @@ EAST_M, NORTH_M = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True
 LAT, LON = np.radians(47.5), np.radians(8.9)
 
 
+def plane_m(east_m: Any, north_m: Any) -> Any:
+    """Heights so far east and north of the middle."""
+    return 480.0 + 0.05 * north_m + 0.03 * east_m
+
+
 def write(path: Path, **others: Any) -> None:
-    """A plane that falls to the south by 0.05, pixels of 30 m, 3 km wide, 480 m high in the middle."""
+    """A plane that falls to south and west, `plane_m`, pixels of 30 m, 3 km wide, 480 m high in the middle."""
     transform = Affine(30.0, 0.0, EAST_M - 1500.0, 0.0, -30.0, NORTH_M + 1500.0)
-    north = NORTH_M + 1500.0 - 30.0 * (np.arange(100) + 0.5)
-    values = np.repeat(480.0 + 0.05 * (north - NORTH_M)[:, np.newaxis], 100, axis=1)
+    from_west_m = 30.0 * (np.arange(100) + 0.5)
+    values = plane_m(from_west_m[np.newaxis] - 1500.0, 1500.0 - from_west_m[:, np.newaxis])
     profile = {"crs": "EPSG:32632", "transform": transform} | others
     with rasterio.open(path, "w", driver="GTiff", width=100, height=100, count=1, dtype="float64", **profile) as file:
         file.write(values, 1)
@@ -37,14 +42,14 @@ def test_heights_and_ranges_are_the_planes_own(tmp_path: Path) -> None:
     terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
     to_geodetic = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
     lon, lat = np.radians(to_geodetic.transform([EAST_M, EAST_M + 700.0], [NORTH_M, NORTH_M + 400.0]))
-    np.testing.assert_allclose(terrain.height_at(lat, lon), [480.0, 500.0], atol=1e-6)
+    np.testing.assert_allclose(terrain.height_at(lat, lon), [480.0, plane_m(700.0, 400.0)], atol=1e-6)
     origin_e = e_from_geodetic(LAT, LON, 1480.0)[np.newaxis]
     straight_down = rot_e_from_l(LAT, LON)[np.newaxis, :, 2]
     np.testing.assert_allclose(terrain.predicted_m(origin_e, straight_down), 1000.0, atol=1.0)
 
 
 def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> None:
-    write(tmp_path / "dem.tif", nodata=480.0 + 0.05 * 15.0)
+    write(tmp_path / "dem.tif", nodata=plane_m(15.0, 15.0))
     terrain = read_terrain(tmp_path / "dem.tif")
     assert np.isnan(terrain.height_at(np.array([LAT, np.radians(48.5)]), np.array([LON, LON]))).all()
 
@@ -53,8 +58,10 @@ def test_outside_and_where_there_is_no_data_nothing_is_known(tmp_path: Path) -> 
 def test_a_grid_in_degrees_goes_on_where_longitudes_begin_anew(tmp_path: Path, west_deg: float) -> None:
     write(tmp_path / "dem.tif", crs="EPSG:4326", transform=Affine(0.001, 0.0, west_deg, 0.0, -0.001, 47.6))
     terrain = pickle.loads(pickle.dumps(read_terrain(tmp_path / "dem.tif")))
-    for lon_deg in (west_deg + 0.02, west_deg + 0.08, west_deg + 0.08 - 360.0, west_deg + 0.08 + 360.0):
-        assert np.isfinite(terrain.height_at(np.array([LAT + 0.001]), np.radians([lon_deg]))).all()
+    north_m = 1500.0 - 30.0 * (47.6 - np.degrees(LAT + 0.001)) / 0.001
+    for east_deg, turn_deg in ((0.02, 0.0), (0.08, 0.0), (0.08, -360.0), (0.08, 360.0)):
+        found = terrain.height_at(np.array([LAT + 0.001]), np.radians([west_deg + east_deg + turn_deg]))
+        np.testing.assert_allclose(found, plane_m(30.0 * east_deg / 0.001 - 1500.0, north_m), atol=1e-6)
     for lon_deg in (west_deg - 0.02, west_deg + 0.12):
         assert np.isnan(terrain.height_at(np.array([LAT + 0.001]), np.radians([lon_deg]))).all()
 
