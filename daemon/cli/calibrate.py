@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -28,10 +29,8 @@ def command(
         Path | None,
         typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the log's IMU and GNSS, navigated."),
     ] = None,
-    at: Annotated[
-        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
-    ] = "body",
-    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
+    at: TrajectoryPoint = "body",
+    week: TrajectoryWeek = None,
     control: Annotated[
         Path | None, typer.Option(metavar="CSV", help="name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m")
     ] = None,
@@ -60,9 +59,7 @@ def command(
         list[str] | None,
         typer.Option("--calibration", metavar="[SCANNER=]FILE", help="To begin with, instead of the log's own."),
     ] = None,
-    datum: Annotated[
-        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
-    ] = None,
+    datum: TrajectoryDatum = None,
     crs: Annotated[str | None, typer.Option(help="Coordinate system; over output.crs.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
     strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -20,13 +21,9 @@ def command(
         Path | None,
         typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; without it the log's INS, else IMU and GNSS."),
     ] = None,
-    at: Annotated[
-        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
-    ] = "body",
-    datum: Annotated[
-        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
-    ] = None,
-    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
+    at: TrajectoryPoint = "body",
+    datum: TrajectoryDatum = None,
+    week: TrajectoryWeek = None,
     calibration: Annotated[
         list[str] | None,
         typer.Option(metavar="[SCANNER=]FILE", help="Instead of the log's own; once a scanner."),

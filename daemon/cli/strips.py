@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -38,16 +39,12 @@ def command(
         Path | None,
         typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text or CSV; default: their IMU and GNSS."),
     ] = None,
-    at: Annotated[
-        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
-    ] = "body",
-    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
+    at: TrajectoryPoint = "body",
+    week: TrajectoryWeek = None,
     calibration: Annotated[
         list[str] | None, typer.Option(metavar="[SCANNER=]FILE", help="Of logs: instead of their own.")
     ] = None,
-    datum: Annotated[
-        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
-    ] = None,
+    datum: TrajectoryDatum = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Of logs: instead of their own.")] = None,
     strips: Annotated[str, typer.Option(help="Of logs: auto, whole, or a CSV of times.")] = "auto",
     adjust: Annotated[

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -37,13 +38,9 @@ def command(
         Path | None,
         typer.Option(metavar="FILE", help="SBET, Waypoint text or CSV; default: the logs' IMU and GNSS, navigated."),
     ] = None,
-    at: Annotated[
-        str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
-    ] = "body",
-    week: Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)] = None,
-    datum: Annotated[
-        str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
-    ] = None,
+    at: TrajectoryPoint = "body",
+    week: TrajectoryWeek = None,
+    datum: TrajectoryDatum = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
     strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
     output: Annotated[

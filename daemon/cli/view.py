@@ -59,6 +59,7 @@ def _make(
     """Read, draw, write, tell; gives whether a file could be read in part only."""
     from rich.console import Console
 
+    from daemon.processing.json_values import finite
     from daemon.processing.quicklook import look_at, numbers_of
     from daemon.processing.quicklook_page import make_page
     from daemon.processing.quicklook_read import QuickLookError
@@ -86,8 +87,6 @@ def _make(
             console.print(one_line(f"swath: {source.path}: {source.damage}; the page is of that part"))
             damaged = True
     if as_json:
-        from daemon.processing.strips_run import finite
-
         print(json.dumps(finite(numbers_of(look)) | {"page": str(page)}, indent=2, allow_nan=False))
     else:
         print(f"{len(look.strips)} strip{'s' * (len(look.strips) != 1)}, {look.surface.points:,} points: {page}")

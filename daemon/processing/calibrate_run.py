@@ -145,9 +145,9 @@ def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
 
 
 def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
-    _refuse_existing(wish, [])  # the report's, before the logs are read
+    _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
     kept = read_flight(wish.logs, folder, tell)
-    _refuse_existing(wish, [head.name for head in kept.flight.heads])
+    _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
     _refuse_one_strip(kept)
     points = _control(wish, kept.flight)
     workers = wish.logs.workers
@@ -203,11 +203,9 @@ def _aligned(flight: Flight) -> dict[str, Calibration]:
     }
 
 
-def _refuse_existing(wish: CalibrateWish, scanners: Sequence[str]) -> None:
-    """UserError where a calibration of a scanner or a report is there and may not be replaced."""
-    files = paths_of(wish, scanners).values() if wish.output.is_dir() else ()
-    reports = () if wish.report is None else (wish.report / OUTCOME,)
-    for path in (*files, *reports):
+def _refuse_existing(wish: CalibrateWish, files: Iterable[Path]) -> None:
+    """UserError where a file is there that may not be replaced."""
+    for path in files:
         if path.exists() and not wish.overwrite:
             raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
 

@@ -18,9 +18,9 @@ from calib.strips import StripReport
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_products import Told, strips_entry
 from daemon.processing.flights import Flight as LoggedFlight
+from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, files_of
-from daemon.processing.strips_run import finite
 from daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
 from daemon.processing.trajectory_summary import write_json
 from georef.trajectory import Trajectory

@@ -17,6 +17,7 @@ from calib.strips import Numbers, StripReport, report_of
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibration_flight import read_flight
 from daemon.processing.flights import Wish
+from daemon.processing.json_values import finite
 from daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
 from daemon.processing.user_errors import told_in_a_line
 from georef.mapping import MappingError
@@ -318,15 +319,6 @@ def _gridded(row: dict[str, Any]) -> dict[str, Any]:
 def _values(numbers: Numbers) -> dict[str, Any]:
     names = ("count", "mean_m", "std_m", "rms_m", "max_m", "median_m", "p95_m")
     return {name: _number(getattr(numbers, name)) for name in names}
-
-
-def finite(value: Any) -> Any:
-    """What JSON can hold: no number is null."""
-    if isinstance(value, dict):
-        return {key: finite(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _number(value: float) -> float | None:

@@ -20,8 +20,9 @@ from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
+from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
-from daemon.processing.strips_run import finite, refuse_installations
+from daemon.processing.strips_run import refuse_installations
 from daemon.processing.trajectory_files import write_whole
 from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.validate_record import record_files, records_of

@@ -19,7 +19,7 @@ SPEED_MPS = 50.0
 
 
 def test_samples_timed_by_their_arrival_lead_nobody_along_the_track(tmp_path: Path) -> None:
-    """CAN's frames come 0.4 ms after their samples: 2 cm of way, at sigmas of 1 cm, if nobody took it out."""
+    """Three frames of CAN at 1 Mbit/s take 0.4 ms: 2 cm of way, at sigmas of 1 cm, if nobody took it out."""
     text = HEADER.format(seed=4, prf_hz=500.0, true="omega_deg = 0.0")
     for name, (x0, y0), (x1, y1), height in LINES[:3]:
         text += LINE.format(name=name, x0=x0, y0=y0, x1=x1, y1=y1, height=height)
@@ -28,7 +28,7 @@ def test_samples_timed_by_their_arrival_lead_nobody_along_the_track(tmp_path: Pa
     navigated = navigate_session(flown.session(), NavigateWish(InputWish(config=config)))
     [leg] = navigated.legs
     offset_s = leg.solved.report.time_offset_s
-    assert 2e-4 < offset_s < 1e-3
+    assert 3e-4 < offset_s < 5e-4
     found, truth = navigated.trajectory(), flown.truth()
     begin_ns, end_ns = found.span
     inside = (truth.time_ns > begin_ns + 20 * SECOND_NS) & (truth.time_ns < end_ns - 2 * SECOND_NS)
@@ -37,4 +37,5 @@ def test_samples_timed_by_their_arrival_lead_nobody_along_the_track(tmp_path: Pa
     ahead = true.velocity_e / np.linalg.norm(true.velocity_e, axis=1, keepdims=True)
     off_m = there.position_e - true.position_e
     assert abs((off_m * ahead).sum(axis=1).mean()) < 0.3 * offset_s * SPEED_MPS
-    assert np.sqrt((off_m**2).sum(axis=1).mean()) < 0.03
+    sigma_m = np.sqrt((there.position_sigma_l**2).sum(axis=1).mean())
+    assert np.sqrt((off_m**2).sum(axis=1).mean()) < 1.5 * sigma_m

@@ -67,17 +67,23 @@ def test_the_cars_logging_delay_is_found() -> None:
 
 
 def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -> None:
-    """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say."""
+    """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say.
+
+    The filter is better than a fix, the smoother than half of one. Squares over predicted ones scatter by 0.3 from flight
+    to flight and axis to axis, those of angles, which last, by 1: the mean of 24 is 1 ± 0.2, 1 ± 0.6 at three sigmas.
+    """
     late_ns, truth, noise = 8_000_000, fly(survey(), 200.0, 50.0), GRADES["tactical"]
-    setup = replace(setup_for(noise, ARM), estimate_time_offset_s=0.02)
+    setup, fix_m = replace(setup_for(noise, ARM), estimate_time_offset_s=0.02), np.array(Fixes().sigma_m)
     squared: list[FloatArray] = []
     for seed in range(8):
         inertial, rows = noised(truth, noise, Fixes(velocity_mps=0.03, rate_hz=5.0), ARM, seed)
         start = drawn_start(truth, seed)
         late = replace(inertial, time_ns=inertial.time_ns + late_ns)
         solved = solve(late, rows, setup, replace(start, time_ns=start.time_ns + late_ns))
-        assert solved.report.time_offset_s == pytest.approx(1e-9 * late_ns, abs=2.5e-4)
-        for solution, most_m in ((solved.forward, 0.015), (solved.smoothed, 0.007)):
+        (sigma_s, *_) = solved.smoothed.time_offset_sigma_s
+        assert sigma_s < 1e-4
+        assert solved.report.time_offset_s == pytest.approx(1e-9 * late_ns, abs=4.0 * sigma_s)
+        for solution, most_m in ((solved.forward, fix_m), (solved.smoothed, fix_m / 2)):
             settled = solution.time_ns >= ns(60.0)
             t = (solution.time_ns[settled] - ns(0.0)) / 1e9
             state = (solution.position_e, solution.velocity_e, solution.q_e_from_b)
@@ -85,8 +91,8 @@ def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -
             assert (rms(off[:, :3]) < most_m).all()
         sigma = np.column_stack([solved.smoothed.position_sigma_l, solved.smoothed.attitude_sigma_rad])[settled]
         squared.append((off[:, [0, 1, 2, 6, 7, 8]] / sigma) ** 2)
-    assert 0.7 < np.concatenate(squared)[:, :3].mean() < 1.4
-    assert 0.5 < np.concatenate(squared)[:, 3:].mean() < 2.0
+    assert np.concatenate(squared)[:, :3].mean() == pytest.approx(1.0, abs=0.2)
+    assert np.concatenate(squared)[:, 3:].mean() == pytest.approx(1.0, abs=0.6)
 
 
 @pytest.mark.parametrize(("raw", "filtered_m", "smoothed_m"), [(False, 11.5, 0.53), (True, 11.5, 0.53)])

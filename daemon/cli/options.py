@@ -1,0 +1,15 @@
+"""Options that several commands have, said once."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+TrajectoryPoint = Annotated[
+    str, typer.Option("--trajectory-at", metavar="POINT", help="body, antenna, scanner, or x,y,z from the body.")
+]
+TrajectoryWeek = Annotated[int | None, typer.Option(help="GPS week of a trajectory that says none.", min=0)]
+TrajectoryDatum = Annotated[
+    str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
+]
