@@ -69,8 +69,9 @@ def test_the_cars_logging_delay_is_found() -> None:
 def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -> None:
     """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say.
 
-    The filter is better than a fix, the smoother than half of one. Squares over predicted ones scatter by 0.3 from flight
-    to flight and axis to axis, those of angles, which last, by 1: the mean of 24 is 1 ± 0.2, 1 ± 0.6 at three sigmas.
+    The filter is better than a fix, the smoother than half of one. Squares over predicted ones scatter by 0.3 from
+    flight to flight and axis to axis, those of angles, which last, by 1: the mean of 24 is 1 ± 0.2, and 1 ± 0.6, at
+    three sigmas.
     """
     late_ns, truth, noise = 8_000_000, fly(survey(), 200.0, 50.0), GRADES["tactical"]
     setup, fix_m = replace(setup_for(noise, ARM), estimate_time_offset_s=0.02), np.array(Fixes().sigma_m)
