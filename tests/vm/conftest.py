@@ -11,7 +11,7 @@ import pytest
 
 from tests.named_only import is_asked_for, limit
 from tests.vm.beside import Moment
-from tests.vm.machine import BESIDE_OTHERS
+from tests.vm.machine import BESIDE_OTHERS, stood_still
 
 HERE = Path(__file__).resolve().parent
 HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
@@ -65,6 +65,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for report in measured:
         told = ", ".join(f"{name} {_short(value)}" for name, value in report.user_properties)
         terminalreporter.write_line(f"{report.nodeid.removeprefix('tests/vm/')}  {told}")
+    if stood_still:
+        count = len(stood_still)
+        terminalreporter.write_line(f"machines that stood still before their first program, powered on again: {count}")
 
 
 def _short(value: object) -> str:

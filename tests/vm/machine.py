@@ -30,6 +30,8 @@ DCD_SHIM = CACHE / "dcd_shim.so"
 BESIDE_OTHERS = CACHE / "beside-others.json"  # what failed while this computer had other work
 
 BOOT_S = 120.0  # twenty times what it takes on an idle machine
+FIRST_WORD_S = 60.0  # from power on to VM-STAGE1, likewise
+POWERED_ON = 3  # times at most, where it stands still before that
 TIMED_OUT = 124
 NO_STATUS = 125
 SERVE = """\
@@ -40,6 +42,7 @@ for ((number = 1; ; number++)); do
     echo $? >/vm/answer/new; mv /vm/answer/new /vm/answer/$number.status
 done
 """  # a command for `start`: what `Machine.shell` asks, one after the other, until the power goes
+stood_still: list[Path] = []  # their folders; told at the end of a run
 _SYSTEMD = "/lib/systemd/systemd"
 # what udev would load for the processor and for what the board has: seconds where the processor is emulated
 _NOT_LOADED = (
@@ -75,6 +78,15 @@ class Machine:
     shared: Path
     deadline_s: float = field(repr=False)
     _asked: int = 0
+
+    def wakes(self) -> bool:
+        """Whether its first program has said a word in time, or it has ended."""
+        until_s = time.monotonic() + FIRST_WORD_S
+        while self.qemu.poll() is None and "VM-STAGE1" not in self.console:
+            if time.monotonic() > until_s:
+                return False
+            time.sleep(0.05)
+        return True
 
     @property
     def output(self) -> str:
@@ -204,6 +216,9 @@ def start(
 ) -> Machine:
     """Boot and run a bash command as root.
 
+    An emulated machine may stand still while its kernel begins (README, pitfalls): one in which no program has run yet
+    is powered on again, and `stood_still` tells it.
+
     Args:
         command: for bash, in the project's tree.
         shared: folder of the host, ``/vm`` in the machine; holds ``output``, ``console`` and with systemd ``journal``.
@@ -222,14 +237,14 @@ def start(
     _prepare(shared, command, overlay, systemd)
     init = _SYSTEMD if systemd else "/vm/stage2"
     modules = (CACHE / "kernel").resolve() / "lib/modules"
-    words = [
+    parameters = [
         "console=ttyS0 quiet panic=-1 mitigations=off tsc=reliable clocksource=tsc init_on_alloc=0",
         f"module_blacklist={','.join(_NOT_LOADED)}",
         f"vm.init={init} vm.modules={modules} vm.tree={TREE} vm.layers={len(layers)}",
         *(["systemd.unit=vm.target systemd.show_status=0"] if systemd else []),
         *kernel,
     ]
-    arguments = ["-kernel", needed[0], "-initrd", needed[1], "-append", " ".join(words)]
+    arguments = ["-kernel", needed[0], "-initrd", needed[1], "-append", " ".join(parameters)]
     for tag, folder, more in [
         ("hostroot", Path("/"), ",readonly=on,multidevs=remap"),
         ("vm", shared, ""),
@@ -238,7 +253,7 @@ def start(
         arguments += ["-fsdev", f"local,id={tag},path={folder},security_model=none{more}"]
         arguments += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
     board = "q35,usb=off,sata=off,smbus=off"
-    machine = ["-M", board, "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
+    computer = ["-M", board, "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
     fixed = ["-nodefaults", "-no-user-config", "-no-reboot", "-device", "virtio-rng-pci"]
     # setpriv: the machine does not outlive a test run that is killed
     line = [
@@ -247,18 +262,29 @@ def start(
         "KILL",
         "qemu-system-x86_64",
         *_accelerator(),
-        *machine,
+        *computer,
         *fixed,
         *arguments,
         *qemu,
     ]
+    words = [str(word) for word in line]
+    for number in range(1, POWERED_ON + 1):
+        machine = _power_on(words, shared, environment or {}, timeout_s)
+        if machine.wakes() or number == POWERED_ON:
+            break
+        machine.kill()
+        stood_still.append(shared)
+    return machine
+
+
+def _power_on(line: list[str], shared: Path, environment: Mapping[str, str], timeout_s: float) -> Machine:
     with (shared / "console").open("wb") as console:
         process = subprocess.Popen(
-            [str(word) for word in line],
+            line,
             stdin=subprocess.DEVNULL,
             stdout=console,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **(environment or {})},
+            env={**os.environ, **environment},
         )
     return Machine(process, shared, time.monotonic() + timeout_s)
 
