@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from daemon.cli.main import app
+from daemon.cli.main import make_app
 from daemon.config import load_config
 from tests.daemon.rig import HANGS_S, Recorder, session_table
 
@@ -136,7 +136,7 @@ def run_beside_a_recorder(folder: Path) -> None:
 
 def point_to_the_page(_: Path) -> None:
     """Named in the text only; what they do is proven in test_import.py and test_export.py."""
-    assert {"import", "export"} <= set(getattr(get_command(app), "commands", {}))
+    assert {"import", "export"} <= set(getattr(get_command(make_app(None)), "commands", {}))
 
 
 def run_points(folder: Path) -> None:
@@ -150,7 +150,7 @@ def run_points(folder: Path) -> None:
 
 def runs_with_georef(_: Path) -> None:
     """`run_points` flies, and looks at what it made."""
-    assert {"sim", "view"} <= set(getattr(get_command(app), "commands", {}))
+    assert {"sim", "view"} <= set(getattr(get_command(make_app(None)), "commands", {}))
 
 
 def extra_is_there(_: Path) -> None:
@@ -237,7 +237,7 @@ def test_configuration_of_the_readme_is_a_whole_aircraft(tmp_path: Path) -> None
 
 
 def test_commands_named_in_the_pages_exist() -> None:
-    known = set(getattr(get_command(app), "commands", {}))
+    known = set(getattr(get_command(make_app(None)), "commands", {}))
     for page in sorted((ROOT / "docs").glob("*.md")):
         for name in re.findall(r"(?:`|\$ )swath ([a-z-]+)\b", page.read_text()):
             assert name in known, f"{page.name}: there is no `swath {name}`"
@@ -256,7 +256,7 @@ def options(command: Any, name: str = "swath") -> Iterator[tuple[str, list[str]]
 def test_every_option_stands_in_a_page() -> None:
     pages = README + "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
     stands = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", pages))
-    assert [f"{name} {words[0]}" for name, words in options(get_command(app)) if stands.isdisjoint(words)] == []
+    assert [f"{name} {words[0]}" for name, words in options(get_command(make_app(None))) if stands.isdisjoint(words)] == []
 
 
 def test_make_help_lists_every_target() -> None:

@@ -7,6 +7,7 @@ line names.
 from __future__ import annotations
 
 import errno
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -99,21 +100,19 @@ def _callback(
     """Options of `swath` itself."""
 
 
-def make_app() -> typer.Typer:
-    """The application with every command whose file there is; a command's file imports what is heavy when it runs."""
+@functools.cache
+def make_app(name: str | None) -> typer.Typer:
+    """The application, its commands imported: the one of this name, or all; what is heavy they import as they run."""
     made = typer.Typer(name="swath", help=HELP, epilog=EPILOG, add_completion=False, rich_markup_mode="markdown")
     made.callback(help=HELP, epilog=EPILOG)(_callback)
     for listed in COMMANDS:
-        if importlib.util.find_spec(listed.module) is not None:
+        if name in (None, listed.name) and importlib.util.find_spec(listed.module) is not None:
             module = importlib.import_module(listed.module)
             if hasattr(module, "app"):  # commands of its own
                 made.add_typer(module.app, name=listed.name, short_help=listed.summary, rich_help_panel=listed.panel)
             else:
                 made.command(listed.name, short_help=listed.summary, rich_help_panel=listed.panel)(module.command)
     return made
-
-
-app = make_app()
 
 
 def main() -> None:
@@ -125,10 +124,11 @@ def main() -> None:
 def run_app(arguments: list[str]) -> int:
     """Run a command; every way it can end becomes an exit code and at most a line an error."""
     if not arguments:
-        app(args=["--help"], prog_name="swath", standalone_mode=False)
+        make_app(None)(args=["--help"], prog_name="swath", standalone_mode=False)
         return int(ExitCode.USAGE)
     try:
-        result = app(args=arguments, prog_name="swath", standalone_mode=False)
+        named = next((listed.name for listed in COMMANDS if listed.name == arguments[0]), None)
+        result = make_app(named)(args=arguments, prog_name="swath", standalone_mode=False)
         sys.stdout.flush()
     except UserError as error:
         _say(*error.message.splitlines())

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from daemon.cli.main import COMMANDS, app
+from daemon.cli.main import COMMANDS, make_app
 from daemon.errors import ExitCode
 from drivers.core.registry import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
@@ -76,13 +76,13 @@ class TestHelp:
 
     def test_every_command_has_a_help_of_its_own(self) -> None:
         for listed in COMMANDS:
-            result = CliRunner().invoke(app, [listed.name, "--help"])
+            result = CliRunner().invoke(make_app(None), [listed.name, "--help"])
             assert result.exit_code == 0, listed.name
             assert "Usage:" in result.output
 
     @pytest.mark.parametrize("name", ["georef", "live"])
     def test_says_where_positions_come_from_without_an_ins(self, name: str) -> None:
-        text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "300"}).output
+        text = CliRunner().invoke(make_app(None), [name, "--help"], env={"COLUMNS": "300"}).output
         assert "IMU and GNSS" in " ".join(text.split())
 
     def test_the_help_loads_no_heavy_module(self) -> None:
@@ -138,7 +138,7 @@ class TestErrors:
 
     def test_an_internal_error_is_one_line_and_its_details_a_file(self, tmp_path: Path) -> None:
         run = run_python(
-            "cli.app.command('boom')(lambda: 1 / 0)\nsys.exit(cli.run_app(['boom']))", TMPDIR=str(tmp_path)
+            "cli.make_app(None).command('boom')(lambda: 1 / 0)\nsys.exit(cli.run_app(['boom']))", TMPDIR=str(tmp_path)
         )
         assert run.returncode == ExitCode.PROBLEM
         [line] = run.stderr.splitlines()
@@ -149,7 +149,7 @@ class TestErrors:
 
     def test_a_service_keeps_the_details_in_its_state_directory(self, tmp_path: Path) -> None:
         run = run_python(
-            "cli.app.command('boom')(lambda: {}['x'])\nsys.exit(cli.run_app(['boom']))", STATE_DIRECTORY=str(tmp_path)
+            "cli.make_app(None).command('boom')(lambda: {}['x'])\nsys.exit(cli.run_app(['boom']))", STATE_DIRECTORY=str(tmp_path)
         )
         assert run.returncode == ExitCode.PROBLEM
         assert len(list(tmp_path.glob("swath-error-*.txt"))) == 1

@@ -40,6 +40,7 @@ print(socket.socket(socket.AF_UNIX).connect_ex(sys.argv[1]))
 RUN_AS = """
 import os, sys
 import daemon.cli.main, daemon.config, daemon.control_client, daemon.monitor, daemon.offload, rich.live, rich.progress
+daemon.cli.main.make_app(None)
 os.setgroups([]); os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))
 sys.exit(daemon.cli.main.run_app(sys.argv[2:]))
 """
