@@ -169,10 +169,14 @@ def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
 
 
 @pytest.fixture
-def without_live(service: Machine) -> Iterator[None]:
+def without_live(service: Machine) -> None:
     """The live service compiles for a quarter of an hour here, beside which a repair takes minutes."""
     service.told("systemctl mask --runtime --now swath-live", COMES_BACK_S)
-    yield
+
+
+@pytest.fixture
+def with_live(service: Machine) -> None:
+    """As it is at boot."""
     service.told("systemctl unmask --runtime swath-live; systemctl start --no-block swath-live")
 
 
@@ -216,6 +220,7 @@ def test_a_thread_that_hangs_costs_a_restart_and_no_more(service: Machine, place
     assert official_counts(logs / f"{stem}.recovered.mcap")["/scanner/left/raw"] > 0
 
 
+@pytest.mark.usefixtures("without_live")
 def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
     service.told("sleep 3")
     old = newest_log(service)
@@ -229,6 +234,7 @@ def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
         assert found[kind] == list(range(found[kind][0], found[kind][-1] + 1)), kind
 
 
+@pytest.mark.usefixtures("with_live")
 def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: Machine, place: Path) -> None:
     pid, moments = shown(service, "MainPID"), random.Random(20)
     first = newest_log(service)
@@ -244,6 +250,7 @@ def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: 
         assert found[kind] == list(range(found[kind][0], found[kind][-1] + 1)), kind
 
 
+@pytest.mark.usefixtures("without_live")
 def test_a_full_disk_ends_the_part_and_room_begins_another(service: Machine, place: Path) -> None:
     old = newest_log(service)
     free = f"$(( $(stat -fc '%a * %S' {LOGS}) ))"
@@ -256,6 +263,7 @@ def test_a_full_disk_ends_the_part_and_room_begins_another(service: Machine, pla
     assert newest_log(service) != old
 
 
+@pytest.mark.usefixtures("with_live")
 def test_shutdown_ends_the_log(service: Machine, place: Path) -> None:
     last = newest_log(service)
     restarts = int(shown(service, "NRestarts"))
