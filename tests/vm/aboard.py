@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,13 @@ SHARED = Path("/vm")
 WORK = Path("/run/flight")
 TREE = Path(__file__).resolve().parents[2]
 WAIT_S = 400.0  # measures nothing: it ends what would never end
+SWATH = "/opt/swath/bin/swath"
+# its user, priority, limits and (no) capabilities are swathd.service's
+AS_THE_SERVICE = (
+    *("prlimit", "--memlock=unlimited", "--rtprio=10", "--nofile=4096", "chrt", "-f", "10"),
+    *("setpriv", "--reuid=swath", "--regid=swath", "--init-groups", "--no-new-privs"),
+    *("--inh-caps=-all", "--bounding-set=-all"),
+)
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
@@ -51,20 +58,28 @@ def keep(name: str, value: dict[str, Any]) -> None:
     (SHARED / f"{name}.json").write_text(json.dumps(value))
 
 
-class Recorder:
-    """``swath run``, which has said READY; ``prefix`` is what starts it."""
+def lend(device: str) -> None:
+    """Give a device to the recorder's user, as the rules of udev do, which is not here."""
+    shutil.chown(device, group="dialout")
+    os.chmod(device, 0o660)
 
-    def __init__(self, config: str, prefix: Sequence[str] = ()) -> None:
+
+class Recorder:
+    """``swath run`` as it is installed, by its own user; it has said READY."""
+
+    def __init__(self, config: str) -> None:
         WORK.mkdir(parents=True, exist_ok=True)
+        shutil.chown(WORK, "swath", "swath")
         (WORK / "swath.toml").write_text(config)
         self._words = WORK / "stderr.txt"
         notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         (WORK / "notify").unlink(missing_ok=True)
         notify.bind(str(WORK / "notify"))
+        (WORK / "notify").chmod(0o666)
         notify.settimeout(WAIT_S)
         with self._words.open("wb") as words:
             self.process = subprocess.Popen(
-                [*prefix, sys.executable, "-m", "daemon.cli.main", "run", str(WORK / "swath.toml")],
+                [*AS_THE_SERVICE, SWATH, "run", str(WORK / "swath.toml")],
                 stderr=words,
                 stdout=subprocess.DEVNULL,
                 env={**os.environ, "NOTIFY_SOCKET": str(WORK / "notify")},
@@ -98,9 +113,9 @@ def session(name: str = "vm") -> str:
 
 
 @contextlib.contextmanager
-def recording(config: str, prefix: Sequence[str] = (), keep_as: str = "logs") -> Iterator[Recorder]:
+def recording(config: str, keep_as: str = "logs") -> Iterator[Recorder]:
     """A recorder at work; log and words are in `SHARED` afterwards."""
-    recorder = Recorder(config, prefix)
+    recorder = Recorder(config)
     try:
         yield recorder
         recorder.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import socket
 import struct
@@ -11,7 +12,7 @@ import time
 from array import array
 from pathlib import Path
 
-from tests.vm.aboard import SHARED, TREE, Recorder, keep, main, recording, say, session, sh, wait_until
+from tests.vm.aboard import SHARED, TREE, WORK, Recorder, keep, main, recording, say, session, sh, wait_until
 
 FRAME = struct.Struct("<IB3x8s")
 FD_FRAME = struct.Struct("<IBBxx64s")
@@ -38,7 +39,8 @@ packet_counter = "SAMPLE.packet_counter"
 
 def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
     """[imu.<name>] on an interface."""
-    dbc = TREE / "fixtures/config/imu.dbc"
+    WORK.mkdir(parents=True, exist_ok=True)
+    dbc = shutil.copy(TREE / "fixtures/config/imu.dbc", WORK)  # the project may lie where only root looks
     return IMU.format(name=name, channel=channel, rate_hz=rate_hz, dbc=dbc, options=options)
 
 

@@ -11,7 +11,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.vm.aboard import SHARED, keep, main, recording, say, session, sh, wait_until
+from tests.vm.aboard import SHARED, keep, lend, main, recording, say, session, sh, wait_until
 
 PARAMETERS = Path("/sys/module/pps_sim/parameters")
 DELAY_S = 0.15  # of a message after its edge
@@ -58,6 +58,7 @@ class Receiver:
         tty.setraw(secondary)
         os.set_blocking(self._main, False)
         self.port = os.ttyname(secondary)
+        lend(self.port)
         self._clock_ns = clock_ns
         self._last_s = clock_ns() // NANO
         threading.Thread(target=self._run, daemon=True).start()
@@ -107,6 +108,7 @@ def set_pps(**parameters: int) -> None:
 def edges(module: str) -> None:
     """Edges that are missing, stray, late, uneven, wrong for long, gone; the device vanishes and returns."""
     sh(f"insmod {module}")
+    lend("/dev/pps0")
     receiver = Receiver(time.time_ns)
     with recording(session() + DEVICES.format(pps="/dev/pps0", port=receiver.port)) as recorder:
         recorder.wait_said("second_known")
@@ -133,6 +135,7 @@ def edges(module: str) -> None:
         recorder.wait_said("/dev/pps0: ")
         time.sleep(9.0)
         sh(f"insmod {module}")
+        lend("/dev/pps0")
         returned = time.monotonic_ns()
         time.sleep(14.0)  # it is looked for every 5 s at the longest
         end = time.monotonic_ns()
@@ -160,6 +163,8 @@ def serial(kind: str, seconds: str) -> None:
         sh("modprobe pps_ldisc")
         line = subprocess.Popen(["ldattach", "-d", "PPS", "/dev/ttyS1"])
         wait_until(lambda: os.path.exists("/dev/pps0"), "/dev/pps0")
+        lend("/dev/pps0")
+    lend("/dev/ttyS1")
     pps = "/dev/pps0" if kind == "ldisc" else "serial-dcd:/dev/ttyS1"
     try:
         with recording(session() + DEVICES.format(pps=pps, port="/dev/ttyS1")):
@@ -174,6 +179,7 @@ def serial(kind: str, seconds: str) -> None:
 def wall_clock(module: str) -> None:
     """The wall clock is stepped by an hour, back, and slewed; then the kernel inserts a leap second."""
     sh(f"insmod {module} raw=1")
+    lend("/dev/pps0")
     # the receiver's UTC is a clock that nobody steps or slews, whose seconds are the pulses'
     base_ns = round((time.time_ns() - raw_ns()) / NANO) * NANO
     steps = []

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.vm.aboard_time import second_told
-from tests.vm.machine import CACHE, Finished, Machine, run, start
+from tests.vm.installed import installed
+from tests.vm.machine import Finished, Machine, run, start
 
 PATIENCE = 20  # how many times as long as on an idle machine, where other machines may run beside it
 
@@ -25,10 +26,8 @@ def command(module: str, *arguments: object, before: str = "") -> str:
     if Path(sys.prefix).is_relative_to("/tmp"):  # the machine has a /tmp of its own
         place = shlex.quote(sys.prefix)
         lines.append(f"mkdir -p {place}; mount -t 9p -o ro,cache=loose,trans=virtio,version=9p2000.L venv {place}")
-    compiled = shlex.quote(str(CACHE / "numba"))
     lines += [
         "export PYTHONDONTWRITEBYTECODE=1",
-        f"export NUMBA_CACHE_DIR={compiled}",
         before,
         shlex.join([sys.executable, "-m", f"tests.vm.{module}", *map(str, arguments)]),
     ]
@@ -57,6 +56,7 @@ def aboard(
     return run(
         command(module, *arguments, before=before),
         shared=shared,
+        layers=[installed()],
         qemu=[*_environment(), *qemu],
         timeout_s=PATIENCE * (20 + seconds),
     ).check()
@@ -75,6 +75,7 @@ def embark(
     return start(
         command(module, *arguments, before=before),
         shared=shared,
+        layers=[installed()],
         qemu=[*_environment(), *qemu],
         environment=environment,
         timeout_s=PATIENCE * (20 + seconds),

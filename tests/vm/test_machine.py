@@ -31,7 +31,7 @@ def test_program_is_installed_for_a_user_of_its_own(tmp_path: Path) -> None:
 def test_one_that_stands_still_is_powered_on_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Path] = []
     monkeypatch.setattr(machine, "stood_still", told)
-    monkeypatch.setattr(machine, "FIRST_WORD_S", 20.0)
+    monkeypatch.setattr(machine, "FIRST_WORD_S", 12.0)
     programs = tmp_path / "bin"
     programs.mkdir()
     qemu = programs / "qemu-system-x86_64"
