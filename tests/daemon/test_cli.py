@@ -149,7 +149,8 @@ class TestErrors:
 
     def test_a_service_keeps_the_details_in_its_state_directory(self, tmp_path: Path) -> None:
         run = run_python(
-            "cli.make_app(None).command('boom')(lambda: {}['x'])\nsys.exit(cli.run_app(['boom']))", STATE_DIRECTORY=str(tmp_path)
+            "cli.make_app(None).command('boom')(lambda: {}['x'])\nsys.exit(cli.run_app(['boom']))",
+            STATE_DIRECTORY=str(tmp_path),
         )
         assert run.returncode == ExitCode.PROBLEM
         assert len(list(tmp_path.glob("swath-error-*.txt"))) == 1
