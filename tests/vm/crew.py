@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.vm.aboard_time import second_told
-from tests.vm.installed import installed
+from tests.vm.installed import image
 from tests.vm.machine import Finished, Machine, run, start
 
 PATIENCE = 20  # how many times as long as on an idle machine, where other machines may run beside it
@@ -56,7 +56,7 @@ def aboard(
     return run(
         command(module, *arguments, before=before),
         shared=shared,
-        layers=[installed()],
+        layers=[image()],
         qemu=[*_environment(), *qemu],
         timeout_s=PATIENCE * (20 + seconds),
     ).check()
@@ -75,7 +75,7 @@ def embark(
     return start(
         command(module, *arguments, before=before),
         shared=shared,
-        layers=[installed()],
+        layers=[image()],
         qemu=[*_environment(), *qemu],
         environment=environment,
         timeout_s=PATIENCE * (20 + seconds),

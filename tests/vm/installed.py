@@ -1,4 +1,4 @@
-"""The program as `make install` installs it, in a folder to lay over the machine's root: made once, kept in .cache."""
+"""The program as `make install` installs it, to lay over the machine's root: a folder and its disk, kept in .cache."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-from tests.vm.machine import CACHE, TREE, UDEV
+from tests.vm.machine import CACHE, TREE, UDEV, with_sbin
 
 INSTALLED = CACHE / "installed"
+IMAGE = CACHE / "installed.ext4"
+MB = 1 << 20
 _SOURCES = ("pyproject.toml", "calib", "daemon", "drivers", "georef", "sim", "systemd")
 _ACCOUNTS = ("passwd", "group", "shadow", "gshadow")
 
@@ -27,12 +29,19 @@ def installed() -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         state = _state()
         mark = CACHE / "installed.state"
-        if mark.exists() and (os.environ.get("SWATH_VM_KEEP") or mark.read_text() == state):
+        if mark.exists() and IMAGE.exists() and (os.environ.get("SWATH_VM_KEEP") or mark.read_text() == state):
             return INSTALLED
         mark.unlink(missing_ok=True)
         _install(INSTALLED)
+        _make_image(INSTALLED, IMAGE)
         mark.write_text(state)
     return INSTALLED
+
+
+def image() -> Path:
+    """The same as a disk, for `machine.start`'s ``layers``: over 9p a recorder takes 18 s to start, from it 14."""
+    installed()
+    return IMAGE
 
 
 def overlay(folder: Path, config: str, *, enabled: Iterable[str] = ("swathd.service",)) -> Path:
@@ -51,7 +60,7 @@ def overlay(folder: Path, config: str, *, enabled: Iterable[str] = ("swathd.serv
 
 def with_udev() -> list[Path]:
     """The layers of a machine that names its devices."""
-    return [installed(), UDEV]
+    return [image(), UDEV]
 
 
 def _install(layer: Path) -> None:
@@ -67,6 +76,14 @@ def _install(layer: Path) -> None:
     _run(["systemd-sysusers", f"--root={layer}"], environment)  # a package's script would, or the next start
     for path in (layer, *(one for one in layer.rglob("*") if one.is_dir() and not one.is_symlink())):
         path.chmod(0o755)
+
+
+def _make_image(layer: Path, path: Path) -> None:
+    """Of what a disk that is only read needs nothing: no journal, no checksums, no blocks kept for root."""
+    path.unlink(missing_ok=True)
+    held = sum(one.lstat().st_size // 4096 + 2 for one in layer.rglob("*")) * 4096
+    without = ["-O", "^has_journal,^metadata_csum", "-m", "0"]
+    _run(["mkfs.ext4", "-qF", *without, "-d", str(layer), str(path), f"{held // MB + 128}M"], with_sbin())
 
 
 def _run(command: list[str], environment: dict[str, str]) -> None:

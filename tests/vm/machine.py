@@ -224,7 +224,7 @@ def start(
         shared: folder of the host, ``/vm`` in the machine; holds ``output``, ``console`` and with systemd ``journal``.
         systemd: PID 1 is systemd, and the command runs after multi-user.target.
         overlay: files copied over the machine's root before PID 1; enabled units belong here.
-        layers: folders laid under those and over the host's root, read-only, the first uppermost.
+        layers: folders or images of ext4, laid under those and over the host's root, read-only, the first uppermost.
         qemu: further arguments of qemu; a network, a disk, a serial line.
         kernel: further words of the kernel's command line.
         environment: further variables of qemu's environment.
@@ -248,7 +248,7 @@ def start(
     for tag, folder, more in [
         ("hostroot", Path("/"), ",readonly=on,multidevs=remap"),
         ("vm", shared, ""),
-        *((f"layer{number}", layer, ",readonly=on") for number, layer in enumerate(layers)),
+        *((f"layer{number}", layer, ",readonly=on") for number, layer in enumerate(layers) if layer.is_dir()),
     ]:
         arguments += ["-fsdev", f"local,id={tag},path={folder},security_model=none{more}"]
         arguments += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
@@ -257,15 +257,13 @@ def start(
     fixed = ["-nodefaults", "-no-user-config", "-no-reboot", "-device", "virtio-rng-pci"]
     # setpriv: the machine does not outlive a test run that is killed
     line = [
-        "setpriv",
-        "--pdeathsig",
-        "KILL",
-        "qemu-system-x86_64",
+        *("setpriv", "--pdeathsig", "KILL", "qemu-system-x86_64"),
         *_accelerator(),
         *computer,
         *fixed,
         *arguments,
         *qemu,
+        *(word for number, layer in enumerate(layers) if layer.is_file() for word in _image(number, layer)),
     ]
     words = [str(word) for word in line]
     for number in range(1, POWERED_ON + 1):
@@ -275,6 +273,14 @@ def start(
         machine.kill()
         stood_still.append(shared)
     return machine
+
+
+def _image(number: int, path: Path) -> list[str]:
+    """A disk behind all that a test has: theirs are vda, vdb, …"""
+    return [
+        *("-drive", f"if=none,id=layer{number},format=raw,file={path},readonly=on,cache=unsafe"),
+        *("-device", f"virtio-blk-pci,drive=layer{number},serial=layer{number},addr={0x1D - number:#x}"),
+    ]
 
 
 def _power_on(line: list[str], shared: Path, environment: Mapping[str, str], timeout_s: float) -> Machine:
@@ -292,7 +298,7 @@ def _power_on(line: list[str], shared: Path, environment: Mapping[str, str], tim
 def make_disk(path: Path, size_mb: int) -> Path:
     """An empty ext4 file system in a file, for `disk`."""
     path.unlink(missing_ok=True)
-    subprocess.run(["mkfs.ext4", "-qF", str(path), f"{size_mb}M"], check=True, capture_output=True, env=_with_sbin())
+    subprocess.run(["mkfs.ext4", "-qF", str(path), f"{size_mb}M"], check=True, capture_output=True, env=with_sbin())
     return path
 
 
@@ -307,7 +313,7 @@ def replay_journal(path: Path) -> None:
     Raises:
         AssertionError: it is damaged beyond that.
     """
-    found = subprocess.run(["e2fsck", "-fy", str(path)], capture_output=True, text=True, env=_with_sbin(), check=False)
+    found = subprocess.run(["e2fsck", "-fy", str(path)], capture_output=True, text=True, env=with_sbin(), check=False)
     assert found.returncode in (0, 1), found.stdout + found.stderr
 
 
@@ -316,7 +322,7 @@ def copy_from_disk(path: Path, source: str, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     request = f"rdump {source} {folder}"
     found = subprocess.run(
-        ["debugfs", "-R", request, str(path)], capture_output=True, text=True, env=_with_sbin(), check=True
+        ["debugfs", "-R", request, str(path)], capture_output=True, text=True, env=with_sbin(), check=True
     )
     assert "not found" not in found.stderr, found.stderr
 
@@ -353,6 +359,8 @@ def _prepare(shared: Path, command: str, overlay: Path | None, systemd: bool) ->
                 (generators / path.name).symlink_to("/dev/null")
         for unit in ("vm.target", "vm-command.service"):
             shutil.copy(GUEST / unit, units / unit)
+        (units / "systemd-udev-trigger.service.d").mkdir()
+        shutil.copy(GUEST / "coldplug.conf", units / "systemd-udev-trigger.service.d")
     for folder in (root, *(path for path in root.rglob("*") if path.is_dir() and not path.is_symlink())):
         if folder.exists():
             folder.chmod(folder.stat().st_mode | 0o055)  # made in a temporary folder, they would lock users out
@@ -366,7 +374,8 @@ def _accelerator() -> list[str]:
     return ["-accel", "tcg,thread=multi", "-cpu", "max"]
 
 
-def _with_sbin() -> dict[str, str]:
+def with_sbin() -> dict[str, str]:
+    """The environment of a program that not everybody's PATH finds."""
     return {**os.environ, "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"}
 
 

@@ -80,7 +80,7 @@ make_initramfs() {
     mkdir -p "$root"/{bin,proc,sys,dev,ro,rw,root,"lib/modules/$release"}
     cp "$(command -v busybox)" "$root/bin/busybox"
     install -m 755 "$here/guest/init" "$root/init"
-    for module in virtio_pci 9pnet_virtio 9p overlay; do
+    for module in virtio_pci 9pnet_virtio 9p overlay virtio_blk crc32c_generic ext4; do
         modprobe -d "$cache/kernel" -S "$release" --show-depends "$module" | awk '$1 == "insmod" {print $2}'
     done | sort -u | while read -r file; do
         install -D "$file" "$root/${file#"$cache/kernel/"}"

@@ -108,6 +108,18 @@ def fetched(service: Machine, place: Path) -> Path:
     return place / "vm/logs"
 
 
+@pytest.fixture
+def without_live(service: Machine) -> None:
+    """The live service compiles for a quarter of an hour here, beside which a repair takes minutes."""
+    service.told("systemctl mask --runtime --now swath-live", COMES_BACK_S)
+
+
+@pytest.fixture
+def with_live(service: Machine) -> None:
+    """As it is at boot."""
+    service.told("systemctl unmask --runtime swath-live; systemctl start --no-block swath-live")
+
+
 def test_both_services_are_enabled_and_started_at_boot(service: Machine) -> None:
     assert service.told("cat /proc/1/comm") == "systemd"
     assert service.told("systemctl is-enabled swathd swath-live").split() == ["enabled", "enabled"]
@@ -126,6 +138,7 @@ def test_ready_is_said_after_recording_has_begun(service: Machine) -> None:
     assert shown(service, "StatusText").startswith("recording flight-")
 
 
+@pytest.mark.usefixtures("without_live")
 def test_devices_have_their_names_and_rights(service: Machine) -> None:
     service.until("ls /dev/rover")
     assert service.told("stat -Lc '%G %a' /dev/pps0 /dev/rover").splitlines() == ["dialout 660"] * 2
@@ -137,6 +150,7 @@ def test_devices_have_their_names_and_rights(service: Machine) -> None:
     assert service.told("stat -Lc %G /dev/gnss/ublox-UBX7") == "dialout"
 
 
+@pytest.mark.usefixtures("without_live")
 def test_a_rule_makes_a_pulse_of_a_serial_port(service: Machine) -> None:
     """By the line discipline that the unit holds; the recorder has the same port open."""
     service.until("systemctl is-active swath-pps@ttyS1 && ls /dev/pps1")
@@ -146,6 +160,7 @@ def test_a_rule_makes_a_pulse_of_a_serial_port(service: Machine) -> None:
     assert shown(service, "NRestarts", "swath-pps@ttyS1") == "0"
 
 
+@pytest.mark.usefixtures("without_live")
 @pytest.mark.parametrize("unit", SERVICES)
 def test_sandbox_denies_what_it_should(service: Machine, unit: str) -> None:
     service.told(f"install -d -o swath -g swath {LOGS}/live; systemctl start probe-{unit}", COMES_BACK_S)
@@ -160,24 +175,13 @@ def test_sandbox_denies_what_it_should(service: Machine, unit: str) -> None:
     assert {name for name, told in found.items() if told is True} == allowed, found
 
 
+@pytest.mark.usefixtures("without_live")
 def test_a_silent_sensor_is_no_reason_to_restart(service: Machine) -> None:
     service.until("systemctl show -P StatusText swathd | grep 'gnss/rover no data yet'")
     pid = shown(service, "MainPID")
     service.told("sleep 15")  # its watchdog has ten
     assert shown(service, "MainPID") == pid
     assert shown(service, "NRestarts") == "0"
-
-
-@pytest.fixture
-def without_live(service: Machine) -> None:
-    """The live service compiles for a quarter of an hour here, beside which a repair takes minutes."""
-    service.told("systemctl mask --runtime --now swath-live", COMES_BACK_S)
-
-
-@pytest.fixture
-def with_live(service: Machine) -> None:
-    """As it is at boot."""
-    service.told("systemctl unmask --runtime swath-live; systemctl start --no-block swath-live")
 
 
 @pytest.mark.usefixtures("without_live")
@@ -238,10 +242,11 @@ def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
 def test_the_live_service_killed_again_and_again_costs_the_log_nothing(service: Machine, place: Path) -> None:
     pid, moments = shown(service, "MainPID"), random.Random(20)
     first = newest_log(service)
+    running = "systemctl show -P ControlPID -P MainPID swath-live | grep -q '[1-9]'"
+    kill = "systemctl kill --kill-who=all -s KILL swath-live"
     for _ in range(KILLS):
-        running = "systemctl show -P ControlPID -P MainPID swath-live | grep -q '[1-9]'"
-        service.until(running, COMES_BACK_S)
-        service.told(f"sleep {moments.uniform(0, 3):.2f}; systemctl kill --kill-who=all -s KILL swath-live || true")
+        begun, gone = f"until {running}; do sleep 0.1; done", f"while {running}; do sleep 0.1; done"
+        service.told(f"{begun}; sleep {moments.uniform(0, 3):.2f}; {kill} || true; {gone}", COMES_BACK_S)
     assert shown(service, "MainPID") == pid
     assert newest_log(service) == first
     service.told("sleep 2")
