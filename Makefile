@@ -18,7 +18,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
+.PHONY: help demo test test-slow test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
 
 help: ## say what there is to make
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -26,10 +26,14 @@ help: ## say what there is to make
 demo: $(VENV)/.flies ## play real recordings, then a virtual flight, through real wires into a recorder, about 2 min
 	@$(BIN)/python -m demo
 
-test: $(VENV)/.tests $(VENV)/.tools ## install and run everything: style, types, import rules, tests
+test: $(VENV)/.tests $(VENV)/.tools ## install and run: style, types, import rules, tests
 	@$(MAKE) -j 2 --output-sync=target lint ready
-	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not long and not alone and not peers"
-	$(PYTEST) -n 0 -m "alone and not long"
+	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not slow and not long and not alone and not peers"
+	$(PYTEST) -n 0 -m "alone and not slow and not long"
+
+test-slow: $(VENV)/.tests $(VENV)/.tools ready ## the tests that take longer: whole flights, calibrated; the demo, the installation
+	$(PYTEST) -n $(JOBS) --dist loadgroup -m "slow and not long and not alone and not peers"
+	$(PYTEST) -n 0 -m "alone and slow and not long"
 
 test-peers: $(VENV)/.tests ## beside gpsd and Foxglove's reader, which it installs (root, apt, npm)
 	@for program in gpsd npm; do command -v $$program >/dev/null || \

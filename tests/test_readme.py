@@ -205,6 +205,7 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", commands())
 def test_command_of_the_readme(line: str, tmp_path: Path) -> None:
     assert line in EXERCISED, "say in EXERCISED how this command is tested"

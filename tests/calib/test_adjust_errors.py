@@ -15,7 +15,7 @@ from calib.trajectory_errors import Taus, gauss_markov
 from tests.calib.roofs import LINES, made, trajectory
 from tests.calib.test_rows import shifted
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 RUNS = 100
 

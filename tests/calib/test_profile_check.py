@@ -21,7 +21,7 @@ from calib.report_profiles import comparison_table, pictures, profiles_table
 from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, gauss_markov
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 LINES = (Line(-145, 0, 90, 290, 300), Line(145, 10, 270, 290, 300), Line(-145, 110, 90, 290, 300))
 CONTROL = [

@@ -28,7 +28,7 @@ from calib.report_verdict import Level
 from calib.report_words import decimals_of, degrees, length, number, plain, share, unknown
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from georef.mount import Mount, Stage
 from georef.rotations import rot_x
 from tests.calib.cast_flight import Cast, cast_flight
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 FloatArray = NDArray[np.float64]
 RULES = StripRules(most_cells=3000)

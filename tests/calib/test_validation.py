@@ -179,6 +179,7 @@ def test_the_tests_reject_as_often_as_they_promise() -> None:
         assert 0.45 < column.mean() < 0.55
 
 
+@pytest.mark.slow
 def test_planes_that_many_swaths_show_are_tested_as_often_as_promised(made: Cast, roofs: Features) -> None:
     """Each sight errs once, in all its distances, as returns and 3 mm of a distance say; so does a strip on a plane."""
     calibrations, flight = {"left": made.truth}, made.flight.placed({"left": made.truth})

@@ -73,6 +73,7 @@ def test_a_note_in_the_place_of_a_directory(command: str) -> None:
     assert "internal error" not in done.stderr
 
 
+@pytest.mark.slow
 def test_configuration_of_another_aircraft(tmp_path: Path) -> None:
     """Each device that speaks something else is named, the one that is right is not, and every byte is recorded."""
     ubx = recording("ubx", "ublox-zed-f9p-hp.log")

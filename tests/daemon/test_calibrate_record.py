@@ -14,7 +14,7 @@ from daemon.processing.flown import TrajectoryWish
 from daemon.processing.setup import Options
 from tests.calib.village import Made, village
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from daemon.processing.flown import TrajectoryWish, offset_of
 from daemon.processing.setup import Options, Setup
 from tests.calib.village import Made, village
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 PRF_HZ, OFFSET_M = 2_000.0, 0.05
 

@@ -60,6 +60,7 @@ def reader(descriptor: int) -> Iterator[bytearray]:
         thread.join()
 
 
+@pytest.mark.slow
 def test_a_caster_s_bytes_are_logged_and_reach_the_receiver(tmp_path: Path) -> None:
     """The caster hangs up in the middle; the second connection gives the rest."""
     logs, half = tmp_path / "logs", len(DATA) // 2

@@ -216,6 +216,7 @@ def recording(tmp_path: Path, logs: Path, wires: list[Wire]) -> Iterator[Recorde
 # --- two of everything ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_of_each_kind_at_once_and_one_receiver_changes_its_messages(tmp_path: Path, logs: Path) -> None:
     """Each source has exactly its own units; the receiver that gives no time any more is told, the other is not."""
     scanners = [udp_wire("scanner/left"), udp_wire("scanner/right")]
@@ -284,6 +285,7 @@ def heard_at(data: bytes, sent_baud: int, heard_baud: int) -> bytes:
     return bytes(heard)
 
 
+@pytest.mark.slow
 def test_a_receiver_that_changes_its_baud_rate_is_told_and_recorded_as_it_came(tmp_path: Path, logs: Path) -> None:
     rover = serial_wire("gnss/rover")
     assert heard_at(zda(1), 9600, 9600) == zda(1)
@@ -407,6 +409,7 @@ def memory_mb(recorder: Recorder) -> float:
     return next(int(row.split()[1]) for row in status.splitlines() if row.startswith("RssAnon")) / 1e3
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_garbage_at_full_rate_costs_the_others_nothing(tmp_path: Path, logs: Path) -> None:
     """A line full of beginnings of messages that never end, and 20 000 datagrams a second that are none."""

@@ -84,6 +84,7 @@ class TestUbx:
         assert outcomes(found).count(Outcome.ACCEPTED) == len(found.steps) - 1
         assert not found.ok
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("chatter", [b"", UBX_DATA])
     def test_without_an_answer_nothing_more_is_sent(self, tmp_path: Path, chatter: bytes) -> None:
         with receiver(split_ubx, ubx_acknowledges(silent="RATE_MEAS"), chatter) as device:
@@ -92,12 +93,14 @@ class TestUbx:
         assert outcomes(found) == [Outcome.ACCEPTED, Outcome.NO_ANSWER, *[Outcome.NOT_SENT] * (len(found.steps) - 2)]
         assert len(device.commands) == 2
 
+    @pytest.mark.slow
     def test_an_answer_said_twice_is_not_that_of_the_next_message(self, tmp_path: Path) -> None:
         acknowledge = ubx_acknowledges(silent="RATE_MEAS")
         with receiver(split_ubx, lambda command: 2 * acknowledge(command)) as device:
             found = apply(gnss(device.path, "ubx"), tmp_path, timeout_s=SILENT_S)["gnss/rover"]
         assert outcomes(found)[:3] == [Outcome.ACCEPTED, Outcome.NO_ANSWER, Outcome.NOT_SENT]
 
+    @pytest.mark.slow
     def test_the_line_follows_the_device_to_the_configured_rate(self, tmp_path: Path) -> None:
         acknowledge = ubx_acknowledges()
 
@@ -115,12 +118,14 @@ class TestUbx:
         assert set(outcomes(found)) == {Outcome.ACCEPTED}
         assert outcome_of(found, "CFG-UART1-BAUDRATE = 460800")[0] == Outcome.ACCEPTED
 
+    @pytest.mark.slow
     def test_a_device_that_has_the_configured_rate_already(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA, termios.B460800) as device:
             text = gnss(device.path, "ubx", "?baud=460800")
             found = apply(text, tmp_path, present_baud=38400, timeout_s=SILENT_S)["gnss/rover"]
         assert set(outcomes(found)) == {Outcome.ACCEPTED}
 
+    @pytest.mark.slow
     def test_a_device_at_another_rate_gives_no_answer(self, tmp_path: Path) -> None:
         with receiver(split_ubx, ubx_acknowledges(), UBX_DATA, termios.B9600) as device:
             found = apply(gnss(device.path, "ubx", "?baud=460800"), tmp_path, timeout_s=SILENT_S)["gnss/rover"]

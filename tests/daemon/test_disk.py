@@ -60,6 +60,7 @@ class Flood:
         self._socket.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reserve_mb", "said"), [(8, "disk_reserve"), (1, "write_failed")])
 def test_stops_when_full_and_resumes_when_there_is_room(small_disk: Path, reserve_mb: int, said: str) -> None:
     """Looked at once a second, the reserve stops 5 MB/s in time; 20 MB/s run past 1 MB into the disk's own error."""
@@ -129,6 +130,7 @@ def keep_parts(logs: Path, kept: Path) -> None:
         shutil.copy(path, kept)
 
 
+@pytest.mark.slow
 @pytest.mark.alone  # asserts how soon
 def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_to(
     failing_disk: tuple[Path, Path], tmp_path: Path
@@ -168,6 +170,7 @@ def test_file_system_that_goes_read_only_is_told_at_once_and_another_is_written_
     assert content.events("recording_resumed")
 
 
+@pytest.mark.slow
 def test_full_from_the_start_is_ready_and_waits(small_disk: Path) -> None:
     (small_disk / "filler").write_bytes(bytes(20 << 20))
     port = free_udp_port()

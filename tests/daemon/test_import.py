@@ -97,6 +97,7 @@ class TestRealCaptures:
         assert sources["scanner/top"]["decoded"]["records"]["ScannerReturns"] == 73_486
         assert session["damage"] == []
 
+    @pytest.mark.slow
     def test_other_readers_accept_it(self, made: Path) -> None:
         for log in made.glob("*.mcap"):
             assert doctor(log).returncode == 0
@@ -465,6 +466,7 @@ def test_a_row_of_a_sidecar_that_cannot_be_is_told(tmp_path: Path, row: str) -> 
         list(read_sidecar(tmp_path / "a.log"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])
 def test_captures_cut_and_damaged_anywhere_never_break_an_import(tmp_path: Path, kind: str) -> None:
     """Whatever is wrong, it is counted or refused in a line, and the log that is made is whole."""

@@ -23,7 +23,7 @@ from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_live import PLAN
 
-pytestmark = [pytest.mark.alone, pytest.mark.xdist_group("kernels")]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
 
 SECONDS = 6.5
 PART_MINUTES = 0.035  # two seconds

@@ -22,7 +22,7 @@ from georef.points import Points
 from tests.daemon.rig import HANGS_S, Recorder, wait_until
 from tests.daemon.test_live_growing import config_of, running
 
-pytestmark = [pytest.mark.alone, pytest.mark.xdist_group("kernels")]
+pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
 
 FloatArray = NDArray[np.float64]
 PLAN = """

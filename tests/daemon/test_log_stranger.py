@@ -29,7 +29,7 @@ from tests.fuzz import mcap_parts as mcap
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = pytest.mark.xdist_group("stranger")  # its files are read once, by one worker
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stranger")]  # its files are read once, by one worker
 PEAK_BYTES = 600 << 20  # of the process, libraries and all
 SECONDS = 60.0
 YEAR_2200_NS = 7_258_118_400_000_000_000

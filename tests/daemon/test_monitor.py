@@ -108,6 +108,7 @@ def comes_as_sent(found: dict[str, Any]) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_says_what_comes_and_that_all_is_well(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 200.0):
@@ -161,6 +162,7 @@ def test_gaps_in_a_sequence_and_damaged_messages_degrade(tmp_path: Path, logs: P
     assert "messages damaged" in troubles
 
 
+@pytest.mark.slow
 def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path) -> None:
     """It has no units and no status of its own; what it is fed is its stream's."""
     data = gzip.decompress(CAPTURE.read_bytes())[:200_000]
@@ -187,6 +189,7 @@ def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path)
     assert not any("imu/main" in trouble for trouble in found["troubles"])
 
 
+@pytest.mark.slow
 def test_a_silent_source_degrades_and_an_absent_one(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + scanner(free_udp_port()) + ROVER.format(path=tmp_path / "nothing")
     with Recorder(tmp_path, config) as recorder:
@@ -220,6 +223,7 @@ def test_nothing_recorded_is_2_and_says_why(tmp_path: Path, logs: Path) -> None:
     assert "is gone, and its log has no end" in found["sentence"]
 
 
+@pytest.mark.slow
 def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
     """A note waits for room, a new part is refused."""
     logs = tmp_path / "disk/logs"
@@ -245,6 +249,7 @@ def test_stopped_at_the_reserve_is_not_recording(tmp_path: Path) -> None:
     assert notes == ["while it is full"]
 
 
+@pytest.mark.slow
 def test_a_writer_that_stands_still_is_not_recording(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         time.sleep(1.5)
@@ -287,6 +292,7 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
     assert (found["verdict"], found["sentence"][:33]) == ("not recording", "NOT RECORDING: nothing has been w")
 
 
+@pytest.mark.slow
 def test_the_log_of_a_power_cut_is_not_called_recording_after_the_restart(tmp_path: Path, logs: Path) -> None:
     """The sign of what is recorded outlives the recorder; the recorder of another boot has no lock to be seen."""
     with Recorder(tmp_path, session_table(logs)) as recorder:
@@ -325,6 +331,7 @@ def units_of(follower: LogFollower) -> list[int]:
     ]
 
 
+@pytest.mark.slow
 def test_follows_over_parts_a_kill_and_a_restart(tmp_path: Path, logs: Path) -> None:
     """What is followed is what is in the files, each unit once, in order."""
     numbers = Numbers(free_udp_port())
@@ -470,6 +477,7 @@ def _processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+@pytest.mark.slow
 def test_on_a_terminal_it_is_a_page_until_ctrl_c(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     main, secondary = pty.openpty()

@@ -33,7 +33,7 @@ from georef.records import FixType
 from georef.timescales.gps_time import SECOND_NS
 from tests.daemon.navigation_flights import FILE, sound_flight, with_rows
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 Array = NDArray[Any]
 EVERY = 4

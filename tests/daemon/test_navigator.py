@@ -130,6 +130,7 @@ def test_points_come_of_it(followed: Told) -> None:
     assert feed.navigator.state.startswith("aligned")
 
 
+@pytest.mark.slow
 def test_the_same_poses_however_its_messages_come(followed: Told, setup: Setup, flown: Flown) -> None:
     again, _, _ = told(setup, flown, one_by_one(flown.session().batches()))
     assert again.tobytes() == followed[0].tobytes()

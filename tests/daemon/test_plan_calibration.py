@@ -12,7 +12,7 @@ import pytest
 from daemon.cli.plan_calibration import command
 from daemon.errors import ExitCode, UserError
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 HEAD = """
 [flight]

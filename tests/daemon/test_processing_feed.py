@@ -179,6 +179,7 @@ def test_random_partitions_give_the_same_bytes(
     assert digest(placed) == digest(whole[0])
 
 
+@pytest.mark.slow
 def test_message_by_message_gives_the_same_bytes(whole: tuple[Placed, LogFeed], setup: Setup, flown: Flown) -> None:
     session = flown.session()
     placed, _ = placed_of(setup, session, cut(session.batches(), 1, 0))

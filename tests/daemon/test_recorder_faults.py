@@ -77,6 +77,7 @@ def last_status(content: LogContent, source: str = "scanner/left") -> dict[str, 
     return status
 
 
+@pytest.mark.slow
 def test_full_queue_is_counted_told_and_survived(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, module=(SPECIAL, "small-queue")) as recorder:
@@ -262,6 +263,7 @@ def test_another_recorder_that_takes_the_directory_made_anew_is_told_and_not_dis
     assert "directory_unlocked" in [event["code"] for event in read_events(path)]
 
 
+@pytest.mark.slow
 def test_directory_that_cannot_come_back_is_not_called_alive(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
@@ -308,6 +310,7 @@ def test_strangers_on_the_port_share_one_channel(tmp_path: Path, logs: Path, num
     assert sum(port is None for _, port in channels) == 1
 
 
+@pytest.mark.slow
 def test_account_goes_on_when_a_device_comes_back(tmp_path: Path, logs: Path) -> None:
     link = tmp_path / "rover"
     config = session_table(logs) + f'[gnss.rover]\ntransport = "serial:{link}"\nprotocol = "nmea"\n'
@@ -379,6 +382,7 @@ def test_death_of_the_writer_ends_the_process(tmp_path: Path, logs: Path, number
         assert "the writer failed: RuntimeError: a defect" in recorder.stderr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("watchdog_s", [None, 2.0])
 def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watchdog_s: float | None) -> None:
     """Under a service manager a new process begins at once; by hand the others are recorded on."""
@@ -404,6 +408,7 @@ def test_death_of_a_receiver(tmp_path: Path, logs: Path, numbers: Numbers, watch
     assert read_events(path)[-1]["code"] == "session_ended"
 
 
+@pytest.mark.slow
 def test_losses_are_exact_while_everything_happens_at_once(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     """Parts, stalls and a flood together: every status of every part keeps the equation (checked while reading)."""
     config = session_table(logs) + scanner(numbers.port, "?buffer_mb=1")

@@ -123,6 +123,7 @@ def test_kernel_stamps_are_the_units_times(tmp_path: Path, logs: Path, sender: s
     assert all(this - 1_000_000 <= time_ns < following for time_ns, (this, following) in spans), spans
 
 
+@pytest.mark.slow
 def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + ROVER.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
     limit_s = 2.0  # of systemd's watchdog; a machine that is busy for a moment is within it
@@ -141,6 +142,7 @@ def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: P
     assert {event["source"] for event in read_log(logs).events("device_absent")} == {"gnss/rover", "pps/main"}
 
 
+@pytest.mark.slow
 def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + SREP.format(port=free_udp_port())
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
@@ -163,6 +165,7 @@ def test_blocked_writer_is_not_called_alive(tmp_path: Path, logs: Path) -> None:
     assert len(list(logs.glob("*.recovered.mcap"))) == 1
 
 
+@pytest.mark.slow
 def test_a_journal_that_nobody_reads_holds_up_nothing(tmp_path: Path, logs: Path) -> None:
     """stderr is a full pipe from the start, so that not one line of the recorder's is taken."""
     unread, full = os.pipe()
@@ -221,6 +224,7 @@ def _waiting_to_be_read(pty: Pty) -> int:
     return int(struct.unpack("i", fcntl.ioctl(pty.slave, termios.FIONREAD, b"\0" * 4))[0])
 
 
+@pytest.mark.slow
 def test_udp_silence_and_resume_are_told(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs) + SREP.format(port=port)) as recorder:

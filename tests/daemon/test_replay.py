@@ -24,7 +24,7 @@ from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, se
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
-pytestmark = pytest.mark.xdist_group("replay")  # what is replayed is recorded once, by one worker
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # what is replayed is recorded once, by one worker
 SECONDS = 18
 BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
 

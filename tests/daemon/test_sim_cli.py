@@ -159,6 +159,7 @@ class TestIntoALog:
         assert in_process(capsys, *words) == (ExitCode.IO, line)
         assert [path.name for path in tmp_path.iterdir()] == [log.name]
 
+    @pytest.mark.slow
     def test_interrupted_it_leaves_nothing(self, tmp_path: Path) -> None:
         folder = tmp_path / "flight"
         command = [sys.executable, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(folder)]
@@ -403,6 +404,7 @@ class TestWires:
         with pytest.raises(UserError, match="--set-clock: this user may not set the clock"):
             WallClock()
 
+    @pytest.mark.slow
     def test_a_recorder_gets_from_the_wires_what_the_log_of_the_flight_holds(
         self, plan: str, flown: tuple[Path, str], tmp_path: Path
     ) -> None:

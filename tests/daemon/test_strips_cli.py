@@ -125,6 +125,7 @@ def test_a_level_that_is_not_kept_is_a_problem(tmp_path: Path) -> None:
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
+@pytest.mark.slow
 def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = products(tmp_path / "good", made.flight)
     run(str(good), "--json")
@@ -153,6 +154,7 @@ def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "said",
     [

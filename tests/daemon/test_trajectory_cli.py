@@ -202,6 +202,7 @@ class TestOtherwise:
         assert {path.name for path in output.parent.iterdir()} == {"t.csv", "t.json"}
         assert output.read_bytes() == (made / "a.csv").read_bytes()
 
+    @pytest.mark.slow
     def test_antennas_that_are_swapped_are_named(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -74,6 +74,7 @@ def run_python(text: str, *arguments: object, **environment: str) -> subprocess.
     )
 
 
+@pytest.mark.slow
 def test_after_a_warm_up_a_flight_needs_no_loop_that_is_not_there(tmp_path: Path) -> None:
     """The first pulse costs what the thousandth does: neither compiling nor reading what was compiled before."""
     done = run_python(FLY, tmp_path)
@@ -128,6 +129,7 @@ def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum
     assert "loops compiled" not in rest, "it has not compiled all of them first"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     tuple(int(part) for part in numba.__version__.split(".")[:2]) < (0, 62), reason="its caches cannot be taken away"
 )

@@ -160,6 +160,7 @@ def test_a_prompt_between_logs_is_skipped() -> None:
 # --- cut and damaged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["bestpos.gps", "ins1.gps", "align.gps", "time.gps", "unit_test_vectors.bin"],
@@ -169,6 +170,7 @@ def test_a_recording_gives_the_same_however_it_is_cut(name: str) -> None:
     assert whole.counters["messages"] == COUNTS[name]
 
 
+@pytest.mark.slow
 def test_the_large_recordings_give_the_same_however_they_are_cut() -> None:
     check_stream(make, recording(SPAN)[: 160 * 1024])
     check_stream(make, recording("oemv_200911218.gps")[: 48 * 1024])

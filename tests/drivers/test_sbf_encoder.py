@@ -139,6 +139,7 @@ def stream() -> bytes:
     return b"".join(pieces)
 
 
+@pytest.mark.slow
 def test_a_whole_stream_gives_the_same_however_it_is_cut() -> None:
     whole = check_stream(lambda: SbfParser(DeviceSettings("gnss/rover")), stream())
     assert {name: len(rows) for name, rows in whole.rows.items()} == {"ImuSamples": 15, "InsSolution": 15}

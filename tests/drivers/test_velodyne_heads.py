@@ -136,6 +136,7 @@ def test_vlp32c_counts_what_the_recorder_left_out() -> None:
     assert (rows["flags"] == RETURN_FLAG_STRONGEST).all()
 
 
+@pytest.mark.slow
 def test_vlp32c_batches_may_be_cut_anywhere() -> None:
     units = payloads(VLP32C_CAPTURE)[:160]
     check_packets(lambda: make_parser(VLP32C), units)
@@ -256,6 +257,7 @@ def test_hdl32e_lasers_in_firing_order() -> None:
     assert not HDL32E.beams.azimuth_deg.any()
 
 
+@pytest.mark.slow
 def test_batches_of_every_head_may_be_cut_anywhere() -> None:
     for head in HEADS.values():
         random = np.random.default_rng(1)

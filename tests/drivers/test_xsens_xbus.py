@@ -200,6 +200,7 @@ def test_each_second_gives_one_time_message(name: str) -> None:
     assert parser.feed(Chunk("imu/main", 1_000_000_000, recording(name))) == found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_recordings_however_they_are_cut(name: str) -> None:
     outcome = check_stream(make, recording(name))

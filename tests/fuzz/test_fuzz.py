@@ -38,6 +38,7 @@ def test_a_short_run_finds_nothing(name: str) -> None:
     assert report.seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(SEEDS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_what_was_once_found_stays_mended(path: Path) -> None:
     check(TARGETS[path.parent.name](), path.read_bytes(), memory=True)
@@ -71,6 +72,7 @@ def test_a_log_taken_apart_is_put_together_again_as_it_was() -> None:
         assert len(again) == len(data)
 
 
+@pytest.mark.slow
 def test_a_defect_behind_a_checksum_is_found() -> None:
     """A decoder that cannot stand one value of one field of one message."""
 

@@ -45,6 +45,7 @@ def run(
     return out, rate, acceleration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prf_hz", [30_000.0, 150_000.0, 800_000.0])
 def test_a_microsecond_costs_less_than_a_tenth_of_a_count(prf_hz: float) -> None:
     rows, time_ns, rate_rps, acceleration_rps2 = read(sine(np.radians(30.0), 50.0), prf_hz, 0.06, BITS_17)

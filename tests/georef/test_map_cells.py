@@ -77,6 +77,7 @@ def test_a_cube_without_values_is_infinitely_wrong() -> None:
     assert error[0] == np.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [quadratic, cubic, creased, torn])
 def test_no_point_is_wrong_by_a_tenth_of_a_millimetre(exact: map_cells.Exact) -> None:
     """Over several cubes, with points at their corners and near creases."""

@@ -40,6 +40,7 @@ def errors(noise_ns: float, ramps: bool, ahead_s: float = 60.0) -> tuple[np.ndar
     return tuple(np.array(column) for column in columns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_ns", [KERNEL_NS, USER_NS])
 @pytest.mark.parametrize("ramps", [False, True])
 def test_sigma_is_honest(noise_ns: float, ramps: bool) -> None:

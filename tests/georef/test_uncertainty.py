@@ -183,6 +183,7 @@ def random_correlation(rng: np.random.Generator) -> FloatArray:
     return correlation
 
 
+@pytest.mark.slow
 def test_every_element_agrees_with_draws_of_all_inputs() -> None:
     rng = np.random.default_rng(5)
     worst = 0.0
@@ -199,6 +200,7 @@ def test_every_element_agrees_with_draws_of_all_inputs() -> None:
     assert worst < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [0, 1])
 def test_covariances_and_axes_asked_together_are_those_asked_alone(stages: int) -> None:
     rng = np.random.default_rng(5)

@@ -18,6 +18,7 @@ from georef.navigation.smoother import forward
 from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, setup_for, survey
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.xdist_group("kernels"),
     pytest.mark.filterwarnings("ignore"),  # theirs, of newer pandas
 ]

@@ -31,7 +31,7 @@ from tests.georef.navigation.virtual_aircraft import (
     white_fixes,
 )
 
-pytestmark = pytest.mark.xdist_group("kernels")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 SEEDS = 10
 MISALIGNMENT = 5e-3  # large, so that a filter that knows nothing of it is far off

@@ -66,6 +66,7 @@ def test_the_cars_logging_delay_is_found() -> None:
     )
 
 
+@pytest.mark.slow
 def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -> None:
     """Stamps 8 ms late, half a metre of way, in eight flights: poses at GNSS's times, as sure as they say.
 
@@ -158,6 +159,7 @@ def test_innovations_that_are_smaller_say_nothing_of_what_lasts() -> None:
     assert smaller.gnss_white_scale[fixed] == pytest.approx(0.7, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_error_that_lasts_and_is_larger_than_the_white_one_keeps_its_sigma() -> None:
     """1.2 cm that last a minute beside 6 mm from epoch to epoch, told as 1.1 cm in all: 12 flights, smoothed.
 
