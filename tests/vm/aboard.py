@@ -23,6 +23,7 @@ WORK = Path("/run/flight")
 TREE = Path(__file__).resolve().parents[2]
 WAIT_S = 400.0  # measures nothing: it ends what would never end
 SWATH = "/opt/swath/bin/swath"
+SETTINGS = "/usr/lib/sysctl.d/90-swath.conf"
 # its user, priority, limits and (no) capabilities are swathd.service's
 AS_THE_SERVICE = (
     *("prlimit", "--memlock=unlimited", "--rtprio=10", "--nofile=4096", "chrt", "-f", "10"),
@@ -130,5 +131,6 @@ def recording(config: str, keep_as: str = "logs") -> Iterator[Recorder]:
 
 
 def main(jobs: dict[str, Callable[..., None]]) -> None:
-    """Do the job that the command line names."""
+    """Do the job that the command line names, on a computer with the installed settings, as its boot would leave them."""
+    sh(f"sysctl -p {SETTINGS}")
     jobs[sys.argv[1]](*sys.argv[2:])

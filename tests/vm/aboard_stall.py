@@ -59,7 +59,6 @@ def drained() -> int:
 
 def stall() -> None:
     """The highest rate without loss; a stall at it with the installed settings, and one with the kernel's default."""
-    sh("sysctl -p /usr/lib/sysctl.d/90-swath.conf")
     with recording(session("installed") + SCANNER, "installed") as recorder:
         recorder.wait_said("device_opened")
         scanner = Scanner()

@@ -59,6 +59,7 @@ def test_can_1_khz_without_loss_and_with_kernel_stamps(tmp_path: Path, seconds: 
     content = read_log(tmp_path / "logs")
     assert units(content, "imu/main") == frames_of(range(1000 * seconds), 1000), finished.output
     assert_nothing_lost(content, "imu/main")
+    assert not content.events("receive_buffer_small")
     assert decoded(tmp_path / "logs", "imu/main") == 1000 * seconds
     (session,) = open_logs([tmp_path / "logs"])
     stamps = np.array([time_ns for time_ns, _ in content.units["imu/main"]])
