@@ -131,6 +131,6 @@ def recording(config: str, keep_as: str = "logs") -> Iterator[Recorder]:
 
 
 def main(jobs: dict[str, Callable[..., None]]) -> None:
-    """Do the job that the command line names, on a computer with the installed settings, as its boot would leave them."""
+    """Do the job that the command line names, under the kernel settings of an installed computer."""
     sh(f"sysctl -p {SETTINGS}")
     jobs[sys.argv[1]](*sys.argv[2:])
