@@ -263,7 +263,8 @@ def test_every_option_stands_in_a_page() -> None:
 
 def test_make_help_lists_every_target() -> None:
     listed = {line.split()[1] for line in run("make", "--no-print-directory", "help").stdout.splitlines()}
-    tests = {"test", "test-peers", "test-vm", "test-vm-long", "test-arm64", "test-long", "soak", "soak-short", "fuzz"}
+    tests = {"test", "test-slow", "test-peers", "test-vm", "test-vm-long", "test-arm64", "test-long"}
+    tests |= {"soak", "soak-short", "fuzz"}
     assert listed == {"help", "demo", "lint", "bench", "bench-calibration", "install", "uninstall", "clean"} | tests
 
 
