@@ -69,6 +69,8 @@ def _chain_noise_ns(chain: Sequence[tuple[int, int]], edges: Sequence[int]) -> f
     whole = np.rint(since / SECOND_NS)
     off = np.abs(since - whole * SECOND_NS - middle - slope * (whole - seconds.mean()))
     near = np.sort(off[off < NOISY_TOLERANCE_NS])
+    if not len(near):  # of stray edges a chain may be made whose own lie nowhere near its line
+        return FIRST_NOISE_FACTOR * chosen
     # by hand: NumPy's median loads numpy.ma from the disk when it is first asked, in flight, with edges waiting
     median = 0.5 * float(near[(len(near) - 1) // 2] + near[len(near) // 2])
     return FIRST_NOISE_FACTOR * max(chosen, 1.4826 * median)

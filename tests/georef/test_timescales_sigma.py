@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from georef.timescales import PpsClock, TimeState
+from georef.timescales.edge_train import _chain_noise_ns
 from tests.georef.clock_run import rms, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, week_tag
 
@@ -122,3 +123,9 @@ def test_live_memory_is_bounded() -> None:
     assert train is not None
     assert len(train._whole) <= 1801
     assert len(train._numbers) == 10 * len(train._whole)
+
+
+def test_a_chain_whose_edges_lie_nowhere_near_its_line_says_its_own_noise() -> None:
+    """As one made of stray edges by chance: 5 ms to either side, of which the tolerance of 2 ms sees none."""
+    chain = [(second, 1_000_000_000 * second + 10_000_000 * (second % 2)) for second in range(10)]
+    assert _chain_noise_ns(chain, [host for _, host in chain]) > 5_000_000
