@@ -15,15 +15,20 @@ from georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
 from georef.records import FixType
 from georef.rotations import quaternion_from_rot, rot_l_from_b
 from georef.timescales.gps_time import SECOND_NS
-from tests.georef.navigation.vehicles import NAVIGATION
+from tests.georef.navigation.vehicles import collected
 
 Array = NDArray[Any]
-FILE = NAVIGATION / "reference_flight" / "tactical.npz"
 WEEK, WEEK_S = 2376, 604_800
 GNSS_SIGMA_M = np.array([0.01, 0.01, 0.02])
 VELOCITY_SIGMA_MPS = np.array([0.02, 0.02, 0.04])
 FILTER_SIGMA = np.array([0.008, 0.007, 0.011]), np.array([0.01, 0.01, 0.012]), np.radians([0.004, 0.004, 0.009])
 SMOOTHER_SIGMA = np.array([0.003, 0.003, 0.005]), np.array([0.004, 0.004, 0.005]), np.radians([0.002, 0.002, 0.004])
+
+
+def reference_truth() -> Array:
+    """Rows of the survey flight's truth."""
+    truth: Array = np.load(collected("reference_flight/tactical.npz"))["truth"]
+    return truth
 
 
 def solution(sigmas: Any, errors: tuple[Array, ...], truth: Array, innovations: Array) -> Solution:
@@ -88,7 +93,7 @@ def innovations_of(truth: Array, random: np.random.Generator) -> Array:
 def sound_flight(seed: int = 1, every: int = 4) -> Flight:
     """Nothing wrong with it. 30 min, epochs at 20 Hz / every."""
     random = np.random.default_rng(seed)
-    truth = np.load(FILE)["truth"][::every]
+    truth = reference_truth()[::every]
     rows = innovations_of(truth, random)
     n = len(truth)
     own = tuple(sigma * random.standard_normal((n, 3)) for sigma in SMOOTHER_SIGMA)

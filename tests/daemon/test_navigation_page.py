@@ -31,7 +31,7 @@ from daemon.processing.navigation_sheet import NARROW, WIDE, Drawn
 from georef.navigation.inputs import Fate, Kind, Solution
 from georef.records import FixType
 from georef.timescales.gps_time import SECOND_NS
-from tests.daemon.navigation_flights import FILE, sound_flight, with_rows
+from tests.daemon.navigation_flights import reference_truth, sound_flight, with_rows
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
@@ -154,7 +154,7 @@ def test_blocks_cover_every_sample_once(flight: Flight) -> None:
 def test_course_against_the_flight_s_truth() -> None:
     """Errors of the stand-in are 5 mm, 5 mm/s, 0.004°; bands hold the truth but for six sigmas of these."""
     flight = sound_flight(every=1)  # 20 Hz: epochs are close enough to share verticals
-    truth = np.load(FILE)["truth"]
+    truth = reference_truth()
     course = course_of(flight)
     speed = np.hypot(truth[:, 5], truth[:, 6])
     angles = truth[:, 8:11].copy()
@@ -214,7 +214,7 @@ def test_separation_is_filter_minus_smoother_in_l(flight: Flight) -> None:
     assert separation is not None
     assert np.abs(separation.position_m).max() == 0.0
     assert np.isnan(separation.position_sigma_m).all()
-    truth = np.load(FILE)["truth"][::EVERY]
+    truth = reference_truth()[::EVERY]
     lat, lon = np.radians(truth[:, 2]), np.radians(truth[:, 3])
     north_e = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=1)
     moved = replace(flight.smoothed, position_e=flight.smoothed.position_e + 0.25 * north_e)

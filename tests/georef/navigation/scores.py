@@ -13,7 +13,7 @@ from georef.navigation.inputs import Solution, Start
 from georef.quaternions import rotated
 from georef.records import StructArray
 from georef.rotations import rot_l_from_b
-from tests.georef.navigation.vehicles import BEGIN_NS, NAVIGATION, ns
+from tests.georef.navigation.vehicles import BEGIN_NS, collected, ns
 
 FloatArray = NDArray[np.float64]
 LINES_S = (100_600.0, 101_550.0)
@@ -33,7 +33,7 @@ OUTAGES_M = {"tactical": (1.81, 0.090), "mems": (8.4, 0.31)}
 @cache
 def truth(name: str) -> FloatArray:
     """The truth's rows."""
-    with np.load(NAVIGATION / "reference_flight" / f"{name}.npz") as data:
+    with np.load(collected(f"reference_flight/{name}.npz")) as data:
         rows: FloatArray = data["truth"]
     return rows
 
@@ -41,7 +41,7 @@ def truth(name: str) -> FloatArray:
 @cache
 def outages(name: str) -> FloatArray:
     """(10, 2) s."""
-    with np.load(NAVIGATION / "reference_flight" / f"{name}.npz") as data:
+    with np.load(collected(f"reference_flight/{name}.npz")) as data:
         spans: FloatArray = data["outages"]
     return spans
 
@@ -55,7 +55,7 @@ def without(rows: StructArray, spans_s: FloatArray) -> StructArray:
 
 def start_of(folder: str, name: str) -> Start:
     """The start that its description gives."""
-    about = json.loads((NAVIGATION / folder / f"{name}.json").read_text())
+    about = json.loads(collected(f"{folder}/{name}.json").read_text())
     lat, lon = np.radians(about["initpos"][:2])
     return Start(
         int(ns(about["starttime"])),

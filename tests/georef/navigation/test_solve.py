@@ -15,13 +15,12 @@ from georef.records import FixType, StructArray
 from georef.rotations import attitude_of
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import flight_errors, of_maxima, off_fixes, rms, start_of, without
-from tests.georef.navigation.vehicles import NAVIGATION, car, ns, reference
+from tests.georef.navigation.vehicles import car, collected, ns, reference
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
 FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
-CAR = NAVIGATION / "gnss_imu_drive"
 
 
 def test_a_flight_that_begins_in_the_air_is_as_good_at_its_begin() -> None:
@@ -48,7 +47,9 @@ def ticking(inertial: Inertial) -> Inertial:
 
     imu.txt has them stretched by 292 ppm, 0.16 s over the drive, which makes of a constant offset one that grows.
     """
-    ticks = np.loadtxt(CAR / "raw" / "imu_1934.csv", delimiter=",", usecols=6).astype(np.int64)[1 : 1 + len(inertial)]
+    ticks = np.loadtxt(collected("gnss_imu_drive/raw/imu_1934.csv"), delimiter=",", usecols=6).astype(np.int64)[
+        1 : 1 + len(inertial)
+    ]
     time_ns = inertial.time_ns[0] + 125_000_000 + (ticks - ticks[0]) * 1_000_000
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 10_000_000) / 1e9
     return replace(inertial, time_ns=time_ns, interval_s=interval_s)
@@ -101,7 +102,7 @@ def test_with_a_unit_that_is_late_the_trajectory_is_where_gnss_says_and_when() -
 def test_the_cars_outages_are_bridged_as_by_others(raw: bool, filtered_m: float, smoothed_m: float) -> None:
     """Thirteen of 15 s, horizontal, RMS of the largest errors; by the unit's own clock a third better."""
     drive, start = car(), start_of("gnss_imu_drive", "meta")
-    fixes, spans = np.loadtxt(CAR / "gnss.txt"), np.loadtxt(CAR / "outages.txt")
+    fixes, spans = np.loadtxt(collected("gnss_imu_drive/gnss.txt")), np.loadtxt(collected("gnss_imu_drive/outages.txt"))
     rows = without(drive.only(Kind.POSITION), spans)
     inertial, setup = drive.inertial, drive.setup
     if raw:

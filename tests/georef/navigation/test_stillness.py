@@ -10,9 +10,8 @@ from georef.earth import e_from_geodetic
 from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
 from georef.timescales import SECOND_NS
-from tests.georef.navigation.vehicles import NAVIGATION
+from tests.georef.navigation.vehicles import collected
 
-FLIGHT = NAVIGATION / "reference_flight" / "mems.npz"
 EPOCH_NS = 1_447_000_000 * SECOND_NS
 RATE_HZ = 100
 
@@ -79,7 +78,7 @@ def test_positions_tell_it_where_no_velocity_is_said(calm: tuple[NDArray[np.floa
 
 
 def test_the_reference_flight_stands_where_its_truth_does() -> None:
-    flight = np.load(FLIGHT)
+    flight = np.load(collected("reference_flight/mems.npz"))
     time_ns = np.rint(flight["imu_t"] * 1e9).astype(np.int64)
     inertial = Inertial(
         time_ns,

@@ -75,16 +75,17 @@ class Recording:
         return kept
 
 
-def needs(path: Path) -> None:
-    """Say so where the collection is not there."""
+def collected(place: str) -> Path:
+    """A file or a folder of the collection; says so where that is not there."""
+    path = NAVIGATION / place
     assert path.exists(), f"{path} is not here: these tests read the recordings of ../shared/fixtures/navigation"
+    return path
 
 
 @cache
 def reference(name: str) -> Recording:
     """The survey flight with a "tactical" or "mems" unit."""
-    folder = NAVIGATION / "reference_flight"
-    needs(folder)
+    folder = collected("reference_flight")
     data, about = np.load(folder / f"{name}.npz"), json.loads((folder / f"{name}.json").read_text())
     time_ns = ns(data["imu_t"])
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 5_000_000) / 1e9
@@ -113,8 +114,7 @@ def reference(name: str) -> Recording:
 @cache
 def car() -> Recording:
     """A real drive; attitude unknown."""
-    folder = NAVIGATION / "gnss_imu_drive"
-    needs(folder)
+    folder = collected("gnss_imu_drive")
     imu, fixes, speeds = (np.loadtxt(folder / f"{name}.txt") for name in ("imu", "gnss", "gnssvel"))
     about = json.loads((folder / "meta.json").read_text())
     time_ns = ns(imu[:, 0])
@@ -136,8 +136,7 @@ def uav() -> Recording:
     """A real flight of a small aeroplane with single-frequency GPS; its own filter's attitude serves as truth."""
     from scipy.io import loadmat
 
-    path = NAVIGATION / "umn_thor75" / "thor75.mat"
-    needs(path)
+    path = collected("umn_thor75/thor75.mat")
     data = loadmat(path, squeeze_me=True, struct_as_record=False)["flight_data"]
     new = np.flatnonzero(np.diff(data.GPS_TOW) != 0) + 1
     new = new[np.abs(data.lat[new]) > 1.0]
