@@ -47,9 +47,8 @@ def ticking(inertial: Inertial) -> Inertial:
 
     imu.txt has them stretched by 292 ppm, 0.16 s over the drive, which makes of a constant offset one that grows.
     """
-    ticks = np.loadtxt(collected("gnss_imu_drive/raw/imu_1934.csv"), delimiter=",", usecols=6).astype(np.int64)[
-        1 : 1 + len(inertial)
-    ]
+    rows = np.loadtxt(collected("gnss_imu_drive/raw/imu_1934.csv"), delimiter=",", usecols=6)
+    ticks = rows.astype(np.int64)[1 : 1 + len(inertial)]
     time_ns = inertial.time_ns[0] + 125_000_000 + (ticks - ticks[0]) * 1_000_000
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 10_000_000) / 1e9
     return replace(inertial, time_ns=time_ns, interval_s=interval_s)
