@@ -38,7 +38,7 @@ from calib.record_values import Plain
 from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
-from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from daemon.processing.calibration_flight import KeptFlight, read_flight, refuse_without_noise, replaced
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
@@ -227,6 +227,7 @@ def _refuse_one_strip(kept: KeptFlight) -> None:
             "overlap, better opposite, crossing and parallel ones at two heights"
         )
     refuse_installations(kept.logged)
+    refuse_without_noise(kept)
 
 
 def refuse_no_planes(log: str, planes: Features) -> None:

@@ -75,6 +75,17 @@ class KeptFlight:
         return [line for flight in self.logged for line in flight.holes]
 
 
+def refuse_without_noise(kept: KeptFlight) -> None:
+    """UserError where returns of a scanner are said to be exact: by its noise an adjustment weighs them."""
+    for head in kept.flight.heads:
+        noise = head.noise
+        if not max(noise.range_m, noise.angle_rad, noise.divergence_rad):
+            raise UserError(
+                f"{kept.logged[0].log}: scanner.{head.name}: range_sigma_m, angle_sigma_deg and divergence_mrad are "
+                "all 0; want the scanner's own: an adjustment weighs returns by them"
+            )
+
+
 def read_flight(wish: Wish, folder: Path, tell: Steps) -> KeptFlight:
     """Read logs.
 

@@ -103,7 +103,8 @@ class Look:
     """All that is known after reading.
 
     Attributes:
-        sources, units, names: files, their unit, names of strips by number.
+        sources, units: files, their unit.
+        names, origins: of strips by number, and of which sessions' run and point source id they are.
         surface: cells of all strips together.
         cells, overlap: strips apart, and against each other.
         strips: their facts by number.
@@ -125,6 +126,7 @@ class Look:
     area_m2: float
     skipped: int
     notes: list[str]
+    origins: list[tuple[str, int]] = field(default_factory=list)
 
 
 def look_at(
@@ -172,6 +174,7 @@ def look_at(
         area_m2,
         reading.skipped,
         notes,
+        reading.book.origins,
     )
 
 
@@ -297,6 +300,7 @@ def _profile(
 def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None) -> list[str]:
     """What was taken for granted, left out or changed."""
     notes = [reading.units.note] if reading.units.note else []
+    notes += reading.book.notes
     notes += [f"{source.path.name}: {source.damage}: partial" for source in reading.sources if source.damage]
     if any(source.crs is not None for source in reading.sources):
         without = [source.path.name for source in reading.sources if source.crs is None]

@@ -17,7 +17,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
-from daemon.processing.quicklook_sidecar import height_unit_in, sidecar_of
+from daemon.processing.quicklook_sidecar import height_unit_in, sessions_in, sidecar_of
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -120,31 +120,56 @@ class Source:
     damage: str = ""
     boxes_m: list[FloatArray] = field(default_factory=list)
 
+    @property
+    def sessions(self) -> str:
+        """Of the run that wrote it, by the sidecar; empty: it does not say so."""
+        return sessions_in(self.sidecar)
+
 
 class StripBook:
-    """Numbers from 0 for strips: of points without a point source id, their file is the strip."""
+    """Numbers from 0 for strips: a point source id is its run's; of points without, their file is the strip.
+
+    Attributes:
+        names: by number; ``4/2`` is strip 4 of the second run that has one.
+        origins: by number, sessions of the run and point source id, 0 where there is none.
+        notes: where strips of equal ids are.
+    """
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        self._of_key: dict[int | Path, int] = {}
+        self.origins: list[tuple[str, int]] = []
+        self.notes: list[str] = []
+        self._of_key: dict[tuple[str, int] | Path, int] = {}
         self._tables: dict[Path, NDArray[np.int32]] = {}
 
-    def numbers(self, path: Path, source_ids: NDArray[np.uint16]) -> NDArray[np.int32]:
+    def numbers(self, source: Source, source_ids: NDArray[np.uint16]) -> NDArray[np.int32]:
         """The strip (n,) of each point of a file."""
-        table = self._tables.setdefault(path, np.full(65536, -1, np.int32))
+        table = self._tables.setdefault(source.path, np.full(65536, -1, np.int32))
         found = table[source_ids]
         if len(found) and found.min() < 0:
             for source_id in np.unique(source_ids[found < 0]):
-                table[source_id] = self._number(int(source_id), path)
+                table[source_id] = self._number(int(source_id), source)
             found = table[source_ids]
         return np.asarray(found, np.int32)
 
-    def _number(self, source_id: int, path: Path) -> int:
-        key: int | Path = source_id or path
+    def _number(self, source_id: int, source: Source) -> int:
+        origin = source.sessions, source_id
+        key: tuple[str, int] | Path = origin if source_id else source.path
         if key not in self._of_key:
             self._of_key[key] = len(self.names)
-            self.names.append(str(source_id) if source_id else path.stem)
+            self.names.append(self._name(source_id, source))
+            self.origins.append(origin)
         return self._of_key[key]
+
+    def _name(self, source_id: int, source: Source) -> str:
+        if not source_id:
+            return source.path.stem
+        before = sum(source_id == other for _, other in self.origins)
+        if not before:
+            return str(source_id)
+        name = f"{source_id}/{before + 1}"
+        self.notes.append(f"strip {name} is that of {source.path}, of other sessions than {source_id}")
+        return name
 
 
 def find_files(paths: Sequence[Path]) -> list[Path]:
@@ -364,7 +389,7 @@ def _block(points: Points, source: Source, units: Units, book: StripBook) -> Blo
         y_m=np.asarray(points.y, np.float64) * units.north_m,
         z_m=np.asarray(points.z, np.float64) * units.up_m,
         intensity=np.asarray(points["intensity"], np.float32),
-        strip=book.numbers(source.path, np.asarray(points["point_source_id"])),
+        strip=book.numbers(source, np.asarray(points["point_source_id"])),
         first=number <= 1,
         single=count <= 1,
         sigma_m=sigma_m,

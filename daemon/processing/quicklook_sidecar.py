@@ -72,6 +72,13 @@ def calibrations_in(sidecar: Json) -> list[str]:
     return list(dict.fromkeys(line for line in told if line))
 
 
+def sessions_in(sidecar: Json) -> str:
+    """The sessions of which its run is; empty: it does not say so."""
+    flights = sidecar.get("flights")
+    entries = flights if isinstance(flights, list) else []
+    return ", ".join(str(entry["session"]) for entry in entries if isinstance(entry, dict) and entry.get("session"))
+
+
 def height_unit_in(sidecar: Json) -> float | None:
     """Metres in a unit of the heights, which a CRS without a vertical one cannot say; None: it does not say so."""
     crs = sidecar.get("crs")

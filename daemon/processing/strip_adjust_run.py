@@ -29,7 +29,7 @@ from daemon.errors import ExitCode, UserError
 from daemon.places import nearest_there
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, refuse_no_planes
-from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from daemon.processing.calibration_flight import KeptFlight, read_flight, refuse_without_noise, replaced
 from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import is_of_logs, refuse_installations
@@ -192,6 +192,7 @@ def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
             "overlap"
         )
     refuse_installations(kept.logged)
+    refuse_without_noise(kept)
     for head in kept.flight.heads:
         if head.start.method == "nominal" and head.name not in wish.logs.options.calibrations:
             raise UserError(

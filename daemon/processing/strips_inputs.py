@@ -133,7 +133,7 @@ def _file_blocks(look: Look) -> Iterator[tuple[int, StripBlock]]:
         try:
             with PointReader(source.path, WANTED) as reader:
                 while len(points := reader.read(BLOCK_POINTS)):
-                    yield from _by_strip(points, book.numbers(source.path, np.asarray(points["point_source_id"])), look)
+                    yield from _by_strip(points, book.numbers(source, np.asarray(points["point_source_id"])), look)
         except UNREADABLE:
             continue  # the quick look has noted the damage
 
@@ -194,9 +194,10 @@ def _flown(look: Look, number: int, trajectories: Sequence[Trajectory]) -> int:
     """The trajectory of a strip, by the times that its sidecar says of it; the only one, if there is one."""
     if len(trajectories) == 1:
         return 0
+    sessions, source_id = look.origins[number]
     for source in look.sources:
-        for entry in source.sidecar.get("strips", []):
-            if str(entry.get("number")) == look.names[number] and entry.get("first_gps_ns"):
+        for entry in source.sidecar.get("strips", []) if source.sessions == sessions else []:
+            if str(entry.get("number")) == str(source_id) and entry.get("first_gps_ns"):
                 spans = [trajectory.span for trajectory in trajectories]
                 inside = [begin <= entry["first_gps_ns"] <= end for begin, end in spans]
                 if any(inside):

@@ -12,7 +12,9 @@ import pytest
 from calib.picked_points import PickedError
 from daemon.errors import UserError
 from daemon.processing.calibrate_inputs import PolygonError, read_polygons, rings_of, ties_of
+from daemon.processing.calibration_flight import refuse_without_noise
 from georef.mapping import Mapping
+from georef.uncertainty import Noise
 from tests.calib.analytic_scene import Line, Scanner, fly, gables
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -36,6 +38,20 @@ def read() -> Any:
 
 def on_map(read: Any, points_t: Any) -> Any:
     return read.logged[0].setup.mapping.map_from_e(read.flight.frame.e_from_t(np.asarray(points_t, np.float64)))
+
+
+def test_a_scanner_without_noise_is_refused() -> None:
+    def kept_with(noise: Noise) -> Any:
+        return SimpleNamespace(
+            flight=SimpleNamespace(heads=[SimpleNamespace(name="left", noise=noise)]),
+            logged=[SimpleNamespace(log="a.mcap")],
+        )
+
+    for noise in (Noise(0.02, 0.0, 0.0, 0.0), Noise(0.0, 2e-5, 0.0, 0.0), Noise(0.0, 0.0, 0.0, 3e-4)):
+        refuse_without_noise(kept_with(noise))
+    with pytest.raises(UserError, match=r"a\.mcap: scanner\.left: range_sigma_m, .* are all 0; want") as raised:
+        refuse_without_noise(kept_with(Noise(0.0, 0.0, divergence_rad=0.0)))
+    assert "\n" not in str(raised.value)
 
 
 def test_polygons() -> None:

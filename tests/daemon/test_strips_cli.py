@@ -54,28 +54,46 @@ def made() -> Cast:
     return cast_flight(FLAT, LINES, prf_hz=40_000.0, true={})
 
 
-def products(folder: Path, flight: Flight, mapping: Mapping | None = None) -> Path:
+def products(
+    folder: Path,
+    flight: Flight,
+    mapping: Mapping | None = None,
+    *,
+    session: str = "a",
+    later_s: int = 0,
+    up_m: float = 0.0,
+) -> Path:
     """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar."""
+    later_ns = later_s * 1_000_000_000
     folder.mkdir()
     mapping = mapping or Mapping("EPSG:25832", datum="same")
     for number, swath in enumerate(flight.swaths, start=1):
         points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
-        seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
+        seconds = (swath.time_ns + later_ns - 1_000_000_000_000_000_000) / 1e9
         number_of = np.asarray(swath.rows["number_of_returns"])
         write(
             folder / f"a_strip{number:02d}.laz",
             points[:, 0],
             points[:, 1],
-            points[:, 2],
+            points[:, 2] + up_m,
             number,
             crs=CRS.from_epsg(25832),
             gps_time=seconds,
             return_number=np.asarray(swath.rows["return_number"]),
             number_of_returns=number_of,
         )
-    (folder / "a_trajectory.csv").write_text(csv_text(flight.trajectories[0]))
+    flown = flight.trajectories[0]
+    (folder / "a_trajectory.csv").write_text(csv_text(replace(flown, time_ns=flown.time_ns + later_ns)))
     sidecar = {
-        "strips": [{"number": number, "file": f"a_strip{number:02d}.laz"} for number in (1, 2)],
+        "flights": [{"session": session}],
+        "strips": [
+            {
+                "number": number,
+                "file": f"a_strip{number:02d}.laz",
+                "first_gps_ns": int(swath.time_ns.min()) + later_ns,
+            }
+            for number, swath in enumerate(flight.swaths, start=1)
+        ],
         "crs": mapping.description(),
     }
     (folder / "a.json").write_text(json.dumps(sidecar))
@@ -178,6 +196,27 @@ def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said
     assert len(own) > 1000
     there = made.flight.frame.e_from_t(np.asarray(swath.points_t[pulse]))
     assert np.abs(of_files.seen.frame.e_from_t(gathered.points[own]) - there).max() < 0.01
+
+
+def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path: Path) -> None:
+    first = products(tmp_path / "p", made.flight)
+    second = products(tmp_path / "q", made.flight, session="b", later_s=1000, up_m=0.07)
+    strips = strips_of_files([first, second], StripRules(), lambda what, done, of: None)
+    assert strips.look.names == ["1", "2", "1/2", "2/2"]
+    (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
+    assert row["median_m"] == pytest.approx(-0.07, abs=2e-3)
+    assert strips.notes == [
+        f"strip {number}/2 is that of {second / f'a_strip0{number}.laz'}, of other sessions than {number}"
+        for number in (1, 2)
+    ]
+    assert strips.seen is not None
+    assert strips.seen.flown == [0, 0, 1, 1]
+
+
+def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, tmp_path: Path) -> None:
+    folders = [products(tmp_path / name, made.flight) for name in ("left", "right")]
+    strips = strips_of_files(folders, StripRules(), lambda what, done, of: None)
+    assert (strips.look.names, strips.notes) == (["1", "2"], [])
 
 
 def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> None:
