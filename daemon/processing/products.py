@@ -27,6 +27,7 @@ from daemon.log.durable import sync_file, try_sync_directory
 from daemon.processing import refusals
 from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
+from daemon.processing.quicklook_sidecar import read_sidecar, sessions_in
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
 from daemon.processing.trajectory_files import TrajectoryFiles, put_in_place, write_trajectory
 from daemon.processing.unread import unread_lines
@@ -177,6 +178,17 @@ def _refuse_existing(wish: Wish, names: Sequence[str]) -> None:
             raise UserError(
                 f"{first}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE
             )
+    _refuse_parts(wish.output, names)
+
+
+def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
+    """UserError where a part of a run would be replaced, whose sidecar would then tell of files that are gone."""
+    for path in sorted(folder.glob("*.json")):
+        sessions = sessions_in(read_sidecar(path))
+        others = [session for session in sessions if session not in names]
+        if others and len(others) < len(sessions):
+            text = f"{path}: is of one run with {', '.join(others)}; want all its sessions at once, or another folder"
+            raise UserError(text, ExitCode.USAGE)
 
 
 def _make(

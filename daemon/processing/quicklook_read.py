@@ -123,7 +123,7 @@ class Source:
     @property
     def sessions(self) -> str:
         """Of the run that wrote it, by the sidecar; empty: it does not say so."""
-        return sessions_in(self.sidecar)
+        return ", ".join(sessions_in(self.sidecar))
 
 
 class StripBook:

@@ -18,13 +18,14 @@ def sidecar_of(path: Path) -> Json:
     """The JSON object that bears a file's name or lists it among its strips; empty: there is none."""
     named = (path.with_suffix(".json"), path.with_name(f"{path.name}.json"))
     for beside in named:
-        if found := _read(beside):
+        if found := read_sidecar(beside):
             return found
     others = sorted(one for one in path.parent.glob("*.json") if one not in named)
-    return next((read for one in others[:MOST_FILES] if path.name in _files_of(read := _read(one))), {})
+    return next((read for one in others[:MOST_FILES] if path.name in _files_of(read := read_sidecar(one))), {})
 
 
-def _read(path: Path) -> Json:
+def read_sidecar(path: Path) -> Json:
+    """The JSON object of a file; empty: there is none that can be read."""
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_BYTES:
             return {}
@@ -72,11 +73,11 @@ def calibrations_in(sidecar: Json) -> list[str]:
     return list(dict.fromkeys(line for line in told if line))
 
 
-def sessions_in(sidecar: Json) -> str:
+def sessions_in(sidecar: Json) -> list[str]:
     """The sessions of which its run is; empty: it does not say so."""
     flights = sidecar.get("flights")
     entries = flights if isinstance(flights, list) else []
-    return ", ".join(str(entry["session"]) for entry in entries if isinstance(entry, dict) and entry.get("session"))
+    return [str(entry["session"]) for entry in entries if isinstance(entry, dict) and entry.get("session")]
 
 
 def height_unit_in(sidecar: Json) -> float | None:

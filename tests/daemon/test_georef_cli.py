@@ -297,6 +297,20 @@ class TestRefusals:
         assert f"{tmp_path / made.name}: is there from an earlier run" in capsys.readouterr().err
         assert [path.name for path in tmp_path.iterdir()] == [made.name]
 
+    def test_one_of_several_sessions_is_not_replaced_where_the_sidecar_is_of_all(
+        self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (sidecar,) = products.glob("*.json")
+        record = json.loads(sidecar.read_text())
+        record["flights"].insert(0, record["flights"][0] | {"session": "20260101T080000-first"})
+        there = tmp_path / "20260101T080000-first.json"
+        there.write_text(json.dumps(record))
+        assert run_app([*flown.arguments(tmp_path), "--overwrite"]) == 2
+        said = capsys.readouterr().err
+        assert f"{there}: is of one run with 20260101T080000-first; want all its sessions at once" in said
+        assert said.count("\n") == 1
+        assert [path.name for path in tmp_path.iterdir()] == [there.name]
+
     @pytest.mark.parametrize(("shift_s", "words"), [(18, "UTC"), (-7 * 86_400, "week"), (3 * 3600, "do not overlap")])
     def test_a_trajectory_of_another_time_is_named(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_s: int, words: str
