@@ -126,7 +126,7 @@ class Look:
     area_m2: float
     skipped: int
     notes: list[str]
-    origins: list[tuple[str, int]] = field(default_factory=list)
+    origins: list[tuple[tuple[str, ...], int]] = field(default_factory=list)
 
 
 def look_at(

@@ -121,9 +121,9 @@ class Source:
     boxes_m: list[FloatArray] = field(default_factory=list)
 
     @property
-    def sessions(self) -> str:
+    def sessions(self) -> tuple[str, ...]:
         """Of the run that wrote it, by the sidecar; empty: it does not say so."""
-        return ", ".join(sessions_in(self.sidecar))
+        return tuple(sessions_in(self.sidecar))
 
 
 class StripBook:
@@ -137,9 +137,9 @@ class StripBook:
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        self.origins: list[tuple[str, int]] = []
+        self.origins: list[tuple[tuple[str, ...], int]] = []
         self.notes: list[str] = []
-        self._of_key: dict[tuple[str, int] | Path, int] = {}
+        self._of_key: dict[tuple[tuple[str, ...], int] | Path, int] = {}
         self._tables: dict[Path, NDArray[np.int32]] = {}
 
     def numbers(self, source: Source, source_ids: NDArray[np.uint16]) -> NDArray[np.int32]:
@@ -154,7 +154,7 @@ class StripBook:
 
     def _number(self, source_id: int, source: Source) -> int:
         origin = source.sessions, source_id
-        key: tuple[str, int] | Path = origin if source_id else source.path
+        key: tuple[tuple[str, ...], int] | Path = origin if source_id else source.path
         if key not in self._of_key:
             self._of_key[key] = len(self.names)
             self.names.append(self._name(source_id, source))

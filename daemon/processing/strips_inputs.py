@@ -30,6 +30,7 @@ FloatArray = NDArray[np.float64]
 Told = Callable[[str, int, int], None]
 
 BLOCK_POINTS = 500_000
+TRAJECTORY = "_trajectory.csv"
 LAS_EPOCH_S = 1_000_000_000  # of adjusted standard GPS time
 WANTED = Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
 WANTED |= Selection.POINT_SOURCE_ID | Selection.GPS_TIME
@@ -157,7 +158,7 @@ def _by_strip(points: Any, strip: NDArray[np.int32], look: Look) -> Iterator[tup
 def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:
     """The trajectories beside the points, and the way from the map's metres to t."""
     sidecars = [source.sidecar for source in look.sources]
-    trajectories = _trajectories(look)
+    trajectories, of_session = _trajectories(look)
     if not trajectories or not all(sidecars):
         return None, lambda points: points
     mapping = _mapping_of(sidecars[0]["crs"])
@@ -169,7 +170,7 @@ def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], Floa
     def place(points: FloatArray) -> FloatArray:
         return frame.t_from_e(mapping.e_from_map(points / unit_m)) if len(points) else points
 
-    flown = [_flown(look, number, trajectories) for number in range(len(look.names))]
+    flown = [_flown(look, number, trajectories, of_session) for number in range(len(look.names))]
     # the files' directions are to the body's right and left, whatever the mounting
     mounted = [np.eye(3)] * len(look.names)
     return SeenFrom(frame, trajectories, flown, [1.0] * len(look.names), mounted), place
@@ -184,25 +185,28 @@ def _mapping_of(crs: dict[str, Any]) -> Mapping:
     return Mapping(crs["crs"], datum=crs["datum_said"], epoch=crs.get("epoch"), accuracy_m=crs["accuracy_wanted_m"])
 
 
-def _trajectories(look: Look) -> list[Trajectory]:
+def _trajectories(look: Look) -> tuple[list[Trajectory], list[str]]:
+    """Those beside the points, and of which session each is."""
     folders = {source.path.parent for source in look.sources}
-    files = sorted(file for folder in folders for file in folder.glob("*_trajectory.csv"))
-    return [read_trajectory(file.read_bytes(), str(file)) for file in files]
+    files = sorted(file for folder in folders for file in folder.glob(f"*{TRAJECTORY}"))
+    return (
+        [read_trajectory(file.read_bytes(), str(file)) for file in files],
+        [file.name.removesuffix(TRAJECTORY) for file in files],
+    )
 
 
-def _flown(look: Look, number: int, trajectories: Sequence[Trajectory]) -> int:
-    """The trajectory of a strip, by the times that its sidecar says of it; the only one, if there is one."""
-    if len(trajectories) == 1:
-        return 0
+def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_session: Sequence[str]) -> int:
+    """The trajectory of a strip: of its run's sessions the one of the times that the sidecar says of it."""
     sessions, source_id = look.origins[number]
+    own = [at for at, session in enumerate(of_session) if session in sessions] or list(range(len(trajectories)))
     for source in look.sources:
         for entry in source.sidecar.get("strips", []) if source.sessions == sessions else []:
             if str(entry.get("number")) == str(source_id) and entry.get("first_gps_ns"):
-                spans = [trajectory.span for trajectory in trajectories]
-                inside = [begin <= entry["first_gps_ns"] <= end for begin, end in spans]
-                if any(inside):
-                    return inside.index(True)
-    return 0
+                for at in own:
+                    begin, end = trajectories[at].span
+                    if begin <= entry["first_gps_ns"] <= end:
+                        return at
+    return own[0]
 
 
 # ---------------------------------------------------------------------- a flight

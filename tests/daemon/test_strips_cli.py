@@ -60,16 +60,14 @@ def products(
     mapping: Mapping | None = None,
     *,
     session: str = "a",
-    later_s: int = 0,
     up_m: float = 0.0,
 ) -> Path:
     """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar."""
-    later_ns = later_s * 1_000_000_000
     folder.mkdir()
     mapping = mapping or Mapping("EPSG:25832", datum="same")
     for number, swath in enumerate(flight.swaths, start=1):
         points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
-        seconds = (swath.time_ns + later_ns - 1_000_000_000_000_000_000) / 1e9
+        seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
         number_of = np.asarray(swath.rows["number_of_returns"])
         write(
             folder / f"a_strip{number:02d}.laz",
@@ -82,15 +80,14 @@ def products(
             return_number=np.asarray(swath.rows["return_number"]),
             number_of_returns=number_of,
         )
-    flown = flight.trajectories[0]
-    (folder / "a_trajectory.csv").write_text(csv_text(replace(flown, time_ns=flown.time_ns + later_ns)))
+    (folder / f"{session}_trajectory.csv").write_text(csv_text(flight.trajectories[0]))
     sidecar = {
         "flights": [{"session": session}],
         "strips": [
             {
                 "number": number,
                 "file": f"a_strip{number:02d}.laz",
-                "first_gps_ns": int(swath.time_ns.min()) + later_ns,
+                "first_gps_ns": int(swath.time_ns.min()),
             }
             for number, swath in enumerate(flight.swaths, start=1)
         ],
@@ -199,8 +196,9 @@ def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said
 
 
 def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path: Path) -> None:
+    """Also of two aircraft at one time: each strip has its run's trajectory."""
     first = products(tmp_path / "p", made.flight)
-    second = products(tmp_path / "q", made.flight, session="b", later_s=1000, up_m=0.07)
+    second = products(tmp_path / "q", made.flight, session="b", up_m=0.07)
     strips = strips_of_files([first, second], StripRules(), lambda what, done, of: None)
     assert strips.look.names == ["1", "2", "1/2", "2/2"]
     (row,) = (row for row in strips.look.overlap.rows if (row["first"], row["second"]) == (0, 2))
