@@ -180,12 +180,12 @@ class GnssHeading:
 
 @dataclass(frozen=True, slots=True)
 class EventMark:
-    """An external event the receiver stamped (camera trigger, photo pulse)."""
+    """An external event the receiver stamped (camera trigger, photo pulse); `rising` None: it says no edge."""
 
     host_time_ns: int
     time: TimeTag
     channel: str
-    rising: bool = True
+    rising: bool | None = True
     count: int | None = None
     sigma_s: float | None = None
     valid: bool = True

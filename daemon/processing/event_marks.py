@@ -19,6 +19,7 @@ HEADER = (
     "source,channel,edge,count,gps_ns,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg,sigma_n_m,sigma_e_m,"
     "sigma_d_m,sigma_roll_deg,sigma_pitch_deg,sigma_heading_deg,sigma_time_s,fate"
 )
+EDGES = {True: "rising", False: "falling", None: ""}
 PLACED = "placed"
 FATES = {
     Fate.GEOREFERENCED: PLACED,
@@ -80,7 +81,7 @@ def _line(mark: Mark, row: FloatArray | None, fate: str) -> str:
     fields = (
         mark.source,
         event.channel,
-        "rising" if event.rising else "falling",
+        EDGES[event.rising],
         "" if event.count is None else str(event.count),
         "" if mark.gps_ns is None else str(mark.gps_ns),
         pose,

@@ -34,7 +34,7 @@ WEEK_NS = 604_800 * NS_PER_S
 GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_PPS_ERROR_S = 1e-3  # a clock offset beyond this is not the offset of a steered PPS
 GREATEST_LEAP_S = 255  # 8 bits in the navigation message
-IMU_ERROR_BIT = 1  # of RAWIMUX's IMU info
+IMU_ERROR_BIT, IMU_ENCRYPTED_BIT = 1, 2  # of RAWIMUX's IMU info
 
 
 class Header(NamedTuple):
@@ -217,6 +217,9 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
         scale = state.configured_scale or tables.IMU_SCALES.get(imu.imu_type)
         if imu.imu_info & IMU_ERROR_BIT:
             state.counters.errors["imu_error"] += 1
+        if imu.imu_info & IMU_ENCRYPTED_BIT:  # "should not be used": counts that are none
+            state.counters.errors["imu_encrypted"] += 1
+            return []
     if scale is None:
         state.counters.errors["imu_scale_unknown"] += 1
         return []
@@ -254,12 +257,16 @@ def corrected_imu(state: State, header: Header, imu: nov.CorrImu | nov.CorrImuDa
 
 
 def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record | Row]:
-    """GPS time of the mark is the receiver's less its clock's offset (MARKxTIME, fields 3 and 4)."""
+    """GPS time of the mark is the receiver's less its clock's offset (MARKxTIME, fields 3 and 4).
+
+    It is of the pulse's leading edge, which is the falling one unless MARKCONTROL was told otherwise; no log says it.
+    """
     return [
         EventMark(
             host_time_ns=header.host_time_ns,
             time=gps_tag(mark.week, _nanoseconds(mark.seconds) - _nanoseconds(mark.clock_offset_s), state.floor_week),
             channel=nov.MARK_CHANNELS[header.name],
+            rising=None,
             sigma_s=mark.clock_offset_sigma_s,
             valid=state.time_counts(header) and mark.clock_status == tables.CLOCK_VALID,
             message=header.name,

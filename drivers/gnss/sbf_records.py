@@ -38,7 +38,8 @@ GREATEST_DRIFT_PPM = 1000.0
 GREATEST_EVENT_OFFSET_S = 1.0  # the rest of a millisecond, and a delay that the user has set
 ERROR_SHIFT = 16  # INS status: the block's info, and above it its error
 
-# Type of solution (mode, bits 0-3) -> the coarse class; what is not here is NONE
+# Type of solution (mode, bits 0-3) -> the coarse class; what is not here is NONE. The reference guide has 9 and 11 not:
+# Septentrio's sbfdef.h calls them PPP with fixed ambiguities, and RTK float with fixed widelane ambiguities
 FIX_TYPES: dict[int, FixType] = {
     1: FixType.SINGLE,
     2: FixType.DIFFERENTIAL,
@@ -48,7 +49,9 @@ FIX_TYPES: dict[int, FixType] = {
     6: FixType.DIFFERENTIAL,  # SBAS
     7: FixType.RTK_FIXED,  # moving base
     8: FixType.RTK_FLOAT,
+    9: FixType.PPP,
     10: FixType.PPP,
+    11: FixType.RTK_FLOAT,
 }
 EVENT_CHANNELS = {1: "EventA", 2: "EventB"}
 

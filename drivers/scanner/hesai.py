@@ -274,10 +274,13 @@ def _utc_seconds(packets: StructArray) -> Int64Array:
 
     Year minus 1900 and five more bytes; or, as the maker's SDK reads a first byte of 0, seconds since 1970 in the
     last four, the highest first (udp_protocol_v6_1.h, GetMicroLidarTimeU64). Bytes that name no date give some time.
+    The SDK takes a PandarQT's year as counted from 2000 or from 1900 (udp_protocol_v3_1.h; the manual is silent), and
+    takes a century off an XT's from 200 on: so only its last two digits count, as 1970 to 2069.
     """
     raw = packets["utc"].copy()
     utc = raw.view(_UTC)
-    month = (utc["year"].astype(np.int64) - 70).astype("M8[Y]").astype("M8[M]") + (utc["month"].astype(np.int64) - 1)
+    year = (utc["year"].astype(np.int64) - 70) % 100
+    month = year.astype("M8[Y]").astype("M8[M]") + (utc["month"].astype(np.int64) - 1)
     days = (month.astype("M8[D]") + (utc["day"].astype(np.int64) - 1)).astype(np.int64)
     of_day = (utc["hour"].astype(np.int64) * 60 + utc["minute"]) * 60 + utc["second"]
     counted = raw.view(np.dtype([("zero", "V2"), ("seconds", ">u4")]))["seconds"].astype(np.int64)

@@ -2,7 +2,7 @@
 
 PandarXT-32 User Manual 3.2 (PandarQT the same): 512 bytes. FF EE, then year, month, day, second, minute, hour, two
 ASCII digits each, the lower first; u32 microseconds; 84 bytes NMEA; reserved; at 506 the positioning status (A or V
-of GPRMC, 0 to 6 of GPGGA, NUL: none), at 507 the PPS lock flag (1 locked).
+of GPRMC, 0 to 9 of GPGGA as the receiver has it, NUL: none), at 507 the PPS lock flag (1 locked).
 
 Each rising edge of the head's internal 1 Hz signal, which is the PPS while locked, triggers a packet, and the date
 and time in it are that edge's: the previous NMEA message's and one second (3.2, Appendix II). So a packet names the
@@ -39,7 +39,8 @@ _STATUS = struct.Struct("<cB")
 _STATUS_AT = 506
 _FILL = 0xDF
 _STATUS_NAMES = {b"\0": "none", b"A": "valid", b"V": "invalid", b"0": "invalid", b"6": "estimated"}
-_STATUS_NAMES |= {b"1": "valid", b"2": "valid", b"3": "valid"}
+# 0 to 9 "as defined by the GPS device manufacturer", 4 and 5 of RTK (Pandar64 User Manual 3.2.2); 9 is NovAtel's SBAS
+_STATUS_NAMES |= dict.fromkeys((b"1", b"2", b"3", b"4", b"5", b"9"), "valid") | {b"7": "manual", b"8": "simulated"}
 
 
 def encode_gps_packet(time: dt.datetime, sentence: str = "", status: bytes = b"A", *, locked: bool = True) -> bytes:

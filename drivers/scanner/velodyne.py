@@ -162,7 +162,8 @@ class VelodyneParser(PacketParser):
         for rows, flags in ((~dual, self._flags[0]), (dual, self._flags[1])):
             used = slice(0, len(flags))
             flags_right[rows] = (flag[rows, used] == flags).all(axis=1)
-            azimuths_right[rows] = (azimuth[rows, used] < FULL_CIRCLE).all(axis=1)
+            # an HDL may say 36 000 where it means 0 (PointCloudLibrary/pcl #20)
+            azimuths_right[rows] = (azimuth[rows, used] <= FULL_CIRCLE).all(axis=1)
         good = np.ones(len(packets), dtype=np.bool_)
         for code, passes in (
             ("bad_block_flag", flags_right),

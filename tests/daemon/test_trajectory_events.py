@@ -93,6 +93,7 @@ def test_what_has_no_pose_says_why_and_keeps_its_place(trajectory: Trajectory) -
     assert {found[number]["lat_deg"] for number in (0, 2, 3, 4, 5)} == {""}
     assert found[1]["lat_deg"] == found[6]["lat_deg"]
     assert found[6]["edge"] == "falling"
+    assert rows([mark(1.0, rising=None)], trajectory)[0]["edge"] == ""
 
 
 def test_no_marks_are_a_header(trajectory: Trajectory) -> None:

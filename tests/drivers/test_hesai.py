@@ -303,6 +303,14 @@ def test_a_date_counted_in_seconds() -> None:
     assert decode(bytes(unit))["device_time_ns"][-1] == NOON_NS + 52_872
 
 
+@pytest.mark.parametrize(("head", "year"), [(QT64, 26), (QT64, 126), (XT32, 126), (XT32, 226)])
+def test_a_year_of_either_century(head: HesaiHead, year: int) -> None:
+    """HesaiLidar_SDK_2.0, udp_protocol_v3_1.h and v6_1.h, GetMicroLidarTimeU64: 2026 in all of these."""
+    unit = bytearray(packet(head))
+    unit[head.packet_dtype().fields["utc"][1]] = year  # type: ignore[index]
+    np.testing.assert_array_equal(decode(bytes(unit), head), decode(packet(head), head))
+
+
 def test_qt64_without_udp_sequence() -> None:
     units = [packet(QT64, time=NOON.replace(microsecond=667 * at), sequence=None) for at in range(3)]
     assert {len(unit) for unit in units} == {1068}
@@ -427,7 +435,11 @@ def test_a_locked_head_is_placed_by_its_latches() -> None:
         (b"\0", True, False, "none"),
         (b"0", True, False, "invalid"),
         (b"2", True, True, "valid"),
+        (b"4", True, True, "valid"),
+        (b"5", True, True, "valid"),
         (b"6", True, False, "estimated"),
+        (b"8", True, False, "simulated"),
+        (b"9", True, True, "valid"),
     ],
 )
 def test_only_a_locked_head_with_a_position_is_believed(status: bytes, locked: bool, valid: bool, name: str) -> None:

@@ -250,12 +250,19 @@ def test_an_imu_error_is_counted() -> None:
     assert parser.counters.errors == {"imu_error": 1}
 
 
+def test_encrypted_counts_are_no_samples() -> None:
+    """RAWIMUX, IMU info bit 1: "the IMU data is encrypted and should not be used"."""
+    records, parser = parse(encode_log("RAWIMUSX", nov.RawImux(2, 8, *RAW_IMU), WEEK, MS))
+    assert records == []
+    assert parser.counters.errors == {"imu_encrypted": 1}
+
+
 def test_heading_and_marks() -> None:
     heading = one(encode_log("HEADING2", HEADING, WEEK, MS), GnssHeading)
     assert math.degrees(heading.heading_rad) == pytest.approx(359.5)
     assert (heading.baseline_m, heading.valid) == (2.0, True)
     mark = one(encode_log("MARK2TIME", MARK, WEEK, MS), EventMark)
-    assert mark.channel == "MARK2"
+    assert (mark.channel, mark.rising) == ("MARK2", None), "MARKCONTROL's polarity is in no log"
     assert mark.time.week == WEEK + 1, "the receiver's clock is behind: GPS time is in the next week"
     assert mark.time.time_ns == pytest.approx(100, abs=1)
     assert mark.sigma_s == 1e-8

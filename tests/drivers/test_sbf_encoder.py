@@ -164,7 +164,9 @@ def test_damage_to_a_whole_stream_costs_only_what_it_touched() -> None:
         (3, 0, FixType.MANUAL, True),
         (4, 0, FixType.RTK_FIXED, True),
         (0x85, 0, FixType.RTK_FLOAT, True),
+        (9, 0, FixType.PPP, True),  # sbfdef.h: MODE_PPP_FIXED_AMBIGUITIES
         (10, 0, FixType.PPP, True),
+        (11, 0, FixType.RTK_FLOAT, True),  # sbfdef.h: MODE_RTK_FLOAT_WL_FIXED_AMBIGUITIES
         (1, 3, FixType.SINGLE, False),
         (0, 1, FixType.NONE, False),
     ],

@@ -263,6 +263,14 @@ def test_azimuth_is_turned_on_to_each_firing() -> None:
     assert (rows["encoder_rad"] < 2 * np.pi).all()
 
 
+def test_a_full_circle_is_north() -> None:
+    """PointCloudLibrary/pcl #20: "the rotation angle returned from the HDL might be 36000 (instead of 0)"."""
+    azimuth = [(35_900 + 20 * block) % 36_000 for block in range(12)]
+    full, zero = decode(packet(azimuth=[each or 36_000 for each in azimuth])), decode(packet(azimuth=azimuth))
+    assert len(full) == 12 * 32
+    np.testing.assert_allclose(full["encoder_rad"], zero["encoder_rad"], atol=1e-12)
+
+
 def test_a_step_of_the_field_of_view_is_not_rotation() -> None:
     azimuth = [1000, 1020, 1040, 1060, 1080, 27_000, 27_020, 27_040, 27_060, 27_080, 27_100, 27_120]
     degrees = np.degrees(decode(packet(azimuth=azimuth))["encoder_rad"]).reshape(12, 32)
