@@ -160,13 +160,14 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
     for session in sessions:
         refusals.refuse_no_name(session.session_id, session.parts[0].path)
-    refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum)
+    refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
         flights.append(_read(session, setup))
     flights[0].holes += [f"passed over: {line}" for line in passed_over]
     refusals.refuse_overlap({flight.log: flight.span for flight in flights})
+    flights.sort(key=lambda flight: flight.span)  # sessions come by their hosts' clocks, which may be wrong
     for flight in flights:
         _choose(wish, flight)
     _number_strips(wish, flights)

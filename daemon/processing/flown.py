@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from daemon.errors import ExitCode, UserError
 from daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
+from daemon.processing.trajectory_files import smrmsg_beside
 from georef.formats.trajectory_file import read_trajectory
 from georef.stream_path import SHORTEST_TRAJECTORY
 from georef.trajectory import Trajectory, TrajectoryError
@@ -106,7 +107,7 @@ def choose_trajectory(
 
 
 def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
-    smrmsg = _smrmsg_beside(file)
+    smrmsg = smrmsg_beside(file)
     return read_trajectory(
         file.read_bytes(),
         str(file),
@@ -115,14 +116,6 @@ def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_sec
         leap_seconds=leap_seconds,
         smrmsg=None if smrmsg is None else smrmsg.read_bytes(),
     )
-
-
-def _smrmsg_beside(file: Path) -> Path | None:
-    """The sigmas that came with an SBET: sbet_X.out and smrmsg_X.out, or X.sbet and X.smrmsg."""
-    names = [file.with_suffix(".smrmsg")] if file.suffix == ".sbet" else []
-    if file.name.startswith("sbet"):
-        names.append(file.with_name("smrmsg" + file.name.removeprefix("sbet")))
-    return next((name for name in names if name.exists()), None)
 
 
 def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:

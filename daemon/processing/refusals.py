@@ -42,19 +42,25 @@ AXES = (
 )
 
 
-def refuse_different_settings(configs: Mapping[Path, Config], crs: str | None, datum: str | None = None) -> None:
+def refuse_different_settings(
+    configs: Mapping[Path, Config], crs: str | None, datum: str | None = None, epoch: float | None = None
+) -> None:
     """Logs of one run share the mapping frame, and of their trajectory the antenna and the datum.
+
+    Args:
+        configs: by log.
+        crs, datum, epoch: what the command line says, over the configurations.
 
     Raises:
         UserError: they do not.
     """
     for (one, first), (other, second) in pairwise(configs.items()):
-        for key in ("crs", "epoch"):
+        for key, said in (("crs", crs), ("epoch", epoch)):
             ours, theirs = getattr(first.output, key), getattr(second.output, key)
-            if crs is None and ours != theirs:
+            if said is None and ours != theirs:
                 raise UserError(
                     f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; "
-                    f"say one with --{key}, or georeference them one by one",
+                    f"say one with --{key} (of swath georef) or --config, or take them one by one",
                     ExitCode.USAGE,
                 )
         if datum is None and (theirs := _datum_of(second)) != (ours := _datum_of(first)):

@@ -87,10 +87,18 @@ class TrajectoryFiles:
 
 
 def _smrmsg_of(sbet: Path) -> Path:
-    """The name under which the sigmas of an SBET are looked for."""
+    """The name under which the sigmas of an SBET are written."""
     if sbet.name.startswith("sbet") and sbet.suffix == ".out":
         return sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet"))
     return sbet.with_suffix(".smrmsg")
+
+
+def smrmsg_beside(sbet: Path) -> Path | None:
+    """The sigmas that came with an SBET: as they are written here, or with the name's first word exchanged."""
+    names = [_smrmsg_of(sbet)] if sbet.suffix.lower() in SBETS else []
+    if sbet.name.startswith("sbet"):
+        names.append(sbet.with_name("smrmsg" + sbet.name.removeprefix("sbet")))
+    return next((name for name in names if name.exists()), None)
 
 
 def write_trajectory(

@@ -78,17 +78,15 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
             refuse_no_name(session.session_id, session.parts[0].path)
         holes = [f"passed over: {line}" for line in passed_over]
         files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
+        _refuse_one_name(wish.events, files)
         if not wish.overwrite:
             files.refuse_existing(wish.events)
         if wish.navigate.inputs.ins == AS_IS:
-            return _write_as_is(wish, files, _in_order(sessions), holes)
-        flights = [navigate_session(session, wish.navigate, tell) for session in _in_order(sessions)]
+            return _write_as_is(wish, files, sessions, holes)
+        flights = [navigate_session(session, wish.navigate, tell) for session in sessions]
+        flights.sort(key=lambda flight: int(flight.solutions()[0].time_ns[0]))  # the hosts' clocks may be wrong
         flights[0].holes.extend(holes)
         return _write(wish, files, flights, tell)
-
-
-def _in_order(sessions: Sequence[Session]) -> list[Session]:
-    return sorted(sessions, key=lambda session: session.info.realtime_ns)
 
 
 def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell) -> TrajectoryReport:
@@ -116,8 +114,10 @@ def _write_as_is(
     """The devices' own INS, without a page."""
     if wish.events is not None:
         raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
-    found = [ins_as_is(session, wish.navigate.inputs.config) for session in sessions]
-    _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in zip(sessions, found, strict=True)])
+    read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
+    read.sort(key=lambda pair: pair[1].trajectory.span)  # the hosts' clocks may be wrong
+    sessions, found = [session for session, _ in read], [one for _, one in read]
+    _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in read])
     trajectory = joined_trajectory([one.trajectory for one in found], found[0].trajectory.name)
     record = summary_head(wish, AS_IS, sessions, [*(line for one in found for line in one.holes), *holes], [])
     record["sessions"] = [
@@ -150,6 +150,12 @@ def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
                 "recordings of one time; navigate them one by one",
                 ExitCode.USAGE,
             )
+
+
+def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
+    """UserError where the marks would go into a file of the trajectory."""
+    if events is not None and events.resolve() in [path.resolve() for path in files.all()]:
+        raise UserError(f"--events {events}: is a file of the trajectory itself; want another name", ExitCode.USAGE)
 
 
 def _write_events(

@@ -113,6 +113,8 @@ def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first
 def placed_in_week(of_week_ns: Int64Array, name: str, span_ns: Span | None, week: int | None) -> Int64Array:
     """GPS time of nanoseconds of a week: the week given, or the one in which they overlap a log's span most."""
     if week is not None:
+        if not 0 <= week <= LATEST_NS // WEEK_NS:  # as 24233, which is a week and a day of it
+            raise TrajectoryError(f"{name}: --week {week} is no GPS week; want whole weeks since 1980, such as 2423")
         return of_week_ns + week * WEEK_NS
     if span_ns is None:
         raise TrajectoryError(f"{name}: says seconds of the week but no week; give the GPS week (--week)")

@@ -62,6 +62,13 @@ def test_logs_with_different_frames() -> None:
     refusals.refuse_different_settings({A: config(), B: config()}, None)
 
 
+def test_an_epoch_that_is_said_settles_different_ones_and_a_frame_does_not() -> None:
+    configs = {A: config(), B: config(epoch=2020.0)}
+    refusals.refuse_different_settings(configs, None, epoch=2026.5)
+    with pytest.raises(UserError, match=r"output\.epoch is 2020\.0, .* say one with --epoch"):
+        refusals.refuse_different_settings(configs, "EPSG:25832")
+
+
 def test_sessions_with_positions_in_different_datums() -> None:
     other = parse_config(
         TEXT.format(arm="[0.1, 0.0, -1.2]", crs="EPSG:25832", epoch=2026.5).replace(

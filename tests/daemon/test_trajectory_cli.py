@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from daemon.processing.event_marks import PLACED
 from daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
 from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory
+from sim.plan import Plan, parse_plan
+from tests.daemon import short_flight
 from tests.daemon.short_flight import MARK_AFTER_NS, Flown, fly_short
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -273,6 +276,14 @@ class TestRefusals:
         assert said in self.refused(capsys, str(flown.log), "-o", str(tmp_path / "a.sbet"), *arguments)
         assert not list(tmp_path.iterdir())
 
+    @pytest.mark.parametrize(("output", "marks"), [("a.sbet", "a.csv"), ("a.csv", "a.csv"), ("a.sbet", "a.json")])
+    def test_marks_do_not_take_the_place_of_the_trajectory(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], output: str, marks: str
+    ) -> None:
+        arguments = ["-o", str(tmp_path / output), "--csv", "--events", str(tmp_path / "." / marks), "--overwrite"]
+        assert "is a file of the trajectory itself" in self.refused(capsys, str(flown.log), *arguments)
+        assert not list(tmp_path.iterdir())
+
     def test_no_log(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         said = self.refused(capsys, str(tmp_path / "no.mcap"), "-o", str(tmp_path / "a.sbet"))
         assert "no such file or directory" in said
@@ -358,3 +369,31 @@ def test_post_processed_positions_make_it_better(flown: Flown, made: Path, tmp_p
     lines = len(file.read_text().splitlines()) - 2
     assert session["gnss"]["observations"]["position"] == lines
     assert session["gnss"]["refused"]["fix_replaced_from_outside"] == pytest.approx(2 * SECONDS, abs=3)
+
+
+def test_sessions_of_a_host_whose_clock_was_set_back_follow_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Sessions are sorted by the host's clock; which came first the trajectories tell."""
+
+    def begun_late(text: str, folder: Path) -> Plan:
+        """With a host's clock that is further off than a plan may say."""
+        plan = parse_plan(text, folder)
+        host = plan.tables.host.model_copy(update={"utc_offset_s": -1200.0})
+        return replace(plan, tables=plan.tables.model_copy(update={"host": host}))
+
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    first = fly_short(tmp_path / "first", PLAN, 16.0)
+    monkeypatch.setattr(short_flight, "parse_plan", begun_late)
+    later = PLAN.replace("seed = 5", "seed = 5\nstart = 2026-06-15T09:10:00Z")
+    second = fly_short(tmp_path / "second", later, 16.0)
+    logs = [first.log, second.log]
+    assert [session.parts[0].path for session in open_logs(logs)] == logs[::-1]
+    capsys.readouterr()
+    assert run_app(["trajectory", *map(str, logs), "-o", str(tmp_path / "a.sbet"), "--no-page"]) == 0
+    told = summary(tmp_path)
+    assert [log["name"] for log in told["logs"]] == [log.name for log in logs]
+    assert [session["session"] for session in told["sessions"]] == [open_logs([log])[0].session_id for log in logs]
+    joined = read_trajectory((tmp_path / "a.sbet").read_bytes(), "a.sbet", span_ns=first.truth().span)
+    assert joined.span[1] - joined.span[0] > 600 * S

@@ -9,7 +9,13 @@ import pytest
 
 from daemon.errors import UserError
 from daemon.processing import trajectory_files
-from daemon.processing.trajectory_files import PARTIAL, TrajectoryFiles, put_in_place, write_trajectory
+from daemon.processing.trajectory_files import (
+    PARTIAL,
+    TrajectoryFiles,
+    put_in_place,
+    smrmsg_beside,
+    write_trajectory,
+)
 from georef.formats.sbet import sbet_bytes
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
@@ -48,6 +54,23 @@ def trajectory() -> Trajectory:
 def written(files: TrajectoryFiles, trajectory: Trajectory) -> None:
     sigma = np.full((len(trajectory), 3), 0.005) + np.arange(3) * 0.001
     put_in_place(write_trajectory(files, trajectory, sigma))
+
+
+@pytest.mark.parametrize("name", ["f1.sbet", "F1.SBET", "f1.out", "sbet_f1.out", "sbet_f1.OUT", "sbet_f1.sbet"])
+def test_the_sigmas_of_an_sbet_are_found_where_they_were_written(
+    trajectory: Trajectory, tmp_path: Path, name: str
+) -> None:
+    files = TrajectoryFiles.of_output(tmp_path / name, "x", csv=False)
+    assert files.sbet is not None
+    assert smrmsg_beside(files.sbet) is None
+    written(files, trajectory)
+    assert smrmsg_beside(files.sbet) == files.smrmsg
+
+
+def test_sigmas_as_applanix_names_them_are_found(tmp_path: Path) -> None:
+    (tmp_path / "smrmsg_f1.sbet").touch()
+    assert smrmsg_beside(tmp_path / "sbet_f1.sbet") == tmp_path / "smrmsg_f1.sbet"
+    assert smrmsg_beside(tmp_path / "f1.csv") is None
 
 
 @pytest.mark.parametrize("block", [7, 49, 50, 1000])

@@ -191,6 +191,13 @@ def test_week_is_the_one_that_overlaps_the_log() -> None:
         read(table_of(trajectory), span_ns=None)
 
 
+@pytest.mark.parametrize("week", [-1, 24_233, 10**6, 10**20])
+def test_a_week_that_is_none(week: int) -> None:
+    """24233 is the third day of week 2423, as names of orbit files have it: beyond 64 bits of nanoseconds."""
+    with pytest.raises(TrajectoryError, match=rf"--week {week} is no GPS week; want whole weeks since 1980"):
+        read_trajectory(sbet_bytes(flown()), "s", week=week)
+
+
 @pytest.mark.parametrize("begins_anew", [True, False])
 @pytest.mark.parametrize("log_begins_s", [-20.0, 10.0])
 def test_week_ends_on_the_way(begins_anew: bool, log_begins_s: float) -> None:
