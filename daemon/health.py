@@ -60,7 +60,8 @@ def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
     told = "; ".join(troubles) if troubles else f"all {sources} sources are coming in" if sources else "begins"
     room = f"{writer.free_bytes / 1e9:.1f} GB free"
     if writer.bytes_per_s > 0:
-        room += f" ({duration_text(writer.free_bytes / writer.bytes_per_s)})"
+        left_s = max(0, writer.free_bytes - writer.reserve_bytes) / writer.bytes_per_s
+        room += f" ({duration_text(left_s)})"
     return f"recording {session_id} part {part}: {told}; {room}"
 
 

@@ -190,14 +190,18 @@ def _read_raw_ns() -> int:
 
 
 def read_clock_sample(discipline: ClockDiscipline) -> dict[str, int | float]:
-    """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status."""
+    """One message of ``/clock``: the three clocks side by side and adjtimex's frequency and status.
+
+    And, where the wall clock is kept, its greatest error: then it may name a second, here and when the log is read.
+    """
     pair = read_clock_pair()
     raw, at_ns, _ = _bracketed(_read_raw_ns)
     shift = at_ns - pair.monotonic_ns  # raw was read a little later: bring it to the pair's instant
-    return {
+    sample: dict[str, int | float] = {
         "realtime_ns": pair.realtime_ns,
         "monotonic_ns": pair.monotonic_ns,
         "monotonic_raw_ns": raw - shift,
         "frequency_ppm": discipline.frequency_ppm,
         "status": discipline.status,
     }
+    return sample | ({"max_error_s": discipline.max_error_s} if discipline.disciplined else {})

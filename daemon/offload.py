@@ -25,6 +25,7 @@ from daemon.parts import read_sign
 PARTIAL = ".partial"
 BLOCK_BYTES = 4 << 20
 SYNC_BYTES = 64 << 20  # so much is handed to the disk before it is waited for
+SAME_TIME_S = 2.0  # a copy has its log's time, as far as its file system keeps it: FAT does to two seconds
 SIGN_BELIEVED_S = 60.0  # of a file system without locks: a log named as growing is, while it does
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
@@ -205,13 +206,16 @@ def _is_left_open(path: Path) -> bool:
 
 
 def _check_there(path: Path, report: OffloadReport, sums: ChecksumList, verify: bool, progress: Progress) -> None:
-    """A copy is there: it was read back when it was made, or is compared now."""
+    """A copy is there: it was read back when it was made, or is compared now.
+
+    One of another time may be of another log with this name, of an import made anew for example.
+    """
     copy, size = report.destination / path.name, path.stat().st_size
     known = sums.sums.get(path.name)
     differs = CopyDiffersError(f"{copy}: is there and is not {path}; nothing was overwritten")
     if copy.stat().st_size != size:
         raise differs
-    if known is None or verify:
+    if known is None or verify or abs(copy.stat().st_mtime - path.stat().st_mtime) > SAME_TIME_S:
         digest = digest_of(path, lambda done: progress(path.name, done, 2 * size))
         if digest_of(copy, lambda done: progress(path.name, size + done, 2 * size)) != digest:
             raise differs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import stat
 from pathlib import Path
 
 from daemon.errors import ConfigError, ExitCode, UserError
@@ -78,6 +79,9 @@ def take_directory(directory: Path, key: str = "session.directory") -> int:
         raise UserError(text, exit_code=ExitCode.IO) from error
     except OSError as error:
         text = f"{key} {directory}: {error.strerror}; give a directory that user {os.getuid()} may write"
+        if os.path.lexists(directory / LOCK) and os.access(directory, os.W_OK | os.X_OK):
+            held = "left there by another user's recording: remove it when that one is at an end"
+            text = f"{key} {directory}: {directory / LOCK}: {error.strerror}; {held}"
         raise UserError(text, exit_code=ExitCode.IO) from error
 
 
@@ -96,10 +100,19 @@ def keep_directory(directory: Path, lock: int) -> None:
     os.close(anew)
 
 
+def _give_to_owner_of(directory: Path, fd: int) -> None:
+    """Root's lock would else keep the directory's owner, the service, from recording there for good."""
+    own, there = os.fstat(fd), directory.stat()
+    if os.geteuid() == 0 and stat.S_ISREG(own.st_mode) and own.st_nlink == 1:  # no other file under this name
+        with contextlib.suppress(PermissionError):  # a file system without owners
+            os.fchown(fd, there.st_uid, there.st_gid)
+
+
 def _lock(directory: Path) -> int:
-    lock = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    lock = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _give_to_owner_of(directory, lock)
     except OSError:
         os.close(lock)
         raise

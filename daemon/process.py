@@ -111,7 +111,8 @@ class RecorderProcess:
         deadline_s = time.monotonic() + RECEIVERS_END_S
         for receiver in assembly.receivers:
             receiver.join(max(0.0, deadline_s - time.monotonic()))
-        left = [receiver.source for receiver in assembly.receivers if receiver.is_alive()]
+        # one whose device is being opened still has taken nothing that could be missing
+        left = [receiver.source for receiver in assembly.receivers if receiver.is_alive() and not receiver.opening]
         if left:
             text = f"no end of {', '.join(left)}: its last units may be missing"
             assembly.shared.events.post(Severity.CRITICAL, "recorder", "stuck", text)

@@ -53,6 +53,7 @@ class WriterHealth:
         status_ns: CLOCK_MONOTONIC when the latest status was written and synced, or the stop for want of room was
             looked at. An error of the disk leaves it standing.
         free_bytes: on the log's file system.
+        reserve_bytes: of them nothing is written into.
         bytes_per_s: written over the last second.
         reason: why nothing is written, in words.
     """
@@ -60,6 +61,7 @@ class WriterHealth:
     state: Writing = Writing.RECORDING
     status_ns: int = 0
     free_bytes: int = 0
+    reserve_bytes: int = 0
     bytes_per_s: float = 0.0
     reason: str = ""
     statuses: dict[str, dict[str, object]] = field(default_factory=dict)
@@ -89,7 +91,7 @@ class Recorder(threading.Thread):
         time_status: TimeStatus,
     ) -> None:
         super().__init__(name="writer", daemon=True)
-        self.health = WriterHealth(status_ns=time.monotonic_ns())
+        self.health = WriterHealth(status_ns=time.monotonic_ns(), reserve_bytes=settings.reserve_bytes)
         self.new_part = threading.Event()
         self.stop = threading.Event()
         self._parts = parts

@@ -26,6 +26,7 @@ from drivers.transports.uri import TransportSpec, open_transport
 EMPTY_LOOKS = 15  # of 10 ms, until a port counts as read to its end
 _PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted
 _LATE_S = 0.002  # units due within this are sent without another sleep
+_PTYS = "/dev/pts"
 LONGEST_PAUSE_NS = 3600 * 1_000_000_000  # between units; a log that says more means another time, nobody waits for it
 
 
@@ -58,8 +59,10 @@ class PtyOutput(Output):
     """A pseudo-terminal that stands at the path where a recorder expects its serial port."""
 
     def __init__(self, path: Path) -> None:
-        if path.exists() and not path.is_symlink():
-            raise TransportError(f"{path}: is there already and is no link; give a path that may be made")
+        if path.exists() and not (path.is_symlink() and path.resolve().is_relative_to(_PTYS)):
+            # a link may be udev's, to a receiver: replaced and removed it would be gone until that is plugged in anew
+            text = "is there already and is no link to a pseudo-terminal; give a path that may be made"
+            raise TransportError(f"{path}: {text}")
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self._port = os.ttyname(slave)

@@ -7,6 +7,8 @@ messages by host time, then what the devices said.
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -20,6 +22,7 @@ from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline
 CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
 MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
 MAX_RATE_OFF = 1e-3  # of device time against GPS time
+KEPT_S = 0.5  # a wall clock whose greatest error is below this is kept by somebody
 
 
 @kept
@@ -96,12 +99,14 @@ class HostClocks:
             self.by_source[source] = shared or PpsClock(
                 assumed_leap_seconds=gnss.leap_seconds, keep_history=keep_history
             )
-        self._readings: list[tuple[int, int, int]] = []
+        self._readings: deque[tuple[int, int, int, float]] = deque()
         self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
 
-    def add_reading(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
-        """The host's clocks side by side."""
-        self._readings.append((realtime_ns, monotonic_ns, monotonic_raw_ns))
+    def add_reading(
+        self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
+    ) -> None:
+        """The host's clocks side by side; max_error_s of the wall clock, inf: nobody keeps it."""
+        self._readings.append((realtime_ns, monotonic_ns, monotonic_raw_ns, max_error_s))
 
     def add_edge(self, source: str, edge: PpsEdge) -> None:
         """An edge of ``pps/name``."""
@@ -114,17 +119,26 @@ class HostClocks:
     def update(self) -> None:
         """Take what has come since the last call."""
         for reading in self._readings:
-            self.timeline.add(*reading)
+            self.timeline.add(*reading[:3])
         self._spoken.sort(key=lambda said: said[:2])
         for host_ns, _, source, said in self._spoken:
+            self._read_wall_clock(host_ns)
             raw_ns = self.timeline.raw_at(host_ns)
             if isinstance(said, PpsEdge):
                 self.by_source[source].add_edge(raw_ns, said.sequence)
                 continue
             names = self.plan.gnss[source].names_edge or said.names_edge
             self.by_source[source].add_message(source, replace(said, host_time_ns=raw_ns, names_edge=names))
-        self._readings.clear()
         self._spoken.clear()
+        self._read_wall_clock(None)
+
+    def _read_wall_clock(self, until_ns: int | None) -> None:
+        """Tell the clocks what the wall clock said up to a host time: as while recording, it may name a second."""
+        readings, host_minus_ns = self._readings, self.timeline.host_minus_monotonic_ns
+        while readings and (until_ns is None or readings[0][1] + host_minus_ns <= until_ns):
+            realtime_ns, _, raw_ns, max_error_s = readings.popleft()
+            for clock in set(self.by_source.values()):
+                clock.set_wall_clock(raw_ns, realtime_ns, disciplined=max_error_s < KEPT_S, sigma_s=max_error_s)
 
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
         """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""
@@ -156,10 +170,12 @@ class StreamClocks:
         """Clocks that know what has been fed so far, and of that the last quarter of an hour."""
         return cls(HostClocks(plan))
 
-    def add_reading(self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int) -> None:
+    def add_reading(
+        self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
+    ) -> None:
         """See `HostClocks.add_reading`."""
         if not self.frozen:
-            self.host.add_reading(realtime_ns, monotonic_ns, monotonic_raw_ns)
+            self.host.add_reading(realtime_ns, monotonic_ns, monotonic_raw_ns, max_error_s)
 
     def add_edge(self, source: str, edge: PpsEdge) -> None:
         """See `HostClocks.add_edge`."""

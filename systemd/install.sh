@@ -106,15 +106,24 @@ put_in_place() {
     rm -rf "$program.old"
 }
 
+# What stands in /etc is the administrator's to change: it is not overwritten without a trace.
+keep_changed() {
+    case $2 in /etc/*) ;; *) return 0 ;; esac
+    [ -e "$DESTDIR$2" ] && ! cmp -s "$source/systemd/$1" "$DESTDIR$2" || return 0
+    cp -p "$DESTDIR$2" "$DESTDIR$2.old"
+    echo "replaced $DESTDIR$2; what it was is in $DESTDIR$2.old"
+}
+
 install_files() {
     placed | while read -r from to; do
         mkdir -p "$DESTDIR$(dirname "$to")"
+        keep_changed "$from" "$to"
         sed "s#/opt/swath#$PREFIX#g" "$source/systemd/$from" >"$DESTDIR$to"
         chmod 0644 "$DESTDIR$to"
     done
     mkdir -p "$DESTDIR/etc/swath" "$DESTDIR/usr/local/bin"
     ln -sfn "$PREFIX/bin/swath" "$DESTDIR/usr/local/bin/swath"
-    if [ -e "$DESTDIR/etc/swath/swath.toml" ]; then
+    if [ -e "$DESTDIR/etc/swath/swath.toml" ] || [ -L "$DESTDIR/etc/swath/swath.toml" ]; then # a link's disk may be away
         echo "kept $DESTDIR/etc/swath/swath.toml"
     else
         install -m 0644 "$source/systemd/swath.toml" "$DESTDIR/etc/swath/swath.toml"

@@ -194,6 +194,25 @@ def test_own_configuration_is_never_overwritten(tmp_path: Path) -> None:
     assert own.read_text() == "mine\n"
 
 
+def test_a_configuration_on_a_disk_that_is_not_mounted_is_not_replaced_by_the_example(tmp_path: Path) -> None:
+    """Else the next start would record with the example's devices."""
+    link = tmp_path / "etc/swath/swath.toml"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(tmp_path / "data/aircraft.toml")
+    assert "kept" in install_files(tmp_path, "/opt/swath")
+    assert link.readlink() == tmp_path / "data/aircraft.toml"
+
+
+def test_what_was_changed_in_etc_is_kept_beside(tmp_path: Path) -> None:
+    assert ".old" not in install_files(tmp_path, "/opt/swath") + install_files(tmp_path, "/opt/swath")
+    placed = tmp_path / "etc/chrony/conf.d/swath.conf"
+    as_installed = placed.read_text()
+    placed.write_text("maxslewrate 20\n")
+    assert f"{placed}.old" in install_files(tmp_path, "/opt/swath")
+    assert placed.read_text() == as_installed
+    assert Path(f"{placed}.old").read_text() == "maxslewrate 20\n"
+
+
 def test_a_folder_with_other_things_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "usr/lib").mkdir(parents=True)
     done = make("install", f"DESTDIR={tmp_path}", "PREFIX=/usr", *python_for_services())

@@ -42,7 +42,7 @@ def command(
         except LogError as error:
             refused.append(str(error))
         except OSError as error:
-            refused.append(f"{path}: {error.strerror or error}")
+            refused.append(f"{error.filename or path}: {error.strerror or error}")
         else:
             reports.append(report)
             if not as_json:

@@ -123,7 +123,7 @@ SCHEMAS: dict[str, bytes] = {
             "frequency_ppm": "num",
             "status": "int",
         },
-        {},
+        {"max_error_s": "num"},
     ),
     "swath.Status": _object(
         "swath.Status",

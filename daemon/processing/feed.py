@@ -7,6 +7,7 @@ while it is written, and one that comes message by message.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -258,13 +259,18 @@ class LogFeed:
         self.stream.add_returns(name, rows)
 
 
-def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int]]:
-    """realtime_ns, monotonic_ns and monotonic_raw_ns of ``/clock``; what is none is left out."""
+def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
+    """realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left out."""
     for _, value in json_objects(batch):
         realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
         raw_ns = _time_of(value.get("monotonic_raw_ns"))
         if realtime_ns is not None and monotonic_ns is not None and raw_ns is not None:
-            yield realtime_ns, monotonic_ns, raw_ns
+            yield realtime_ns, monotonic_ns, raw_ns, _error_of(value.get("max_error_s"))
+
+
+def _error_of(value: Any) -> float:
+    said = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
+    return float(value) if said else math.inf
 
 
 def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:

@@ -13,6 +13,7 @@ import os
 import re
 import socket
 import stat
+import struct
 import time
 from typing import Any
 
@@ -25,6 +26,9 @@ from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
 from drivers.transports.mmsg import DropCounter, ask_receive_buffer, stamping
 from drivers.transports.uri import TransportSpec
 
+CONNECT_S = 2.0  # to a gateway
+# a gateway that loses its power says nothing: the connection counts as dead after 25 s
+_KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 KERNEL_STAMPED = frozenset({"udp_multicast"})
 MAX_FRAMES = 1000  # bounds one receive
 SLICE_S = 0.1  # a bus without a descriptor is asked in slices, so that a close from outside is noticed
@@ -32,7 +36,7 @@ BATCH_S = 0.032  # 260 frames of a full 1 Mbit/s bus; the kernel has their stamp
 BUFFER_BYTES = 4 << 20
 SEND_TIMEOUT_S = 1.0
 
-_UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+_UNREADABLE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
 _MISSING = re.compile(r"missing \d+ required .*arguments?: (.*)")  # Python's word for options that were not given
 _NAME = re.compile(r"'(\w+)'")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
@@ -67,11 +71,14 @@ class PythonCanTransport(DescriptorTransport):
         self._fd = -1
         self._sock: socket.socket | None = None
         self._drops: DropCounter | None = None
+        self._connection: socket.socket | None = None
 
     def _open_device(self) -> int:
         keywords: dict[str, Any] = {key: keyword_value(value) for key, value in self._spec.options.items()}
         spec = self._spec
         try:
+            if spec.interface == "socketcand" and {"host", "port"} <= keywords.keys():
+                _see_that_it_is_there(keywords["host"], keywords["port"])
             with stamping() if self._kernel_stamped else contextlib.nullcontext():
                 self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
         except NameError as error:  # how a python-can interface says that its maker's library is not installed
@@ -82,6 +89,7 @@ class PythonCanTransport(DescriptorTransport):
             raise TransportError(f"{self.name}: cannot open the CAN bus: {self._why_not_opened(error)}") from error
         self._fd = _descriptor(self._bus)
         self._watch_socket()
+        self._connection = _connection(self._bus)
         return self._fd
 
     def _why_not_opened(self, error: Exception) -> str:
@@ -109,7 +117,7 @@ class PythonCanTransport(DescriptorTransport):
         if self._sock is not None:
             self._sock.close()
             self._sock = self._drops = None
-        bus, self._bus = self._bus, None
+        bus, self._bus, self._connection = self._bus, None, None
         if bus is None:
             return
         try:
@@ -174,9 +182,21 @@ class PythonCanTransport(DescriptorTransport):
             message = self._read(min(max(left_s, 0.0), SLICE_S))
             if message is not None:
                 return [message]
+            self._see_that_it_is_connected()
             if left_s <= 0:
                 break
         return []
+
+    def _see_that_it_is_connected(self) -> None:
+        """On silence: socketcand's bus reads nothing for ever from a gateway that has closed, as fast as it can."""
+        try:
+            ended = self._connection is not None and not self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise TransportError(f"{self.name}: the connection broke: {_one_line(error)}") from error
+        if ended:
+            raise TransportError(f"{self.name}: the gateway closed the connection")
 
     def _read(self, timeout_s: float) -> can.Message | None:
         """One message; None on silence or on input nobody can read, which is counted."""
@@ -215,6 +235,25 @@ def _descriptor(bus: can.BusABC) -> int:
         return int(bus.fileno())
     except (NotImplementedError, can.CanError):
         return -1
+
+
+def _see_that_it_is_there(host: str, port: int) -> None:
+    """Raises OSError where no gateway listens.
+
+    socketcand's bus would ask for 10 s, thousands of times a second, with a line on stderr each time.
+    """
+    socket.create_connection((host, port), CONNECT_S).close()
+
+
+def _connection(bus: can.BusABC) -> socket.socket | None:
+    """The connection of a socketcand bus, which has no other way to it, kept alive; None of any other."""
+    found = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    if not isinstance(found, socket.socket):
+        return None
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEPALIVE:
+        found.setsockopt(socket.IPPROTO_TCP, option, value)
+    return found
 
 
 def _one_line(error: BaseException) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from array import array
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ SPACING_FLOOR_NS = 2_000.0
 MAX_BRIDGED_S = 1_000  # longer without a latched edge the seconds can no longer be counted by ticks
 REFUSED_IN_A_ROW = 4  # spacings: then the first edge was the wrong one
 STEP_BACK_NS = 50_000_000  # device time going back further is a restart
+JUMP_NS = 5 * SECOND_NS  # … or passing the host's by more, which no stall of datagrams does: it was restarted, or set
 LABEL_KNOTS = 31  # latched edges around the time asked for whose labels are compared
 LABEL_MAJORITY = 0.8
 LABEL_MAX_SIGMA_NS = 1e8  # the host's clock must be better than this to say which second
@@ -134,15 +136,26 @@ class _Arrivals:
 
 
 class _Segment:
-    """The device's clock from one power-on to the next."""
+    """The device's clock from one power-on, or one change between kept and free, to the next."""
 
-    def __init__(self, first_host_ns: int) -> None:
+    def __init__(self, first_host_ns: int, *, free: bool) -> None:
         self.first_host_ns = first_host_ns
+        self.free = free
         self.latch = _Latch()
         self.arrivals = _Arrivals()
         self.last_device_ns: int | None = None
+        self.last_host_ns = first_host_ns
         self.last_count = -1
         self.last_pps_ns = -1
+
+
+def _runs_free(rows: StructArray) -> NDArray[np.bool_]:
+    """(n,) where a head whose clock the PPS sets, and which counts no edges, has none: it drifts, and is set again.
+
+    Its seconds before and after are no two points of one clock, as a counter's latches are.
+    """
+    free: NDArray[np.bool_] = (rows["locked"] == 0) & (rows["pps_time_ns"] < 0) & (rows["pps_count"] < 0)
+    return free
 
 
 class DeviceClock:
@@ -167,15 +180,20 @@ class DeviceClock:
         device = np.asarray(rows["device_time_ns"], dtype=np.int64)
         count = np.asarray(rows["pps_count"], dtype=np.int64)
         self._note_locks(np.asarray(rows["locked"]), host)
-        back = (np.diff(device) < -STEP_BACK_NS) | ((np.diff(count) < 0) & (count[1:] >= 0))
-        starts = [0, *(int(place) + 1 for place in np.flatnonzero(back))]
+        free = _runs_free(rows)
+        begins = (np.diff(device) < -STEP_BACK_NS) | ((np.diff(count) < 0) & (count[1:] >= 0)) | np.diff(free)
+        begins |= np.abs(np.diff(device) - np.diff(host)) > JUMP_NS
+        starts = [0, *(int(place) + 1 for place in np.flatnonzero(begins))]
         for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
-            segment = self._segment_for(int(device[start]), int(count[start]), int(host[start]))
+            segment = self._segment_for(int(device[start]), int(count[start]), int(host[start]), free=bool(free[start]))
             pps = np.asarray(rows["pps_time_ns"][start:stop], dtype=np.int64)
-            self._add_latched(segment, pps, count[start:stop], device[start:stop], host[start:stop])
+            broken = self._add_latched(segment, pps, count[start:stop], device[start:stop], host[start:stop])
+            bounds = [start, *(start + place for place in broken), stop]
+            for part, (first, last) in zip(self._segments[-len(bounds) + 1 :], pairwise(bounds), strict=True):
+                if last > first:
+                    part.arrivals.add(device[first:last], host[first:last])
             segment = self._segments[-1]
-            segment.arrivals.add(device[start:stop], host[start:stop])
-            segment.last_device_ns = int(device[stop - 1])
+            segment.last_device_ns, segment.last_host_ns = int(device[stop - 1]), int(host[stop - 1])
             segment.last_count = int(count[stop - 1])
         self._trim()
 
@@ -186,23 +204,29 @@ class DeviceClock:
             self._lock_host.append(int(host[place]))
             self._lock_state.append(int(locked[place]))
 
-    def _segment_for(self, device_ns: int, count: int, host_ns: int) -> _Segment:
-        """The segment that goes on, or a new one where device time or edge count went back."""
+    def _segment_for(self, device_ns: int, count: int, host_ns: int, *, free: bool) -> _Segment:
+        """The segment that goes on; a new one where count or device time went back, that jumped, or lock changed."""
         if self._segments:
             last = self._segments[-1]
-            went_back = last.last_device_ns is not None and device_ns < last.last_device_ns - STEP_BACK_NS
-            if not went_back and not 0 <= count < last.last_count:
+            passed_ns = 0 if last.last_device_ns is None else device_ns - last.last_device_ns
+            jumped = last.last_device_ns is not None and abs(passed_ns - (host_ns - last.last_host_ns)) > JUMP_NS
+            goes_on = passed_ns >= -STEP_BACK_NS and not jumped and not 0 <= count < last.last_count
+            if goes_on and free == last.free:
                 return last
-        self._segments.append(_Segment(host_ns))
+        self._segments.append(_Segment(host_ns, free=free))
         return self._segments[-1]
 
     def _add_latched(
         self, segment: _Segment, pps: Int64Array, count: Int64Array, device: Int64Array, host: Int64Array
-    ) -> None:
-        """Take each new latch once: the host saw its edge (device time − latch) before the row's stamp."""
+    ) -> list[int]:
+        """Take each new latch once: the host saw its edge (device time − latch) before the row's stamp.
+
+        Returns the rows at which the chain broke, and so another segment began.
+        """
+        broken: list[int] = []
         usable = np.flatnonzero((pps >= 0) & (count != 0))
         if not usable.size:
-            return
+            return broken
         values = pps[usable]
         fresh = usable[np.concatenate(([values[0] != segment.last_pps_ns], np.diff(values) != 0))]
         segment.last_pps_ns = int(values[-1])
@@ -211,6 +235,7 @@ class DeviceClock:
             edge, at = int(pps[place]), int(host[place]) - int(device[place] - pps[place])
             if latch.device and edge - latch.device[-1] > MAX_BRIDGED_S * SECOND_NS:
                 segment = self._follow_up(segment, int(host[place]))
+                broken.append(place)
             reason = segment.latch.add(edge, at)
             if reason is None:
                 self._edges_used += 1
@@ -219,10 +244,12 @@ class DeviceClock:
             if segment.latch.refused_in_a_row >= REFUSED_IN_A_ROW:
                 segment = self._follow_up(segment, int(host[place]))
                 segment.latch.add(edge, at)
+                broken.append(place)
+        return broken
 
     def _follow_up(self, segment: _Segment, host_ns: int) -> _Segment:
         """A new segment where the chain of latched edges broke."""
-        following = _Segment(host_ns)
+        following = _Segment(host_ns, free=segment.free)
         following.last_pps_ns = segment.last_pps_ns
         self._segments.append(following)
         return following
@@ -271,19 +298,20 @@ class DeviceClock:
         return gps, np.hypot(sigma, scatter)
 
     def _by_latch(self, latch: _Latch, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]] | None:
-        """Piecewise linear between latched edges, by their last rate beyond; None where their second is not known."""
+        """Piecewise linear between latched edges, by their last rate beyond; None where their second is not known.
+
+        One edge alone is none: it may be a register that reads 0 before the first pulse, or a glitch at power-on.
+        """
         knots = np.array(latch.device, dtype=np.int64)
-        if not knots.size:
+        if len(knots) < 2:
             return None
         label = self._label(latch, int(np.searchsorted(knots, np.median(device))))
         if label is None:
             return None
         gps = (np.array(latch.seconds, dtype=np.int64) + label) * SECOND_NS
-        left = np.clip(np.searchsorted(knots, device, side="right") - 1, 0, max(len(knots) - 2, 0))
-        right = np.minimum(left + 1, len(knots) - 1)
-        rate = np.ones(device.shape)
-        if len(knots) > 1:
-            rate = (gps[right] - gps[left]) / (knots[right] - knots[left]).astype(np.float64)
+        left = np.clip(np.searchsorted(knots, device, side="right") - 1, 0, len(knots) - 2)
+        right = left + 1
+        rate = (gps[right] - gps[left]) / (knots[right] - knots[left]).astype(np.float64)
         before, after = device < knots[0], device > knots[-1]
         anchor = np.where(after, len(knots) - 1, left)
         rate = np.where(after, latch.slope(len(knots) - 1), np.where(before, latch.slope(0), rate))
@@ -291,8 +319,6 @@ class DeviceClock:
         near = np.minimum(np.abs(device - knots[left]), np.abs(device - knots[right])).astype(np.float64) / SECOND_NS
         noise = latch.noise_ns()
         variance = noise**2 * (1.0 + 12.0 / SLOPE_KNOTS**3 * near**2) + WANDER_NS**2 * near**3
-        if len(knots) == 1:
-            variance = variance + (MAX_DRIFT / 2 * SECOND_NS * near) ** 2
         return gps[anchor] + np.rint(rate * since).astype(np.int64), np.sqrt(variance)
 
     def _label(self, latch: _Latch, around: int) -> int | None:

@@ -32,18 +32,18 @@ FIRST_NOISE_FACTOR = 1.5  # five edges tell little: rather too much at first
 FIRST_NOISE_NS = 2_000.0  # prior of the stamps' noise, worth two edges beside the first lock's residuals
 
 
-def find_chain(edges: Sequence[int], *, noisy: bool) -> list[tuple[int, int]] | None:
+def find_chain(edges: Sequence[int], train: EdgeTrain | None = None, *, noisy: bool) -> list[tuple[int, int]] | None:
     """Edges of one 1 Hz train that ends with the newest edge: (index from 0, host ns); None where there is none yet.
 
     Neighbours lie whole seconds (up to MAX_CHAIN_GAP_S) ± 200 ppm apart. noisy allows NOISY_TOLERANCE_NS more and asks
-    for more edges.
+    for more edges. What a train there is has taken is not used: knots of two trains may not overlap.
     """
     wanted = NOISY_LOCK_EDGES if noisy else FIRST_LOCK_EDGES
     chain = [(0, edges[-1])]
     for edge in reversed(edges[:-1]):
         index, host = chain[-1]
         gap = round((host - edge) / SECOND_NS)
-        if gap > MAX_CHAIN_GAP_S:
+        if gap > MAX_CHAIN_GAP_S or (train is not None and edge <= train.last_host_ns):
             break
         tolerance = MAX_DRIFT * gap * SECOND_NS + (NOISY_TOLERANCE_NS if noisy else 0)
         if gap >= 1 and abs(host - edge - gap * SECOND_NS) <= tolerance:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from georef.records import TimeScale, TimeTag
-from georef.timescales.gps_time import DAY_NS, table_leap_seconds
+from georef.timescales.gps_time import DAY_NS, gps_ns_from_week, table_leap_seconds, utc_from_gps
 from georef.timescales.labelling import LeapTrust
 
 
@@ -40,6 +40,7 @@ class LeapBook:
 
     def __init__(self, assumed: int | None) -> None:
         self.assumed = assumed
+        self._date: dt.date | None = None  # of the latest message that had one: what is assumed goes by it
         self._said: dict[str, int] = {}
         self._inserted: dict[str, tuple[dt.date, int]] = {}  # source: first day of the new count, the count
 
@@ -66,11 +67,11 @@ class LeapBook:
         """Note what a tag says about leap seconds; the change, where it differs from what was in use."""
         if tag.scale is TimeScale.UTC and tag.date is not None and tag.time_ns >= DAY_NS:
             self._see_second_60(source, tag.date, tag.leap_seconds)
+        self._note_date(tag)
         said = tag.leap_seconds
         if said is None or said == self._said.get(source):
             return None
-        date = tag.date if tag.date is not None else dt.date.max
-        before = self.on(source, date) if date is not dt.date.max else self._latest(source)
+        before = self.on(source, self._date) if self._date is not None else self._latest(source)
         said_before = source in self._said
         self._said[source] = said
         inserted = self._inserted.get(source)
@@ -80,6 +81,13 @@ class LeapBook:
         if before.seconds == said:
             return None
         return LeapChange(source, before.seconds, said, said_before)
+
+    def _note_date(self, tag: TimeTag) -> None:
+        """A leap count is often said without a date (NAV-TIMELS), also in a recording of years ago."""
+        if tag.scale is TimeScale.GPS and tag.week is not None:
+            self._date = utc_from_gps(gps_ns_from_week(tag.week, tag.time_ns), 18)[0]
+        elif tag.date is not None:
+            self._date = tag.date
 
     def _latest(self, source: str) -> LeapSeconds:
         inserted = self._inserted.get(source)

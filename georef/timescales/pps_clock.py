@@ -132,7 +132,7 @@ class PpsClock:
                 return
             self._drop_candidate()
         self._edges_unlocked += 1
-        chain = find_chain(list(self._edges), noisy=self._edges_unlocked > NOISY_AFTER_EDGES)
+        chain = find_chain(list(self._edges), self._train, noisy=self._edges_unlocked > NOISY_AFTER_EDGES)
         if chain is None:
             if self._train is None:
                 self._refuse_edge("no_train_yet")

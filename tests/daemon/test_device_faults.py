@@ -453,3 +453,13 @@ def babble(wire: Wire, data: bytes) -> None:
     for at in range(0, len(data), 460):
         time.sleep(max(0.0, start_s + at / 92_160 - time.monotonic()))
         wire.send(data[at : at + 460])
+
+
+def test_a_device_that_is_still_being_opened_at_the_end_has_lost_nothing(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:  # a gateway that takes connections and says nothing
+        transport = f"can:socketcand:can0?host=127.0.0.1&port={mute.getsockname()[1]}"
+        config = f'{session_table(tmp_path / "logs")}[imu.main]\ntransport = "{transport}"\nprotocol = "canmod-gps"\n'
+        with Recorder(tmp_path, config) as recorder:
+            with mute.accept()[0]:
+                assert recorder.stop() == 0
+    assert "stuck" not in recorder.stderr()

@@ -121,6 +121,11 @@ def test_clock_sample_has_the_three_clocks() -> None:
     assert -500 <= sample["frequency_ppm"] <= 500
 
 
+def test_a_clock_sample_says_the_greatest_error_of_a_wall_clock_that_is_kept() -> None:
+    assert read_clock_sample(ClockDiscipline(0.0, 0, 0.01))["max_error_s"] == 0.01
+    assert "max_error_s" not in read_clock_sample(ClockDiscipline(0.0, STA_UNSYNC, 0.01))
+
+
 def test_discipline_needs_sync_and_a_bounded_error() -> None:
     assert ClockDiscipline(0.0, 0, 0.01).disciplined
     assert not ClockDiscipline(0.0, STA_UNSYNC, 0.01).disciplined

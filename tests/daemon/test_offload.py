@@ -204,12 +204,36 @@ def test_verify_reads_again_and_finds_what_changed(logs: Path, disk: Path) -> No
     path = logs / "flight_0.mcap"
     write_part(path)
     run_all(logs, disk)
+    copied = (disk / path.name).stat()
     data = bytearray((disk / path.name).read_bytes())
     data[1000] ^= 1
     (disk / path.name).write_bytes(data)
+    os.utime(disk / path.name, ns=(copied.st_atime_ns, copied.st_mtime_ns))  # a disk that forgets changes no time
     assert offload_json(logs, disk)[0] == 0
     code, report, _ = offload_json(logs, disk, "--verify")
     assert (code, report["may_be_deleted"]) == (4, [])
+
+
+def test_another_log_of_the_same_name_and_size_is_not_taken_for_the_one_that_was_copied(
+    logs: Path, disk: Path, tmp_path: Path
+) -> None:
+    """An import made anew has the name of the one before, and may be as long."""
+    path = logs / "flight_0.mcap"
+    write_part(path)
+    run_all(logs, disk)
+    others = tmp_path / "others"
+    others.mkdir()
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 1
+    other = others / path.name
+    other.write_bytes(data)
+    later_ns = path.stat().st_mtime_ns + 60_000_000_000
+    os.utime(other, ns=(later_ns, later_ns))
+    code, report, stderr = offload_json(others, disk)
+    assert (code, report["may_be_deleted"], report["there"]) == (4, [], [])
+    assert "is there and is not" in stderr
+    os.utime(path, ns=(later_ns, later_ns))  # the log itself, its time changed by whoever: compared, and found there
+    assert offload_json(logs, disk)[1]["may_be_deleted"] == [str(path)]
 
 
 def test_a_log_that_a_crash_left_open_is_copied_and_said(logs: Path, disk: Path) -> None:

@@ -312,6 +312,18 @@ def test_sentence_says_what_an_operator_must_know() -> None:
     assert "begins" in sentence("s", 0, WriterHealth())
 
 
+def test_the_time_left_is_that_until_the_reserve_where_recording_stops(bench: Bench) -> None:
+    settings = RecorderSettings(1 << 30, 1800.0, 1.0, 1000)
+    channels, clock = ChannelTable(), HostClock()
+    recorder = Recorder(bench.parts, settings, bench.queue, channels, bench.events, clock, lambda source: {})
+    assert recorder.health.reserve_bytes == 1000
+    health = health_of(gnss_rover={})
+    health.reserve_bytes = 99_400_000_000
+    assert sentence("s", 0, health).endswith("100.0 GB free (1 min)")
+    health.reserve_bytes = 200_000_000_000
+    assert sentence("s", 0, health).endswith("100.0 GB free (0 s)")
+
+
 def test_a_device_that_is_long_in_opening_is_told_and_restarts_nothing() -> None:
     """A caster's name that is looked up for a minute must not cost the scanner's data."""
     now_ns = 100_000_000_000

@@ -91,7 +91,7 @@ def test_what_cannot_be_done_is_one_line(logs: Path, tmp_path: Path) -> None:
         ([str(tmp_path / "empty")], "no logs"),
         ([str(tmp_path / "text.mcap")], "text.mcap"),
         (["--keep-free-mb", "1e9", str(logs / CUT)], "needed to recover"),
-        (["--output", str(tmp_path / "absent"), str(logs / CUT)], "No such file"),
+        (["--output", str(tmp_path / "absent"), str(logs / CUT)], f"{tmp_path / 'absent'}: No such file"),
     ]
     for arguments, words in cases:
         result = swath("recover", *arguments)

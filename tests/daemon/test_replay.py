@@ -19,6 +19,7 @@ import can
 import pytest
 
 from daemon.wire_player import Output, PtyOutput, TimedUnit, play
+from drivers.transports.base import TransportError
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 from tests.daemon.test_cli import ROOT
@@ -169,6 +170,23 @@ def test_a_port_that_nobody_reads_does_not_hold_up_the_rest(tmp_path: Path) -> N
     assert time.monotonic() - started < 30  # waited for once, not two hundred times
     output.close()
     assert not (tmp_path / "port").is_symlink()
+
+
+def test_a_link_to_a_device_is_left_alone_and_one_that_a_killed_replay_left_is_replaced(tmp_path: Path) -> None:
+    """Played with the aircraft's own configuration, udev's name of the receiver must not be lost."""
+    link = tmp_path / "rover"
+    link.symlink_to("/dev/null")
+    with pytest.raises(TransportError, match="is no link to a pseudo-terminal"):
+        PtyOutput(link)
+    assert link.readlink() == Path("/dev/null")
+    for left in ("/dev/pts/ptmx", "/dev/pts/999999"):
+        link.unlink()
+        link.symlink_to(left)
+        output = PtyOutput(link)
+        assert link.readlink() != Path(left)
+        output.close()
+        assert not link.is_symlink()
+        link.symlink_to(left)
 
 
 class Dues(Output):

@@ -275,6 +275,33 @@ def test_slcan_unplugged(adapter: SlcanAdapter) -> None:
     adapter.transport.close()
 
 
+@pytest.mark.parametrize(
+    ("interface", "cut_off", "whole"),
+    [
+        ("serial", "aa010203", "aa00000000" + "02" + "23010000" + "aabb" + "bb"),
+        ("seeedstudio", "aac223", "aac2" + "2301" + "aabb" + "55"),
+    ],
+)
+def test_a_binary_frame_that_is_cut_off_is_counted_and_the_next_one_comes(
+    interface: str, cut_off: str, whole: str
+) -> None:
+    """An adapter that resets, or a line that loses bytes, must not end the thread that reads it."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    transport = PythonCanTransport(parse_transport(f"can:{interface}:{os.ttyname(slave)}?timeout=0.05"))
+    transport.open()
+    try:
+        os.write(master, bytes.fromhex(cut_off))
+        assert transport.receive(1.0) == []
+        assert transport.counters.refused == 1
+        os.write(master, bytes.fromhex(whole))
+        assert frames(collect(transport, 1)) == [encode_can_frame(0x123, b"\xaa\xbb")]
+    finally:
+        transport.close()
+        os.close(master)
+        os.close(slave)
+
+
 # ---- what every bus must do
 
 
@@ -425,3 +452,46 @@ def test_a_damaged_link_message_never_raises(cut: Callable[[bytes, int], bytes])
 def test_interfaces_without_a_bitrate() -> None:
     assert interface_bitrate("lo") is None
     assert interface_bitrate("nosuch0") is None
+
+
+# ---- socketcand on loopback
+
+
+def test_a_gateway_that_closes_is_noticed_and_comes_back() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as gateway:
+        gateway.settimeout(10.0)
+
+        def greet() -> socket.socket:
+            gateway.accept()[0].close()  # asked whether it is there
+            connection, _ = gateway.accept()
+            connection.sendall(b"< hi >")
+            for _ in ("open", "rawmode"):
+                connection.recv(100)
+                connection.sendall(b"< ok >")
+            return connection
+
+        port = gateway.getsockname()[1]
+        for _ in range(2):
+            transport = PythonCanTransport(parse_transport(f"can:socketcand:can0?host=127.0.0.1&port={port}"))
+            opening = threading.Thread(target=transport.open, daemon=True)
+            opening.start()
+            with greet() as connection:
+                opening.join()
+                assert transport.receive(0.05) == []
+                connection.sendall(b"< frame 123 1.5 AABB >")
+                assert frames(collect(transport, 1)) == [encode_can_frame(0x123, b"\xaa\xbb")]
+                connection.sendall(b"< frame 124 1.5 CC >")
+            assert frames(collect(transport, 1)) == [encode_can_frame(0x124, b"\xcc")]
+            with pytest.raises(TransportError, match="the gateway closed the connection"):
+                transport.receive(5.0)
+            transport.close()
+
+
+def test_a_gateway_that_is_not_there_is_asked_once(caplog: pytest.LogCaptureFixture) -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        port = nobody.getsockname()[1]
+        transport = PythonCanTransport(parse_transport(f"can:socketcand:can0?host=127.0.0.1&port={port}"))
+        with pytest.raises(TransportError, match="cannot open the CAN bus: Connection refused"):
+            transport.open()
+    assert not [record for record in caplog.records if "Failed to connect" in record.message]

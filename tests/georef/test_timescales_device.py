@@ -152,6 +152,25 @@ def test_a_first_latch_that_was_none() -> None:
     assert np.max(np.abs(errors_ns(clock, np.arange(30.0, 59.0, 0.1)))) < 300
 
 
+@pytest.mark.parametrize("pulses_from_s", [40.0, math.inf])
+def test_a_register_that_reads_zero_before_the_first_pulse_is_no_edge(pulses_from_s: float) -> None:
+    """The device was switched on 0.2 s after a whole second; its latch reads 0 until a pulse comes, if one does."""
+    times = np.arange(20.003, 60.0, 0.02)
+    rows = rows_of(times)
+    switched_on_ns = int(device_ns(5.2))
+    for column in ("device_time_ns", "pps_time_ns"):
+        rows[column] -= switched_on_ns
+    rows["pps_time_ns"][times < pulses_from_s] = 0
+    rows["pps_count"] = -1
+    clock = DeviceClock(host_clock(120), keep_history=True)
+    clock.add(rows)
+    gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
+    error = np.abs(gps - START_S * NS - np.rint(times * NS))
+    assert np.all(error < 4.0 * sigma)
+    assert np.all(sigma < 3e6)
+    assert np.all(sigma[times > pulses_from_s + 5.0] < 1e4)
+
+
 def test_restart_is_a_new_segment() -> None:
     """The counter starts again from little: the host time chooses the segment; both are right."""
     times = np.arange(20.003, 60.0, 0.02)
@@ -167,6 +186,27 @@ def test_restart_is_a_new_segment() -> None:
     gps, _ = clock.gps_from_device(device_ns(times + 50.0) - reset)
     late = gps[100:1900] - START_S * NS - np.rint((times[100:1900] + 50.0) * NS)
     assert np.max(np.abs(late)) < 300
+
+
+@pytest.mark.parametrize("latched", [False, True])
+@pytest.mark.parametrize(("silent_s", "ahead_s"), [(0.02, 20.123), (0.02, 1.7e9), (60.0, -20.123)])
+def test_device_time_that_jumps_is_a_new_segment(silent_s: float, ahead_s: float, latched: bool) -> None:
+    """Set to another scale, or restarted while nothing came and further on by now: what host time contradicts."""
+    times = np.arange(20.003, 60.0, 0.02)
+    after = np.arange(times[-1] + silent_s, times[-1] + silent_s + 60.0, 0.02)
+    rows, later = rows_of(times, latched=latched), rows_of(after, latched=latched)
+    later["device_time_ns"] += round(ahead_s * NS)
+    if latched:
+        later["pps_time_ns"] += round(ahead_s * NS)
+    rows, times = np.concatenate((rows, later)), np.concatenate((times, after))
+    rows["pps_count"] = -1
+    for step in (len(rows), 37):
+        clock = DeviceClock(host_clock(200), keep_history=True)
+        for start in range(0, len(rows), step):
+            clock.add(rows[start : start + step])
+        gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
+        assert np.all(np.abs(gps - START_S * NS - np.rint(times * NS)) < 4.0 * sigma + 300)
+        assert clock.status().segments == 2
 
 
 def test_label_that_comes_late_reaches_the_past() -> None:
@@ -221,11 +261,31 @@ def test_hour_stamps_while_locked_only() -> None:
     assert np.all(sigma[~locked] > 1e6)
 
 
-def test_hour_stamps_that_contradict_the_clock_are_refused() -> None:
-    """A head that says locked but is 5 s off is not believed; refusals are counted."""
+def test_a_head_that_loses_its_pulse_is_not_called_latched_meanwhile() -> None:
+    """A head whose second is the edge while locked drifts by 20 ppm for a minute, then is set right again: 1.2 ms."""
+    times = np.arange(20.003, 160.0, 0.02)
+    free = (times >= 60.0) & (times < 120.0)
+    rows = rows_of(times, latched=False)
+    rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * (times - 60.0), 0.0)) * NS)
+    rows["locked"] = ~free
+    rows["pps_time_ns"] = np.where(free, -1, rows["device_time_ns"] // NS * NS)
+    for step in (len(rows), 37):
+        clock = DeviceClock(host_clock(180), keep_history=True)
+        for start in range(0, len(rows), step):
+            clock.add(rows[start : start + step])
+        gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
+        error = np.abs(gps - START_S * NS - np.rint(times * NS))
+        assert np.all(error < 4.0 * sigma + 300)
+        assert np.all(sigma[free] > 1e6)
+        assert np.max(error[~free]) < 300
+
+
+@pytest.mark.parametrize("off_s", [5.0, 1.0, -1.0])
+def test_hour_stamps_that_contradict_the_clock_are_refused(off_s: float) -> None:
+    """A head that says locked but is seconds off (by its receiver's old leap count) is not believed, but counted."""
     times = np.arange(100.0, 200.0, 0.5)
     rows = rows_of(times, latched=False, locked=1)
-    rows["device_time_ns"] = np.rint((times + 5.0) * 1e6).astype(np.int64) * 1000
+    rows["device_time_ns"] = np.rint((times + off_s) * 1e6).astype(np.int64) * 1000
     clock = DeviceClock(host_clock(220), past_utc_hour=True)
     clock.add(rows)
     _, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])

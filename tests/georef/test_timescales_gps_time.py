@@ -137,9 +137,9 @@ def test_complete_time_refuses_what_cannot_be() -> None:
     )
 
 
-@given(gps_times, st.integers(-900, 900))
+@given(gps_times, st.integers(-450, 900))
 def test_hour_stamps_find_their_hour(gps: int, off_ms: int) -> None:
-    """Stamps past the UTC hour, across the hour's turn: placed within ± 30 min, believed within 1 s."""
+    """Stamps past the UTC hour, across the hour's turn: placed within ± 30 min, believed up to 1 s old, 0.5 s ahead."""
     gps += WEEK_NS
     past = np.array([(gps - 18 * SECOND_NS) % HOUR_NS])
     placed, believed = gps_ns_past_hour(past, np.array([gps + off_ms * 1_000_000]), 18)

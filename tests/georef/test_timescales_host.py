@@ -158,3 +158,20 @@ def test_time_is_monotone_and_continuous_across_a_relock() -> None:
     gps, _ = clock.gps_from_host(hosts)
     assert np.all(np.diff(gps) > 0)
     assert np.max(np.abs(np.diff(gps) / np.diff(hosts) - 1.0)) < 0.03
+
+
+def test_edges_that_move_a_little_spoil_no_second_before_them() -> None:
+    """The receiver sets its pulse by 0.5 ms: near enough to what was that a chain could run through both."""
+    clock = PpsClock(18, keep_history=True)
+    true = np.arange(200) * NS
+    edges = true + 10**13 + np.where(np.arange(200) >= 100, 500_000, 0)
+    week, of_week = divmod(START, 604_800)
+    for second, edge in enumerate(edges.tolist()):
+        clock.add_edge(edge)
+        tag = TimeTag(TimeScale.GPS, (of_week + second) * NS, week)
+        clock.add_message("gnss/rover", TimeMessage(edge + 10**8, tag, NamesEdge.PREVIOUS, message="TIME"))
+    assert "pps_relocked" in [event.code for event in clock.drain_events()]
+    asked = np.arange(60.0, 99.0, 0.25)
+    gps, sigma = clock.gps_from_host(10**13 + np.rint(asked * NS).astype(np.int64))
+    assert np.max(sigma) < 5_000
+    assert np.max(np.abs(gps - START * NS - np.rint(asked * NS))) < 1_000

@@ -6,6 +6,7 @@ The recordings carry no arrival times, so the edges are put where the receiver's
 
 from __future__ import annotations
 
+import datetime as dt
 import gzip
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,8 @@ import pytest
 
 from drivers.core.parser import DeviceSettings
 from drivers.core.registry import find_driver
-from georef.records import Chunk, NamesEdge, TimeMessage
-from georef.timescales import SECOND_NS, PpsClock, TimeState, whole_gps_ns
+from georef.records import Chunk, NamesEdge, TimeMessage, TimeScale, TimeTag
+from georef.timescales import HOUR_NS, SECOND_NS, PpsClock, TimeState, gps_ns_from_utc, week_from_gps, whole_gps_ns
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 HOST_0 = 10**13
@@ -69,3 +70,27 @@ def test_all_messages_name_the_same_second(name: str, protocol: str, kinds: set[
     assert [event.code for event in clock.drain_events()] == ["second_known"]
     assert "unplaced" not in status.messages_refused
     assert kinds <= voters
+
+
+@pytest.mark.parametrize(("year", "leap"), [(2014, 16), (2016, 17), (2026, 18)])
+def test_a_leap_count_said_without_a_date_is_compared_with_that_of_the_recordings_day(year: int, leap: int) -> None:
+    """RMC labels the edges by the table; NAV-TIMELS, which has no date, then says the same count: nothing moves."""
+    date = dt.date(year, 5, 10)
+    start_ns = gps_ns_from_utc(date, 12 * HOUR_NS, leap)
+    clock = PpsClock()
+    for second in range(90):
+        edge_ns = HOST_0 + second * SECOND_NS
+        clock.add_edge(edge_ns)
+        tag = TimeTag(TimeScale.UTC, 12 * HOUR_NS + second * SECOND_NS, date=date)
+        clock.add_message("gnss/rover", TimeMessage(edge_ns + 150_000_000, tag, NamesEdge.PREVIOUS, message="RMC"))
+        if second >= 40:
+            time_ns = week_from_gps(start_ns + second * SECOND_NS)[1]
+            tag = TimeTag(TimeScale.GPS, time_ns, leap_seconds=leap)
+            message = TimeMessage(edge_ns + 160_000_000, tag, NamesEdge.PREVIOUS, message="NAV-TIMELS")
+            clock.add_message("gnss/rover", message)
+        status = clock.status(edge_ns + 500_000_000)
+        if second > 5:
+            assert status.state is TimeState.LOCKED
+            assert status.offset_ns is not None
+            assert abs(HOST_0 + status.offset_ns - start_ns) < 1_000_000
+    assert [event.code for event in clock.drain_events()] == ["second_known"]
