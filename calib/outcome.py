@@ -63,7 +63,13 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class GroupFit:
-    """A group of observations as a whole: variance component and what it contributes."""
+    """A group of observations as a whole: variance component and what it contributes.
+
+    Attributes:
+        observations: all of them, those that were rejected too.
+        rms_m: of those that were kept.
+        rejected: so many of all.
+    """
 
     group: str
     observations: int

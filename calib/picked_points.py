@@ -7,7 +7,7 @@ import io
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,20 @@ def picked_ties(flight: Flight, picked: Sequence[Picked], settings: PickedSettin
         else:
             refused["picked: seen in one strip only"] += 1
     return Features(ties=tuple(ties), refused=+refused)
+
+
+def carried(picked: Features, picked_in: Flight, flight: Flight) -> Features:
+    """Picked tie points where they would have been picked in the same returns as another calibration places them.
+
+    An adjustment takes points as measured where the flight's returns lie: picks are of the files that a user had.
+    """
+
+    def seen(one: Sighting) -> Sighting:
+        moved_t = flight.swaths[one.swath].points_t[one.at] - picked_in.swaths[one.swath].points_t[one.at]
+        return replace(one, point_t=one.point_t + moved_t)
+
+    ties = tuple(replace(tie, sightings=tuple(map(seen, tie.sightings))) for tie in picked.ties)
+    return replace(picked, ties=ties)
 
 
 def _swath(flight: Flight, one: Picked) -> int:

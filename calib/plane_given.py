@@ -22,6 +22,7 @@ Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]
 _DEFAULT = PlaneSettings()
 _TRIALS = 200
 _SEED = 1981
+_LONGEST_M = 2_000.0  # east or north: no face is as large, and cells of its box would fill the memory
 _SHARE_LEAST = 0.7  # of the returns in a polygon that lie on its plane
 
 
@@ -36,7 +37,7 @@ def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEF
         settings: of the tests.
 
     Raises:
-        PlaneError: a polygon has fewer than three corners, or two have the same name.
+        PlaneError: a polygon has fewer than three corners, or is no face for its size, or two have the same name.
     """
     rings = _checked(polygons)
     cell_m = cell_size(flight, settings)
@@ -64,6 +65,10 @@ def _checked(polygons: Rings) -> dict[str, FloatArray]:
         corners = np.asarray(ring, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or not np.isfinite(corners).all():
             raise PlaneError(f"polygon {name}: got corners of shape {corners.shape}, want (k, 2) numbers, k at least 3")
+        east_m, north_m = np.ptp(corners, axis=0).tolist()
+        if max(east_m, north_m) > _LONGEST_M:
+            size = f"{east_m:,.0f} m by {north_m:,.0f} m"
+            raise PlaneError(f"polygon {name}: got {size}, want about one face, at most {_LONGEST_M:,.0f} m a side")
         if name in rings:
             raise PlaneError(f"polygon {name}: there are two of this name; want each name once")
         rings[name] = corners

@@ -176,8 +176,8 @@ def _on_ties(solution: Solution) -> tuple[Residuals, float]:
     ties, square = solution.ties, 0.0
     rot = ties.rows.flight.frame.rot_t_from_e
     columns: list[tuple[FloatArray, ...]] = []
-    where = []
-    for (tie, sighting), seen, weight in zip(ties.order, ties.seen(solution.state), solution.tie_weight, strict=True):
+    where, weights = [], solution.tie_weight.tolist()  # of single precision the sum would be, too, which no JSON takes
+    for (tie, sighting), seen, weight in zip(ties.order, ties.seen(solution.state), weights, strict=True):
         where += [(tie, sighting.swath, sighting.at)] * 3
         if seen is None:
             columns.append((np.full(3, np.nan), np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3)))
@@ -270,7 +270,7 @@ def _pseudo(solution: Solution) -> list[GroupFit]:
 
 
 def _fit(residuals: Residuals, square: float | None) -> GroupFit:
-    sums = np.zeros(5)  # observations, redundancy, Σ p (e / σ)², Σ e², rejected
+    sums = np.zeros(5)  # observations that were kept, redundancy, Σ p (e / σ)², Σ e², rejected
     for begin in range(0, len(residuals.weight), BLOCK):
         mine = slice(begin, begin + BLOCK)
         kept = residuals.weight[mine] > 0.0
@@ -279,7 +279,8 @@ def _fit(residuals: Residuals, square: float | None) -> GroupFit:
         sums += kept.sum(), free.sum(), (weight * (error / sigma) ** 2).sum(), (error**2).sum(), (~kept).sum()
     count, redundancy, squares, errors, rejected = sums.tolist()
     rms = float(np.sqrt(errors / count)) if count else 0.0
-    return _group(residuals.group, int(count), redundancy, squares if square is None else square, rms, int(rejected))
+    every, rejects = int(count + rejected), int(rejected)
+    return _group(residuals.group, every, redundancy, squares if square is None else square, rms, rejects)
 
 
 def _group(name: str, count: int, redundancy: float, square: float, rms: float, rejected: int = 0) -> GroupFit:

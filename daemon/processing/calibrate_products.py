@@ -302,9 +302,10 @@ def _lines(done: Calibrated, knots: Sequence[float], before: StripReport, after:
         lines.append(f"not estimated: {held.scanner} {key_of(held.name, knots)[0]}: {held.why}{remedy}")
     planes, ties = len(done.features.planes), len(done.features.ties)
     seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
-    lines.append(
-        f"{' and '.join(seen)}, redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
-    )
+    control = sum(len(plane.control) for plane in done.features.planes)
+    used = f", {control} of {len(done.control)} control points" if done.control else ""
+    fit = f"redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
+    lines.append(f"{' and '.join(seen)}{used}, {fit}")
     rms = [report.all.height.rms_m for report in (before, after)]
     lines.append(f"strips differ by {rms[0]:.3f} m (RMS) before, {rms[1]:.3f} m after")
     lines += _profile_lines(done.check)

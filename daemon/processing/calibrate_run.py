@@ -27,7 +27,7 @@ from calib.normals import NormalError
 from calib.outcome import Adjusted
 from calib.parameters import ParameterError
 from calib.parameters import Wish as Model
-from calib.picked_points import PickedError
+from calib.picked_points import PickedError, carried
 from calib.plane_given import given_planes
 from calib.plane_matching import rematch
 from calib.plane_search import find_planes
@@ -157,7 +157,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     notes = _doubts(flight, points)
     tell("planes", 0, 1)
     rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
-    picked = [] if wish.ties is None else [ties_of(wish.ties, kept)]
+    picked = Features() if wish.ties is None else ties_of(wish.ties, kept)
 
     def search() -> Features:
         if rings is not None:
@@ -169,9 +169,12 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
         with ThreadPoolExecutor(workers) as pool:
             return rematch(flight, planes, PLANES, pool.map)
 
+    def observed() -> Features:
+        return Features.joined([_features(wish, flight, planes, points), carried(picked, kept.flight, flight)])
+
     planes, searched = search(), 1
     refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)
-    features = Features.joined([_features(wish, flight, planes, points), *picked])
+    features = observed()
     prior = prior_of(kept)
 
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
@@ -181,12 +184,13 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
         # once more: roofs at a swath's edges that the pre-alignment left apart lie on each other now
         again = searched == 1 or rings is not None
         planes, searched = search() if again else match(), searched + 1
-        features = Features.joined([_features(wish, flight, planes, points), *picked])
+        features = observed()
         return features
 
     tell("adjustment", 0, 1)
     adjusted = adjust(flight, features, wish.model, prior, start=start, rematch=found_anew)
     _refuse_far(wish, kept.flight, adjusted)
+    refuse_lost_control(wish.control, features)
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
@@ -239,6 +243,14 @@ def refuse_no_planes(log: str, planes: Features) -> None:
         f"{log}: no plane is seen by two strips ({why or 'no candidates'}); want strips that overlap over roofs and "
         "open ground, with some 2 returns a square metre"
     )
+
+
+def refuse_lost_control(control: Path | None, features: Features) -> None:
+    """UserError where control is given, and none of it says anything."""
+    if control is None or any(plane.control for plane in features.planes):
+        return
+    why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
+    raise UserError(f"{control}: no point lies on ground that a strip shows as a plane ({why or 'no returns'})")
 
 
 # ---------------------------------------------------------------------- observations

@@ -28,7 +28,7 @@ from calib.strips import StripReport, differences
 from daemon.errors import ExitCode, UserError
 from daemon.places import nearest_there
 from daemon.processing.calibrate_inputs import control_of
-from daemon.processing.calibrate_run import PLANES, refuse_no_planes
+from daemon.processing.calibrate_run import PLANES, refuse_lost_control, refuse_no_planes
 from daemon.processing.calibration_flight import KeptFlight, read_flight, refuse_without_noise, replaced
 from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import Wish
@@ -174,7 +174,7 @@ def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     first = adjust_strips(flight, features, calibrations, replace(wish.settings, linearisations=1))
     tell("planes again", 0, 1)  # what errors of the trajectory had left apart lies on each other now
     features = features_of(moved(first, "matched"))
-    _refuse_lost_control(wish, features)
+    refuse_lost_control(wish.control, features)
     tell("adjustment", 0, 1)
     adjusted = adjust_strips(flight, features, calibrations, wish.settings)
     tell("strips before and after", 0, 1)
@@ -200,13 +200,6 @@ def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
                 "want --calibration FILE of swath calibrate",
                 ExitCode.USAGE,
             )
-
-
-def _refuse_lost_control(wish: AdjustWish, features: Features) -> None:
-    if wish.control is None or any(plane.control for plane in features.planes):
-        return
-    why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
-    raise UserError(f"{wish.control}: no point lies on ground that a strip shows as a plane ({why or 'no returns'})")
 
 
 def _notes(wish: AdjustWish, flight: Flight, features: Features, before: StripReport) -> list[str]:

@@ -216,6 +216,8 @@ def _written(wish: ValidateWish, found: _Found) -> Validated:
         for one in found.histories:
             lines += _table(one) + list(one.sentences)
             wrong += list(one.sentences) if one.moved else []
+        if found.validation is None and not any(one.steps for one in found.histories):
+            wrong += [sentence for one in found.histories for sentence in one.sentences]  # nothing could be tested
     record["notes"] = found.notes
     record = finite(record)
     if wish.output is not None:

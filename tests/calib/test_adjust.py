@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -217,6 +218,8 @@ def test_tie_points_alone_find_the_truth() -> None:
     noisy = adjust(built.flight, Features(ties=tied(built, 0.05, 2)), Wish(), prior)
     assert (np.abs(noisy.values - built.truth.parameters[:4]) < 3.5 * noisy.sigmas).all()
     assert 0.8 < noisy.variance_factor < 1.2
+    figures = [noisy.variance_factor, noisy.global_test, *((one.variance_factor, one.rms_m) for one in noisy.groups)]
+    assert json.loads(json.dumps(figures))
 
 
 def test_a_wrong_sighting_is_taken_out() -> None:
@@ -232,6 +235,8 @@ def test_a_wrong_sighting_is_taken_out() -> None:
     taken = np.flatnonzero(residuals.weight == 0.0)
     assert set(residuals.feature[taken]) == {3}
     assert set(residuals.swath[taken]) == {first.swath}
+    (of_ties,) = (one for one in found.groups if one.group == "ties")
+    assert (of_ties.observations, of_ties.rejected) == (len(residuals.weight), len(taken))  # rejected of all
     assert (np.abs(found.values - good.values) < 0.5 * good.sigmas).all()
 
 

@@ -312,6 +312,7 @@ def test_a_polygon_over_a_ridge_is_mixed(cast: Cast, flight: Flight) -> None:
     [
         ([("a", [[0, 0], [1, 1]])], r"polygon a: got corners of shape \(2, 2\), want \(k, 2\)"),
         ([("a", [[0, 0], [1, 1], [1, 0]])] * 2, "polygon a: there are two of this name"),
+        ({"a": [[0, 0], [20, 0], [-5e5, -5e6]]}, "polygon a: got 500,020 m by 5,000,000 m, want about one face"),
     ],
 )
 def test_a_wrong_polygon_is_told(flight: Flight, polygons: list[tuple[str, FloatArray]], text: str) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib.features import Features, Patch, Plane, TiePoint
 from calib.flight import Flight, Head, Swath, Tangent
-from calib.picked_points import PickedError, PickedSettings, picked_ties, read_picked
+from calib.picked_points import PickedError, PickedSettings, carried, picked_ties, read_picked
 from calib.tie_points import TieSettings, find_ties, fit_patch, meet
 from georef.beams import LineGeometry
 from georef.calibration import nominal
@@ -200,6 +200,16 @@ def test_file_of_picked_points() -> None:
         "picked: no return of the strip near it": 1,
         "picked: seen in one strip only": 2,
     }
+
+
+def test_picked_points_go_with_their_returns() -> None:
+    flight, _ = roof(1, SHIFTS)
+    picked = picked_ties(flight, read_picked(TEXT, "ties.csv"))
+    away = np.array([3.0, -2.0, 0.5])
+    second = replace(flight.swaths[1], points_t=flight.swaths[1].points_t + away)
+    again = carried(picked, flight, replace(flight, swaths=(flight.swaths[0], second, *flight.swaths[2:])))
+    (tie,) = again.ties
+    np.testing.assert_allclose([one.point_t for one in tie.sightings], [[0.0, 1.0, 5.3], [3.3, -1.2, 5.9]])
 
 
 def test_sighting_far_from_the_others_is_counted() -> None:

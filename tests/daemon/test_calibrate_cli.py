@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
+from scipy.spatial import cKDTree
 
 from calib.features import Features, Plane
 from calib.parameters import Wish
@@ -21,6 +22,7 @@ from daemon.processing.calibrate_run import refuse_no_planes
 from daemon.processing.calibration_plan import PlanWish, plan_calibration
 from daemon.processing.warm_calibration import warm_calibration
 from georef.calibration import Calibration, read_calibration
+from georef.mapping import Mapping
 from sim.plan import parse_plan
 from tests.calib.village import Made, village
 
@@ -170,6 +172,52 @@ def test_the_plan_says_beforehand_what_the_flight_gives(made: Made, tmp_path: Pa
     for name, predicted in zip(names, planned.predicted.sigmas, strict=True):
         sigma = found.sigmas[list_of(name.removeprefix("left."))]
         assert 0.75 < predicted / sigma < 1.25, name
+
+
+def test_control_that_lies_on_nothing_is_refused(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two points, too few to be doubted as a whole."""
+    lines = (made.flown.folder / "control.csv").read_text().splitlines()
+    points = [line.split(",") for line in lines[1:]]
+    control = tmp_path / "control.csv"
+    raised = [",".join((name, lat, lon, f"{float(h) + 150.0:.3f}", sigma)) for name, lat, lon, h, sigma in points[:2]]
+    control.write_text("\n".join([lines[0], *raised]) + "\n")
+    output = tmp_path / "left.toml"
+    line = refused(capsys, output, arguments(made, output, "--control", str(control)))
+    assert "control.csv: no point lies on ground that a strip shows as a plane" in line
+
+
+def picked(made: Made, path: Path) -> Path:
+    """Forty places on roofs and ground, as the strips' points show them with the calibration to start from."""
+    flight, truth = made.flight, made.at_truth()
+    mapping = Mapping("EPSG:25832", datum="same")
+    mapping.settle(flight.frame.origin_e[np.newaxis])
+    trees = [cKDTree(swath.points_t) for swath in truth.swaths]
+    rows = ["name,strip,x,y,z,sigma_m"]
+    for number, place_t in enumerate(truth.swaths[0].points_t[:: len(truth.swaths[0]) // 40]):
+        for swath, true, tree in zip(flight.swaths, truth.swaths, trees, strict=True):
+            away_m, at = tree.query(place_t)
+            if away_m < 0.6:
+                place_e = flight.frame.e_from_t((swath.points_t[at] + place_t - true.points_t[at])[np.newaxis])
+                x, y, z = mapping.map_from_e(place_e)[0]
+                rows.append(f"p{number},{swath.strip},{x:.3f},{y:.3f},{z:.3f},0.02")
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_points_picked_before_the_calibration_fit_after_it(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, ties = tmp_path / "left.toml", picked(made, tmp_path / "ties.csv")
+    control = ("--control", str(made.flown.folder / "control.csv"))
+    assert run_app(arguments(made, output, "--ties", str(ties), *control)) == 0
+    assert "rejected" not in capsys.readouterr().out
+    found = read_calibration(output.read_text(), "left.toml")
+    for name in (*ANGLES, "range_offset_m"):
+        sigma = found.sigmas[list_of(name)]
+        assert sigma > 0.0, name
+        assert abs(found.value(name) - made.truth.value(name)) < 3.0 * sigma, name
 
 
 def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:

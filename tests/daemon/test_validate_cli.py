@@ -82,6 +82,16 @@ def test_a_history_that_stayed_is_fine(tmp_path: Path, capsys: pytest.CaptureFix
     assert "0.1009 ± 0.0010" in told
 
 
+def test_a_history_in_which_nothing_can_be_tested_is_a_problem(tmp_path: Path) -> None:
+    first = file_of(tmp_path / "c1.toml", boresight(0.1))
+    with pytest.raises(UserError, match="fewer than two calibrations with sigmas: no drift can be tested") as caught:
+        run(str(first), "--history", str(first))
+    assert caught.value.exit_code == ExitCode.PROBLEM
+    second = file_of(tmp_path / "c2.toml", boresight(0.1).changed(scan_plane_tilt_rad=1e-3), 2)
+    with pytest.raises(UserError, match="not judged between 2026-01-01 and 2026-02-01: scan_plane_tilt_deg, held"):
+        run(str(second), "--history", str(first))
+
+
 # ---------------------------------------------------------------------- logs
 
 
