@@ -228,8 +228,12 @@ class _Case:
                 del self.partner[at]
 
     def told(self, at: int) -> Held:
-        """In words."""
-        active = sorted([*self._active(), at])
+        """In words, beside what it was given up for: where that is held as well, it alone would look determined."""
+        free, other = set(self._active()), at
+        while other in self.partner and other not in free:
+            free.add(other)
+            other = self.partner[other]
+        active = sorted(free)
         sigma, rho = self._figures(active)
         here = active.index(at)
         own = np.abs(rho[here]) * self._of_one_head[at, active]

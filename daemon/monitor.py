@@ -69,7 +69,7 @@ class Monitor:
         if part is None or (before is not None and before.info.session_id == part.info.session_id):
             return
         self._sources.clear()
-        self._newest_ns = 0
+        self._newest_ns = self._damaged = 0
         drivers, self._notes = stored_drivers(part.attachments) if self._decode else ({}, [])
         for source, make_parser in drivers.items():
             self._sources[source] = SourceWatch(source, Decoding(make_parser))
@@ -143,11 +143,15 @@ class Monitor:
             "sources": sources,
             "bytes_per_s": round(rate),
             **room,
-            "damaged_chunks": self._damaged + (0 if self._part is None else self._part.damaged),
+            "damaged_chunks": self._damaged_chunks,
             "events": list(self._events),
             "notes": self._notes,
         }
         return found | {"sentence": _sentence(found)}
+
+    @property
+    def _damaged_chunks(self) -> int:
+        return self._damaged + (0 if self._part is None else self._part.damaged)
 
     def _now_ns(self, session: SessionInfo) -> int:
         """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
@@ -204,6 +208,8 @@ class Monitor:
             if "decoded" in values and (told := decoded_trouble(values["decoded"])):
                 words.append(told if words[0] else f"{source} {told}")
             troubles.append(", ".join(filter(None, words)))
+        if self._damaged_chunks:
+            troubles.append(f"{self._damaged_chunks} chunks of the log DAMAGED")
         hours = room["hours_left"]
         if hours is not None and hours * 3600 < LITTLE_LEFT_S:
             troubles.append(f"room for {duration_text(hours * 3600)} only")

@@ -101,6 +101,7 @@ class HostClocks:
             )
         self._readings: deque[tuple[int, int, int, float]] = deque()
         self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
+        self._told: set[PpsClock] = set()  # by a receiver: a wall clock decides between seconds, and is no time alone
 
     def add_reading(
         self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
@@ -129,6 +130,7 @@ class HostClocks:
                 continue
             names = self.plan.gnss[source].names_edge or said.names_edge
             self.by_source[source].add_message(source, replace(said, host_time_ns=raw_ns, names_edge=names))
+            self._told.add(self.by_source[source])
         self._spoken.clear()
         self._read_wall_clock(None)
 
@@ -137,7 +139,7 @@ class HostClocks:
         readings, host_minus_ns = self._readings, self.timeline.host_minus_monotonic_ns
         while readings and (until_ns is None or readings[0][1] + host_minus_ns <= until_ns):
             realtime_ns, _, raw_ns, max_error_s = readings.popleft()
-            for clock in set(self.by_source.values()):
+            for clock in self._told:
                 clock.set_wall_clock(raw_ns, realtime_ns, disciplined=max_error_s < KEPT_S, sigma_s=max_error_s)
 
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:

@@ -110,8 +110,12 @@ put_in_place() {
 keep_changed() {
     case $2 in /etc/*) ;; *) return 0 ;; esac
     [ -e "$DESTDIR$2" ] && ! cmp -s "$source/systemd/$1" "$DESTDIR$2" || return 0
-    cp -p "$DESTDIR$2" "$DESTDIR$2.old"
-    echo "replaced $DESTDIR$2; what it was is in $DESTDIR$2.old"
+    kept=$DESTDIR$2.old more=1
+    while [ -e "$kept" ] && ! cmp -s "$DESTDIR$2" "$kept"; do # what an earlier install kept stays, too
+        more=$((more + 1)) kept=$DESTDIR$2.old$more
+    done
+    cp -p "$DESTDIR$2" "$kept"
+    echo "replaced $DESTDIR$2; what it was is in $kept"
 }
 
 install_files() {

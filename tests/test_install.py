@@ -211,6 +211,10 @@ def test_what_was_changed_in_etc_is_kept_beside(tmp_path: Path) -> None:
     assert f"{placed}.old" in install_files(tmp_path, "/opt/swath")
     assert placed.read_text() == as_installed
     assert Path(f"{placed}.old").read_text() == "maxslewrate 20\n"
+    placed.write_text("an earlier version's\n")
+    assert f"{placed}.old2" in install_files(tmp_path, "/opt/swath")
+    kept = [Path(f"{placed}.old").read_text(), Path(f"{placed}.old2").read_text()]
+    assert kept == ["maxslewrate 20\n", "an earlier version's\n"], "the second does not take the first's place"
 
 
 def test_a_folder_with_other_things_is_not_overwritten(tmp_path: Path) -> None:

@@ -98,7 +98,9 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     untold = [source for source, values in numbers["sources"].items() if not values["has_status"]]
     if untold:
         console.print(f"no status of {_plain(', '.join(untold))}: what was lost is not known", highlight=False)
-    if not unaccounted and not untold:
+    if numbers["missing_parts"] or numbers["damage"]:
+        console.print("[red]not every unit is here: what missing parts and damaged places held is not counted above[/]")
+    elif not unaccounted and not untold:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
     for event in numbers["marks"]:
         told = f"{clock_text(event.get('time_ns'))} mark: {_plain(event.get('text', '?'))}"

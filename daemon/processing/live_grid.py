@@ -99,14 +99,16 @@ class CountGrid:
             return np.zeros((0, 0), dtype=np.uint64), 0.0, 0.0, self.cell_m
         west, south, east, north = extent
         block = 1
-        while max(east - west, north - south) * (TILE // block) > limit and block < TILE:
+        while max(east - west, north - south) * TILE > limit * block:
             block *= 2
-        side = TILE // block
-        image = np.zeros(((north - south) * side, (east - west) * side), dtype=np.uint64)
+        tiles, side = max(1, block // TILE), max(1, TILE // block)  # a far point: tiles a cell; else cells a tile
+        within = TILE // side
+        rows, columns = -((south - north) // tiles) * side, -((west - east) // tiles) * side
+        image = np.zeros((rows, columns), dtype=np.uint64)
         for tile, (column, row) in zip(self._counts, self._places[: int(self._state[0])].tolist(), strict=False):
-            sums = tile.reshape(side, block, side, block).sum(axis=(1, 3), dtype=np.uint64)
-            top, left = (north - 1 - row) * side, (column - west) * side
-            image[top : top + side, left : left + side] = sums[::-1]
+            sums = tile.reshape(side, within, side, within).sum(axis=(1, 3), dtype=np.uint64)
+            top, left = (north - 1 - row) // tiles * side, (column - west) // tiles * side
+            image[top : top + side, left : left + side] += sums[::-1]
         width_m = self.cell_m * block
         return image, west * TILE * self.cell_m, north * TILE * self.cell_m, width_m
 

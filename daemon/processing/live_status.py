@@ -130,7 +130,7 @@ class LiveStatus:
                 for source, latencies in sorted(self._log.items())
             },
             "time": self._clock_states(now_ns),
-            "trajectory": {"source": self._setup.ins_source, "covered_until_gps_ns": stream.path.covered_until_ns},
+            "trajectory": {"source": self._trajectory_source, "covered_until_gps_ns": stream.path.covered_until_ns},
             "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
             "free_bytes": products.room.free_bytes,
             "stops_writing_at_bytes": products.room.least_bytes,
@@ -143,6 +143,11 @@ class LiveStatus:
                 "damaged_chunks": follower.damaged + (follower.part.damaged if follower.part else 0),
             }
         return found
+
+    @property
+    def _trajectory_source(self) -> str | None:
+        """A receiver that could tell an INS solution and tells none is not whose it is."""
+        return self._setup.ins_source if self.navigation is None else "navigated"
 
     def _clock_states(self, now_ns: int) -> dict[str, Any]:
         host = self._stream.clocks.host

@@ -60,7 +60,7 @@ def frame_of(low_m: FloatArray, high_m: FloatArray, cell_m: float) -> Frame:
     """Cells from a south-western (2,) to a north-eastern (2,) corner; larger ones where they would be too many."""
     while True:
         first = np.floor(low_m[:2] / cell_m)
-        columns, rows = (np.floor(high_m[:2] / cell_m) - first).astype(int) + 1
+        columns, rows = (np.floor(high_m[:2] / cell_m) - first + 1.0).tolist()  # whole, and never beyond 64 bits
         if rows * columns <= MOST_CELLS:
             return Frame(float(first[0] * cell_m), float(first[1] * cell_m), cell_m, int(rows), int(columns))
         cell_m = round_up(cell_m * 1.01)

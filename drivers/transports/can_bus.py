@@ -9,6 +9,7 @@ over.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import re
 import socket
@@ -26,6 +27,7 @@ from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
 from drivers.transports.mmsg import DropCounter, ask_receive_buffer, stamping
 from drivers.transports.uri import TransportSpec
 
+SOCKETCAND = "can.interfaces.socketcand.socketcand"
 CONNECT_S = 2.0  # to a gateway
 # a gateway that loses its power says nothing: the connection counts as dead after 25 s
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
@@ -77,8 +79,8 @@ class PythonCanTransport(DescriptorTransport):
         keywords: dict[str, Any] = {key: keyword_value(value) for key, value in self._spec.options.items()}
         spec = self._spec
         try:
-            if spec.interface == "socketcand" and {"host", "port"} <= keywords.keys():
-                _see_that_it_is_there(keywords["host"], keywords["port"])
+            if spec.interface == "socketcand":
+                vars(importlib.import_module(SOCKETCAND))["connect_to_server"] = _connect_once
             with stamping() if self._kernel_stamped else contextlib.nullcontext():
                 self._bus = can.Bus(interface=spec.interface, channel=spec.channel, ignore_config=True, **keywords)
         except NameError as error:  # how a python-can interface says that its maker's library is not installed
@@ -237,12 +239,19 @@ def _descriptor(bus: can.BusABC) -> int:
         return -1
 
 
-def _see_that_it_is_there(host: str, port: int) -> None:
-    """Raises OSError where no gateway listens.
+def _connect_once(connection: socket.socket, host: str, port: int) -> None:
+    """Connects socketcand's bus; raises OSError where no gateway listens.
 
-    socketcand's bus would ask for 10 s, thousands of times a second, with a line on stderr each time.
+    Its own way asks for 10 s, thousands of times a second, with a line on stderr each time. To ask beforehand, by
+    another connection, would take the place of the only client that some gateways serve.
     """
-    socket.create_connection((host, port), CONNECT_S).close()
+    connection.settimeout(CONNECT_S)
+    try:
+        connection.connect((host, port))
+    except BaseException:  # nobody else has it
+        connection.close()
+        raise
+    connection.settimeout(None)
 
 
 def _connection(bus: can.BusABC) -> socket.socket | None:

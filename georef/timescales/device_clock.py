@@ -21,6 +21,7 @@ from georef.timescales.pps_clock import PpsClock
 
 MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: further from the edge than this it is refused
 MAX_DRIFT = 200e-6
+HELD_DRIFT = MAX_DRIFT / 2  # of a clock that the pulse set: nobody has seen yet at which rate it runs alone
 SPACING_FLOOR_NS = 2_000.0
 MAX_BRIDGED_S = 1_000  # longer without a latched edge the seconds can no longer be counted by ticks
 REFUSED_IN_A_ROW = 4  # spacings: then the first edge was the wrong one
@@ -138,9 +139,11 @@ class _Arrivals:
 class _Segment:
     """The device's clock from one power-on, or one change between kept and free, to the next."""
 
-    def __init__(self, first_host_ns: int, *, free: bool) -> None:
+    def __init__(self, first_host_ns: int, *, free: bool, held: _Latch | None = None) -> None:
+        """held: of the segment before, whose time goes on where a head has just lost its pulse."""
         self.first_host_ns = first_host_ns
         self.free = free
+        self.held = held
         self.latch = _Latch()
         self.arrivals = _Arrivals()
         self.last_device_ns: int | None = None
@@ -206,6 +209,7 @@ class DeviceClock:
 
     def _segment_for(self, device_ns: int, count: int, host_ns: int, *, free: bool) -> _Segment:
         """The segment that goes on; a new one where count or device time went back, that jumped, or lock changed."""
+        held = None
         if self._segments:
             last = self._segments[-1]
             passed_ns = 0 if last.last_device_ns is None else device_ns - last.last_device_ns
@@ -213,7 +217,8 @@ class DeviceClock:
             goes_on = passed_ns >= -STEP_BACK_NS and not jumped and not 0 <= count < last.last_count
             if goes_on and free == last.free:
                 return last
-        self._segments.append(_Segment(host_ns, free=free))
+            held = last.latch if goes_on and free else None
+        self._segments.append(_Segment(host_ns, free=free, held=held))
         return self._segments[-1]
 
     def _add_latched(
@@ -291,6 +296,15 @@ class DeviceClock:
         latched = self._by_latch(segment.latch, device)
         if latched is not None:
             return latched
+        gps, sigma = self._by_arrivals(segment, device)
+        held = None if segment.held is None else self._by_latch(segment.held, device)
+        if segment.held is None or held is None:
+            return gps, sigma
+        held_sigma = np.hypot(held[1], HELD_DRIFT * (device - segment.held.device[-1]))
+        better = held_sigma < sigma  # for some 20 s; within 10 s it is good enough for returns
+        return np.where(better, held[0], gps), np.where(better, held_sigma, sigma)
+
+    def _by_arrivals(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
         if not segment.arrivals.bins:
             return np.zeros_like(device), np.full(device.shape, math.inf)
         host, scatter = segment.arrivals.host_at(device)

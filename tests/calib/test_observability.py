@@ -282,6 +282,16 @@ def test_one_that_was_given_up_comes_back_when_it_is_determined_after_all() -> N
     assert {held.name for held in decide(normal, three)} == {"lever_arm_x_m"}
 
 
+def test_what_is_held_beside_what_it_was_given_up_for_is_not_said_to_be_certain_enough() -> None:
+    """By itself, heading held, the slope would be known to 0.9 of what is of use; heading is known to nobody."""
+    names = ["left.kappa_rad", "left.pitch_slope"]
+    heading, slope = decide(information(np.array([[40.0**2, 0.9 * 80.0], [0.9 * 80.0, 2.0**2]]), names), names)
+    assert slope.sigma == pytest.approx(2.0 * RULES["pitch_slope"].wanted, rel=1e-3)
+    assert slope.why.startswith("this flight cannot tell it apart from left.kappa_rad (correlation +0.900)")
+    assert heading.sigma > RULES["kappa_rad"].wanted
+    assert "times as uncertain as is of use" in heading.why
+
+
 def test_rounding_that_makes_an_eigenvalue_negative_is_no_knowledge() -> None:
     names = ["left.omega_rad", "left.scan_angle_offset_rad"]
     wanted = np.array([RULES[kind_of(name)].wanted for name in names])

@@ -6,6 +6,7 @@ import copy
 import json
 import random
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -295,6 +296,21 @@ class TestStatus:
             found.append(told["max"] if told else None)
         assert found == [None, 0.2, 0.2, 0.2, 0.3, 0.3]
         assert len(asked) == 3
+
+    def test_what_was_navigated_is_not_called_the_devices_own(self) -> None:
+        """A receiver whose protocol could tell an INS solution, and that has none."""
+        host = SimpleNamespace(by_source={})
+        stream: Any = SimpleNamespace(
+            scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
+        )
+        products: Any = SimpleNamespace(
+            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
+        )
+        setup: Any = SimpleNamespace(ins_source="gnss/rover")
+        status = LiveStatus(setup, stream, products)
+        assert status.plain(None, 0)["trajectory"] == {"source": "gnss/rover", "covered_until_gps_ns": 7}
+        status.navigation = "aligned with dual-antenna heading"
+        assert status.plain(None, 0)["trajectory"]["source"] == "navigated"
 
     def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
         (tmp_path / "file").touch()

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from daemon.config.tables import LiveConfig
 from daemon.processing.live_grid import TILE, CountGrid
 from daemon.processing.live_mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
-from daemon.processing.live_products import LiveProducts, Room, Thinning, picture
+from daemon.processing.live_products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
 from georef.points import Points
 from georef.trajectory import Trajectory
 
@@ -325,6 +325,16 @@ class TestGrid:
             assert ours[1:] == theirs[1:]
             assert max(ours[0].shape) <= max(limit, 2 * TILE)
             assert ours[0].sum() == len(points)
+
+    def test_one_point_far_away_makes_no_larger_image(self) -> None:
+        """As a first position that was wrong: 137 million cells would be drawn for 6 s, every 10 s."""
+        grid = CountGrid(1.0)
+        grid.add(np.array([[0.5, 0.5, 0.0], [5.5, 5.5, 0.0], [3e6 + 0.5, -3e6 + 0.5, 0.0]]))
+        image, west, north, cell = grid.image(IMAGE_CELLS)
+        assert max(image.shape) <= IMAGE_CELLS
+        assert image.sum() == 3
+        for east_m, north_m, count in ((1.0, 1.0, 2), (3e6, -3e6 + 1.0, 1)):
+            assert image[int((north - north_m) // cell), int((east_m - west) // cell)] == count
 
     def test_what_is_nowhere_is_refused(self) -> None:
         grid = CountGrid(1.0)

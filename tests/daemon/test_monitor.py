@@ -16,6 +16,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,10 @@ import pytest
 from rich.console import Console
 
 from daemon.cli.monitor import page, time_text
+from daemon.log.encode import encode_block
 from daemon.log.follow import LogFollower, PartFollower
 from daemon.log.reader import open_logs
+from daemon.log.writer import PartWriter
 from daemon.monitor import Monitor
 from daemon.monitor_source import Decoding
 from daemon.run import read_boot_id
@@ -38,7 +41,7 @@ from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_
 from tests.daemon.test_check import nmea
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_info import CAPTURE
-from tests.daemon.test_log import INFO, write_part
+from tests.daemon.test_log import INFO, SCANNER, START_NS, write_part
 from tests.daemon.test_recorder_faults import Numbers, scanner
 from tests.daemon.wires import pty as serial_port
 
@@ -411,6 +414,40 @@ def test_a_damaged_chunk_is_counted_and_the_next_one_read(tmp_path: Path) -> Non
     follower.close()
     assert follower.damaged == 1
     assert 0 < found < expected
+
+
+def test_a_damaged_chunk_of_the_growing_log_degrades(tmp_path: Path) -> None:
+    """What the disk made of the log since is lost as well; the next session begins without."""
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    write_part(path, finish=False)
+    data = bytearray(path.read_bytes())
+    data[len(data) * 3 // 4] ^= 1
+    path.write_bytes(data[: len(data) // 2])
+    sign = {"session_id": INFO.session_id, "part": 0, "path": path.name, "boot_id": "another"}
+    (tmp_path / "recording.json").write_text(json.dumps(sign))
+    monitor = Monitor(tmp_path, decode=False)
+    monitor.poll()
+    path.write_bytes(data)
+    monitor.poll()
+    found = monitor.snapshot()
+    assert (found["verdict"], found["damaged_chunks"]) == ("degraded", 1)
+    assert "1 chunks of the log DAMAGED" in found["sentence"]
+    other = replace(INFO, session_id="later-20261121T110000Z-ab12")
+    later = PartWriter(tmp_path / f"{other.session_id}_0.mcap", other, 0)
+    later.add_channel(1, SCANNER)
+    later.add(encode_block(1, 0, np.array([START_NS + 10**9]), np.zeros((1, 9), np.uint8)))
+    later.flush()
+    sign |= {"session_id": other.session_id, "path": later.path.name}
+    (tmp_path / "recording.json").write_text(json.dumps(sign))
+    for _ in range(3):
+        monitor.poll()
+    later.add(encode_block(1, 1, np.array([START_NS + 2 * 10**9]), np.zeros((1, 9), np.uint8)))
+    later.flush()
+    monitor.poll()
+    found = monitor.snapshot()
+    later.abandon()
+    monitor.close()
+    assert (found["session_id"], found["verdict"], found["damaged_chunks"]) == (other.session_id, "recording", 0)
 
 
 class Costly(PacketParser):

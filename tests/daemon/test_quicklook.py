@@ -347,6 +347,12 @@ def test_tiles_are_kept_where_there_are_points_only() -> None:
     assert cells.used == 0
 
 
+def test_cells_beyond_all_numbers_are_too_many_as_well() -> None:
+    """`--cell 1e-9`: their product is no 64 bit integer."""
+    frame = frame_of(np.array([0.0, 0.0]), np.array([1e4, 1e4]), 1e-9)
+    assert 1_000_000 < frame.rows * frame.columns <= 2_000_000
+
+
 def test_frames_stay_within_two_million_cells() -> None:
     frame = frame_of(np.array([0.0, 0.0]), np.array([1e5, 1e5]), 0.1)
     assert frame.rows * frame.columns <= 2_000_000

@@ -462,7 +462,6 @@ def test_a_gateway_that_closes_is_noticed_and_comes_back() -> None:
         gateway.settimeout(10.0)
 
         def greet() -> socket.socket:
-            gateway.accept()[0].close()  # asked whether it is there
             connection, _ = gateway.accept()
             connection.sendall(b"< hi >")
             for _ in ("open", "rawmode"):
@@ -485,6 +484,26 @@ def test_a_gateway_that_closes_is_noticed_and_comes_back() -> None:
             with pytest.raises(TransportError, match="the gateway closed the connection"):
                 transport.receive(5.0)
             transport.close()
+
+
+def test_a_gateway_that_serves_one_client_has_no_other() -> None:
+    """It may take a while to notice that a client has gone, and turns the next one away meanwhile."""
+    with socket.create_server(("127.0.0.1", 0)) as gateway:
+
+        def serve() -> None:
+            with gateway.accept()[0] as only:
+                gateway.close()
+                only.sendall(b"< hi >")
+                while only.recv(100):
+                    only.sendall(b"< ok >")
+
+        port = gateway.getsockname()[1]
+        serving = threading.Thread(target=serve, daemon=True)
+        serving.start()
+        transport = PythonCanTransport(parse_transport(f"can:socketcand:can0?host=127.0.0.1&port={port}"))
+        transport.open()
+        transport.close()
+        serving.join(5.0)
 
 
 def test_a_gateway_that_is_not_there_is_asked_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -51,3 +51,11 @@ def test_a_wall_clock_that_nobody_keeps_decides_nothing() -> None:
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, 800_000_000, math.inf, seconds=60, ticks_s=0)
     assert clocks.status("pps/main", HOST_NS + 60 * SECOND_NS).state is TimeState.COARSE
+
+
+def test_a_wall_clock_is_no_time_where_no_receiver_speaks() -> None:
+    """Its drift between readings is in no sigma, and what is missing could no longer be said."""
+    plan = ClockPlan(OFFSET_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan(None)})
+    clocks = HostClocks(plan, keep_history=True)
+    told(clocks, 100_000_000, 0.01, seconds=60, ticks_s=1)
+    assert clocks.status("pps/main", HOST_NS + 60 * SECOND_NS).state is TimeState.NO_TIME
