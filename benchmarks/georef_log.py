@@ -169,7 +169,8 @@ class Bench:
         """Log to LAZ, as a worker does it."""
         first, last = self.index.spans()
         self.path.unlink(missing_ok=True)
-        plan = SessionPlan(self.index, self.setup, self.clocks.clocks, self.las, {})
+        numbers = {name: number for number, name in enumerate(self.setup.scanners)}
+        plan = SessionPlan(self.index, self.setup, self.clocks.clocks, self.las, {}, numbers)
         segment = Segment(1, int(first.min()), int(last.max()) + 1)
         run_job(plan, Job(0, segment, self.places, self.trajectory, self.path))
 

@@ -128,6 +128,15 @@ def test_every_device_has_a_page() -> None:
     assert protocols - pages == set()
 
 
+def test_every_counter_of_a_driver_is_on_a_page() -> None:
+    """`swath info` and `swath monitor` show it by its code alone."""
+    sources = [path.read_text() for path in (ROOT / "drivers").rglob("*.py")]
+    codes = {code for text in sources for code in re.findall(r'errors\["([a-z0-9_]+)"\]', text)}
+    assert len(codes) > 25
+    pages = "".join(path.read_text() for path in (ROOT / "docs/devices").glob("*.md"))
+    assert {code for code in codes if f"`{code}`" not in pages} == set()
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):

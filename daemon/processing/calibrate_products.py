@@ -98,7 +98,8 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
     now = dt.datetime.now(dt.UTC).replace(microsecond=0)
     found = done.adjusted.calibrations[name]
     digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
-    config = done.kept.logged[0].setup.config
+    # a session may lack a scanner: its settings are those of its first, as of the heads
+    config = next(flight.setup.config for flight in done.kept.logged if name in flight.setup.scanners)
     table = config.scanner[name]
     logs = tuple(entry for entry in inputs if entry[0].endswith(".mcap"))
     return Header(

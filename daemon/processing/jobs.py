@@ -71,11 +71,13 @@ class SessionPlan(JobPlan):
     Attributes:
         las: of the files.
         intensity_factors: by scanner.
+        numbers: of scanners, as the files say them.
         copc: the files are cloud optimised.
     """
 
     las: LasSettings
     intensity_factors: dict[str, float]
+    numbers: dict[str, int]
     copc: bool = False
 
 
@@ -196,14 +198,13 @@ def _write(
     opened: ExitStack,
     tell: Tell,
 ) -> None:
-    setup, names = plan.setup, plan.setup.scanners
+    setup = plan.setup
     georeferenced = setup.office_stream(plan.clocks, trajectory)
     feed = LogFeed(setup, georeferenced)
-    numbers = {name: number for number, name in enumerate(names)}
 
     def put(name: str, points: Points, *, withheld: bool = False) -> None:
         factor = plan.intensity_factors.get(name, 1.0)
-        sink.write(points, scanner=numbers[name], intensity_factor=factor, withheld=withheld)
+        sink.write(points, scanner=plan.numbers[name], intensity_factor=factor, withheld=withheld)
 
     def write(placed: list[tuple[str, Points]]) -> None:
         for name, points in placed:

@@ -41,6 +41,7 @@ SENSORS: tuple[tuple[str, str, str], ...] = (  # name, field of Solution, of Imu
 CHI2_MEDIAN = np.array([np.nan, 0.45494, 1.38629, 2.36597])  # of 1, 2, 3 degrees of freedom
 MOST_SORTED = 400_000  # epochs a percentile is taken of
 FEWEST = 30  # observations of a kind whose spread is told
+WINDOW_NS = 30 * SECOND_NS  # as long as the root mean square of a whole flight may hide
 
 
 def figures_of(flight: Flight, separation: Separation | None) -> Figures:
@@ -64,6 +65,7 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
         "sigma_largest": _sigmas(best, lambda column: float(np.nanmax(column))),
         "filter_sigma_rms": _sigmas(flight.forward, _root_mean_square),
         "separation": _separation(separation),
+        "separation_worst": _worst_separation(separation, flight.start_ns),
         "sensors": _sensors(flight),
         "lever_arm": _lever_arm(flight),
         "time_offset": _time_offset(flight),
@@ -165,19 +167,42 @@ def _sigmas(solution: Solution, told: Any) -> dict[str, float | None]:
     return found
 
 
-def _separation(separation: Separation | None) -> Figures | None:
-    """Root mean square of filter − smoother over its predicted sigma: 1 where both tell the truth."""
-    if separation is None:
-        return None
-    ratios = {
+def _ratios(separation: Separation) -> dict[str, FloatArray]:
+    return {
         "position": separation.position_m / separation.position_sigma_m,
         "velocity": separation.velocity_mps / separation.velocity_sigma_mps,
         "attitude": separation.attitude_rad / separation.attitude_sigma_rad,
     }
+
+
+def _separation(separation: Separation | None) -> Figures | None:
+    """Root mean square of filter − smoother over its predicted sigma: 1 where both tell the truth."""
+    if separation is None:
+        return None
     return {
         name: _root_mean_square(ratio[np.isfinite(ratio)]) if np.isfinite(ratio).sum() >= FEWEST else None
-        for name, ratio in ratios.items()
+        for name, ratio in _ratios(separation).items()
     }
+
+
+def _worst_separation(separation: Separation | None, start_ns: int) -> dict[str, Figures] | None:
+    """The same of the window in which it is largest, and its middle: seconds of a wrong fix in hours of a flight."""
+    if separation is None:
+        return None
+    found = {}
+    for name, ratio in _ratios(separation).items():
+        known = np.isfinite(ratio)
+        squares = np.where(known, ratio, 0.0) ** 2
+        sums, counts = (np.append(0.0, np.cumsum(values.sum(axis=1))) for values in (squares, known))
+        first = np.arange(len(ratio))
+        last = np.searchsorted(separation.time_ns, separation.time_ns + WINDOW_NS)
+        count = counts[last] - counts[first]
+        mean = np.where(count >= FEWEST, (sums[last] - sums[first]) / np.maximum(count, 1.0), 0.0)
+        at = int(np.argmax(mean))
+        if mean[at] > 0.0:
+            middle_ns = (int(separation.time_ns[at]) + int(separation.time_ns[last[at] - 1])) // 2
+            found[name] = {"value": float(np.sqrt(mean[at])), "at_s": (middle_ns - start_ns) / SECOND_NS}
+    return found
 
 
 def _sensors(flight: Flight) -> dict[str, dict[str, Figures]]:
@@ -221,3 +246,18 @@ def _time_offset(flight: Flight) -> Figures | None:
         return None
     offset_s, sigma_s = float(best.time_offset_s[-1]), float(best.time_offset_sigma_s[-1])
     return {"estimate_s": offset_s, "sigma_s": sigma_s, "significant": abs(offset_s) > 3 * sigma_s}
+
+
+def accuracy_words(figures: Figures) -> str:
+    """Sigmas over the flight, as people say them."""
+    rms = figures["sigma_rms"]
+    place = [rms["north_m"], rms["east_m"], rms["down_m"]]
+    known = [value for value in place if value is not None]
+    if not known:
+        return "sigmas are not known"
+    worst_m = max(known)
+    words = [f"position to {100 * worst_m:.1f} cm" if worst_m < 1.0 else f"position to {worst_m:.1f} m"]
+    tilt = [rms[f"{angle}_deg"] for angle in ANGLES[:2] if rms[f"{angle}_deg"] is not None]
+    words += [f"roll and pitch to {max(tilt):.4f}°"] if tilt else []
+    words += [f"heading to {rms['heading_deg']:.4f}°"] if rms["heading_deg"] is not None else []
+    return ", ".join(words) + " (one sigma, root mean square over the flight)"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
-from daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures
+from daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures, accuracy_words
 
 Measure = Callable[[Figures], Iterator[tuple[str, float | None]]]
 
@@ -153,6 +153,11 @@ def _separations(figures: Figures) -> Iterator[tuple[str, float | None]]:
     yield from (figures["separation"] or {}).items()
 
 
+def _worst_separations(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    for name, worst in (figures["separation_worst"] or {}).items():
+        yield f"{name} {worst['at_s']:.0f} s after the start", worst["value"]
+
+
 def _arm(key: str) -> Measure:
     def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
         if figures["lever_arm"] is not None:
@@ -275,6 +280,14 @@ RULES: tuple[Rule, ...] = (
         f"check {NOISE}; a disturbance in the middle of the flight shows in the separation's plot",
     ),
     Rule(
+        "separation at worst",
+        _worst_separations,
+        8.0,
+        None,
+        "filter and smoother differ in {of} by {value:.0f} times what their sigmas say, over 30 s",
+        "do not use lines flown then, or leave out the positions of that time (--gnss): a wrong fix looks like this",
+    ),
+    Rule(
         "bridged share",
         _one("bridged", "share"),
         0.001,
@@ -382,18 +395,3 @@ def _sentence(level: Level, figures: Figures, reasons: list[Reason]) -> str:
     more = len(reasons) - 1
     tail = f"; {more} more {'reason' if more == 1 else 'reasons'} below" if more else ""
     return f"{word}: {told[0]}{tail}."
-
-
-def accuracy_words(figures: Figures) -> str:
-    """Sigmas over the flight, as people say them."""
-    rms = figures["sigma_rms"]
-    place = [rms["north_m"], rms["east_m"], rms["down_m"]]
-    known = [value for value in place if value is not None]
-    if not known:
-        return "sigmas are not known"
-    worst_m = max(known)
-    words = [f"position to {100 * worst_m:.1f} cm" if worst_m < 1.0 else f"position to {worst_m:.1f} m"]
-    tilt = [rms[f"{angle}_deg"] for angle in ANGLES[:2] if rms[f"{angle}_deg"] is not None]
-    words += [f"roll and pitch to {max(tilt):.4f}°"] if tilt else []
-    words += [f"heading to {rms['heading_deg']:.4f}°"] if rms["heading_deg"] is not None else []
-    return ", ".join(words) + " (one sigma, root mean square over the flight)"

@@ -89,7 +89,12 @@ def _job(wish: Wish, flight: Flight, number: int, tile: Segment, partial: Path) 
     return Job(number, tile, places, trajectory, path, dropped)
 
 
-def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> SessionPlan:
+def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
+    """Of scanners, by name, the same in all files: a session may lack one that another has."""
+    return {name: number for number, name in enumerate(sorted({n for one in flights for n in one.setup.scanners}))}
+
+
+def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]) -> SessionPlan:
     setup = flight.setup
     assert setup.mapping is not None
     protocols = {name: setup.config.scanner[name].protocol for name in setup.scanners}
@@ -113,7 +118,7 @@ def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float]) -> Ses
     )
     eight_bit = [name for name, protocol in protocols.items() if find_driver("scanner", protocol).eight_bit_intensity]
     factors = dict.fromkeys(eight_bit, INTENSITY_FACTOR)
-    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, wish.copc)
+    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, numbers, wish.copc)
 
 
 def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
@@ -200,7 +205,8 @@ def _make(
     tell: Tell,
 ) -> Report:
     origin = _origin(flights)
-    plans = [_plan(wish, flight, origin) for flight in flights]
+    numbers = _numbers(flights)
+    plans = [_plan(wish, flight, origin, numbers) for flight in flights]
     jobs = [job for number, flight in enumerate(flights) for job in _jobs(wish, flight, number, partial)]
     total = sum(job.size for job in jobs)
     given_up = Event()

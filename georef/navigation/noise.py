@@ -26,6 +26,7 @@ MOST_SCALES, NEAR = 3, 0.1  # tries of one share, until the mean square is so ne
 SHARES = (0.5, 0.8, 0.95)
 TAILS = 10.0  # degrees of freedom of the t distribution that stands for innovations: outliers weigh little
 SOUND = (0.5, 1.7)  # mean square of normalised innovations of a hypothesis that explains them
+FEW = 0.1  # share of positions far beyond the gate: so few are blunders, more are noise that is larger than said
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,19 @@ class NoiseFound:
         return self.best.scale != 1.0 or self.best.share != 0.0
 
 
+def without_blunders(innovations: StructArray, run: StructArray) -> StructArray:
+    """Innovations but for positions of times at which a run with the receiver's own sigmas refused or re-acquired one.
+
+    Seconds of a wrong fix are no noise, and would hide that of the other hours.
+    """
+    place = run[(run["kind"] == Kind.POSITION) & (run["fate"] <= Fate.REACQUIRED)]
+    far = place[np.isin(place["fate"], (Fate.REJECTED, Fate.REACQUIRED))]
+    if len(far) > FEW * len(place):
+        return innovations
+    kept: StructArray = innovations[~np.isin(innovations["time_ns"], far["time_ns"])]
+    return kept
+
+
 def second_moments(innovations: StructArray) -> tuple[dict[int, float], dict[int, int]]:
     """Mean square of normalised innovations of positions that were not refused, and how many, by fix type."""
     told = innovations[(innovations["kind"] == Kind.POSITION) & (innovations["fate"] <= Fate.REACQUIRED)]
@@ -90,7 +104,7 @@ def by_moments(setup: Setup, innovations: StructArray) -> Setup:
     For a setup that says how much of the errors lasts, which innovations hardly show. Where they are larger, all of it
     is; where they are smaller, only the part that does not last: what lasts is as the receiver's sigmas have it.
     """
-    moments, counts = second_moments(innovations)
+    moments, counts = second_moments(without_blunders(innovations, innovations))
     off = {
         fix: math.sqrt(moment)
         for fix, moment in moments.items()
@@ -112,17 +126,17 @@ def find_noise(innovations: StructArray, stretch: Callable[[Setup], StructArray]
         stretch: innovations of a run over the stretch with another setup.
         setup: of the run, sigmas as the receiver says them and white.
     """
-    moments, counts = second_moments(innovations)
+    moments, counts = second_moments(without_blunders(innovations, innovations))
     first = Hypothesis(1.0, 0.0, 0.0, _mean(moments, counts))
     if sum(counts.values()) < ENOUGH:
         return NoiseFound((first,), first, moments, counts)
-    base = log_likelihood(stretch(setup))
+    base = log_likelihood(without_blunders(stretch(setup), innovations))
 
     def tried(scale: float, share: float) -> Hypothesis:
         """With the scale, or one nearer to what innovations then say."""
         for _ in range(MOST_SCALES):
             scale = min(max(scale, SCALES[0]), SCALES[1])
-            found = stretch(scaled(setup, scale, share))
+            found = without_blunders(stretch(scaled(setup, scale, share)), innovations)
             one = Hypothesis(scale, share, log_likelihood(found) - base, _mean(*second_moments(found)))
             if abs(one.second_moment - 1.0) < NEAR:
                 break

@@ -21,7 +21,8 @@ TURN_RADPS = 4e-3  # mean of a second: above it something turns; biases of a goo
 FORCE_MPS2 = 0.08  # by which means of neighbouring seconds may differ
 SIGMAS = 3.0  # of a receiver's velocity or change of position: beyond them it moves, but
 MOVES_MPS = (0.05, 0.3)  # never below the first of these, and always above the second
-DRIFTS_M = (0.3, 1.0)  # the same of positions some epochs apart, where no velocity is said
+DRIFTS_M = (0.3, 1.0)  # the same of positions some time apart, where no velocity is said
+APART_NS = 5 * SECOND_NS // 2  # at least: epochs of a quick receiver are too near to each other to tell a slow flight
 SIGMA_MPS = 0.02  # a standing aircraft sways in the wind, and a running engine shakes it
 BESIDE = 2  # seconds on either side that must be still too
 
@@ -96,8 +97,8 @@ def _by_velocity(rows: StructArray) -> BoolArray:
 
 
 def _by_position(rows: StructArray) -> BoolArray:
-    """Against the position some epochs before: less than noise, and than what a slow roll makes."""
-    back = np.maximum(np.arange(len(rows)) - BESIDE - 1, 0)
+    """Against the position some time before: less than noise, and than what a slow roll makes."""
+    back = np.maximum(np.searchsorted(rows["time_ns"], rows["time_ns"] - APART_NS, side="right") - 1, 0)
     away = np.linalg.norm(rows["value"] - rows["value"][back], axis=1)
     moves: BoolArray = away > np.clip(SIGMAS * np.linalg.norm(rows["sigma"], axis=1), *DRIFTS_M)
     return moves

@@ -101,6 +101,7 @@ PLACES: dict[str, Callable[[Figures, float], Any]] = {
     "innovations small": lambda f, v: f["observations"]["position"].update(sigma_factor=1.0 / v),
     "innovations correlated": lambda f, v: f["observations"]["position"].update(correlation=v),
     "separation": lambda f, v: f["separation"].update(attitude=v),
+    "separation at worst": lambda f, v: f["separation_worst"].update(position={"value": v, "at_s": 700.0}),
     "bridged share": lambda f, v: f["bridged"].update(share=v),
     "bridged run": lambda f, v: f["bridged"].update(longest_s=v),
     "bias": lambda f, v: f["sensors"]["accel_bias"]["y"].update(largest_over_expected=v),
@@ -196,6 +197,20 @@ def test_correlated_innovations(sound: Flight) -> None:
 def test_a_separation_too_large(sound: Flight) -> None:
     small = replace(sound.forward, position_sigma_l=sound.forward.position_sigma_l / 2)
     assert "separation" in told(replace(sound, forward=small))
+
+
+def test_seconds_of_a_wrong_fix_are_told_with_their_time_however_long_the_flight(sound: Flight) -> None:
+    at_s = (sound.forward.time_ns - sound.start_ns) / SECOND_NS
+    moved = sound.forward.position_e.copy()
+    during = (at_s > 700.0) & (at_s < 712.0)
+    moved[during] += 20.0 * sound.forward.position_sigma_l[during]
+    wrong = replace(sound, forward=replace(sound.forward, position_e=moved))
+    found = figures_of(wrong, separation_of(wrong))
+    assert found["separation"]["position"] < 2.0
+    assert found["separation_worst"]["position"]["at_s"] == pytest.approx(706.0, abs=10.0)
+    assert found["separation_worst"]["velocity"]["value"] < 2.5
+    assert "filter and smoother differ in position 7" in told(wrong)["separation at worst"]
+    assert "separation" not in told(wrong)
 
 
 def test_made_up_samples(sound: Flight) -> None:

@@ -131,6 +131,25 @@ def test_noise_that_is_not_as_said_is_found(scale: float, share: float) -> None:
     assert solved.report.noise.changed == (scale != 1.0 or share > 0.0)
 
 
+@pytest.mark.parametrize("fault", ["frozen", "wrong fix"])
+def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> None:
+    """A receiver that repeats itself for 5 s, a wrong fix for 20 s: errors that last are found all the same, and sigmas
+    long before and after are honest: the mean of squares over predicted ones scatters by 0.4.
+    """
+    truth = fly(survey(), FLIGHT_S, 50.0)
+    inertial, rows = noised(truth, GRADES["tactical"], Fixes(share=0.8, rate_hz=5.0), ARM, 11)
+    bad = (rows["time_ns"] >= ns(300.0)) & (rows["time_ns"] < ns(305.0 if fault == "frozen" else 320.0))
+    rows["value"][bad] = rows["value"][bad][0] if fault == "frozen" else rows["value"][bad] + [0.9, 0.8, 1.0]
+    solved = solve(inertial, rows, setup_for(GRADES["tactical"], ARM), drawn_start(truth, 11))
+    assert solved.report.noise is not None
+    assert solved.report.noise.best.share >= 0.5
+    found = solved.smoothed
+    far = (found.time_ns < ns(280.0)) | (found.time_ns > ns(350.0))
+    t = truth.edges[np.searchsorted(ns(truth.edges), found.time_ns[far])]
+    off = errors(truth, t, found.position_e[far], found.velocity_e[far], found.q_e_from_b[far])[:, :3]
+    assert np.mean((off / found.position_sigma_l[far]) ** 2) < 1.0 + 3 * 0.4
+
+
 def test_what_a_flight_says_nothing_of_is_told() -> None:
     """Straight and level, a lever arm sought: along the flight it moves like the start, the flight cannot tell."""
     truth = fly(survey(line_s=1000.0), 60.0, 50.0)

@@ -50,6 +50,19 @@ def test_a_vehicle_that_stands_is_seen_but_for_the_ends(calm: tuple[NDArray[np.f
     assert not rows["value"].any()
 
 
+@pytest.mark.parametrize("rate_hz", [1, 20])
+@pytest.mark.parametrize(("speed_mps", "stands"), [(0.0, True), (0.3, False), (1.5, False)])
+def test_positions_alone_tell_a_slow_flight_from_standing_however_often_they_come(
+    calm: tuple[NDArray[np.float64], NDArray[np.float64]], rate_hz: int, speed_mps: float, stands: bool
+) -> None:
+    rows = np.zeros(40 * rate_hz, OBSERVATION_DTYPE)
+    t = np.arange(len(rows)) / rate_hz
+    rows["time_ns"] = EPOCH_NS + np.rint(t * 1e9).astype(np.int64)
+    rows["kind"], rows["sigma"] = Kind.POSITION, 0.02
+    rows["value"] = e_from_geodetic(0.8, 0.1, 500.0) + np.outer(speed_mps * t, [0.0, 1.0, 0.0])
+    assert bool(len(still_seconds(unit(40, *calm), rows))) == stands
+
+
 def test_even_straight_flight_feels_like_standing_and_is_not(
     calm: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
