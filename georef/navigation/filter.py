@@ -253,7 +253,7 @@ def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
         total_decay=total_decay,
         sigma=np.zeros(9),
         bridge=np.zeros(3),
-        refused=np.stack([none, none, none + start.time_ns, none + settled_ns]),
+        refused=np.stack([none, none, none + start.time_ns, none + settled_ns, none, none]),
         lately=np.zeros((6, KINDS)),
         top=np.zeros((MOVED, layout.core)),
         work=np.zeros((MOVED, n)),

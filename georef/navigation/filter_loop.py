@@ -52,7 +52,7 @@ from georef.navigation.filter_types import (
     Running,
     Told,
 )
-from georef.navigation.gate import drifted, judge, noise_factor, settling
+from georef.navigation.gate import drifted, judge, leapt, noise_factor, settling
 from georef.navigation.inputs import Fate
 from georef.navigation.kalman import factorise, innovation_covariance, take_component, whiten, whiten_rows
 from georef.navigation.level import attitude_rows, level_axes
@@ -198,6 +198,9 @@ def observe(run: Running, model: Model, rows: Rows, r: int, nodes: Nodes, told: 
     lost = drifted(kind, s, noise, m)
     chi2 = tell(told, r, nu, s, m, run.small[7])
     settles = settling(run, model, kind, lost, chi2, m)
+    if leapt(run, model, kind, settles, chi2, m):
+        told.fate[r] = _REJECTED
+        return
     factor = 1.0
     if not settles:
         factor = noise_factor(run, kind, run.small[7], chi2, m, model.rules.gate[m] * model.rules.reject)

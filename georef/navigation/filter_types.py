@@ -20,8 +20,9 @@ KINDS = len(Kind)
 # Columns of `Running.clock`
 NOW, NEXT_STEP, NEXT_NODE, STARTED, GAPS, OUT, NODE, SCALAR = range(8)
 CLOCK_SIZE = 8
-# Rows of `Running.refused`: how many in a row, since when, when one was taken last, until when the state settles
-COUNT, SINCE_NS, TAKEN_NS, SETTLED_NS = 0, 1, 2, 3
+# Rows of `Running.refused`: how many in a row, since when, when one was taken last, until when the state settles; when
+# the last came if it was within the gate, when one leapt away
+COUNT, SINCE_NS, TAKEN_NS, SETTLED_NS, SOUND_NS, LEAPT_NS = 0, 1, 2, 3, 4, 5
 # Rows of `Running.lately`: mean χ² a component, of how many, mean product of neighbours, the last normalised (3)
 MEAN, SEEN, ALIKE, WHITE = 0, 1, 2, 3
 # Columns of `Told.figures`

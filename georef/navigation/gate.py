@@ -17,11 +17,13 @@ from georef.navigation.error_model import E_ATTITUDE, E_POSITION, E_VELOCITY, La
 from georef.navigation.filter_types import (
     ALIKE,
     COUNT,
+    LEAPT_NS,
     MEAN,
     NOW,
     SEEN,
     SETTLED_NS,
     SINCE_NS,
+    SOUND_NS,
     TAKEN_NS,
     WHITE,
     Model,
@@ -44,6 +46,8 @@ STEADY, FEW = 30.0, 5.0  # observations that a mean is of; from how many on it c
 TOLERATED = 1.5  # mean χ² a component that chance may give
 PERSISTENT = 0.5  # of it, mean product of neighbours: they are alike
 DRIFTED = 10.0  # an innovation's variance over the observation's own
+LEAP_NS = 2_500_000_000  # positions further apart than this may lie apart by the state's drift
+PATIENCE = 6  # times `reacquire_ns` for which a leap is taken for a wrong fix
 SETTLING = 25.0  # factor on χ² beyond which even a state that settles has an observation refused
 
 
@@ -121,6 +125,27 @@ def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: 
     if lost and chi2 > model.rules.gate[m]:
         run.refused[SETTLED_NS, kind] = run.clock[NOW] + model.reacquire_ns
     return bool(run.clock[NOW] < run.refused[SETTLED_NS, kind])
+
+
+@kernel
+def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> bool:
+    """Whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
+
+    So does a wrong fix. A state that is worse than its covariance leaves the gate slowly, and one that is not known
+    much better than the positions is to blame itself. What lasts longer than a wrong fix may is judged like the rest.
+    """
+    refused, now, gate = run.refused, run.clock[NOW], model.rules.gate[m]
+    if kind != _POSITION:
+        return False
+    if settles or chi2 <= gate * model.rules.reject:
+        refused[LEAPT_NS, kind] = 0
+        refused[SOUND_NS, kind] = now if chi2 <= gate else 0
+        return False
+    if refused[SOUND_NS, kind] > 0 and now - refused[SOUND_NS, kind] <= LEAP_NS:
+        refused[LEAPT_NS, kind] = now
+    refused[SOUND_NS, kind] = 0
+    since = refused[LEAPT_NS, kind]
+    return bool(since > 0 and now - since <= PATIENCE * model.reacquire_ns)
 
 
 @kernel

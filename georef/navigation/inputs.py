@@ -209,7 +209,8 @@ class Setup:
         gate_probability: a sound observation exceeds the gate so often.
         reject_factor: beyond so many times the gate's radius an observation is rejected, up to there inflated.
         reacquire_after: so many rejected in a row of one kind, over at least `reacquire_s`, widen the state.
-        reacquire_s: see there; and how long a state that has drifted, or has just begun, may settle.
+        reacquire_s: see there, of positions that leapt six times as long (`gate.leapt`); and how long a state that has
+            drifted, or has just begun, may settle.
         node_s: longest time between nodes of the smoother.
         step_s: longest step of the covariance.
         gnss_sigma_scale: by fix type, factor on positions' sigmas (as found by an earlier pass).

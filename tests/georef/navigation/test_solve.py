@@ -150,6 +150,23 @@ def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> 
     assert np.mean((off / found.position_sigma_l[far]) ** 2) < 1.0 + 3 * 0.4
 
 
+def test_a_wrong_fix_moves_nothing_while_velocities_say_that_it_is_one() -> None:
+    """1.6 m from one epoch to the next, for 20 s: refused to its end, and errors stay within their sigmas."""
+    truth = fly(survey(), FLIGHT_S, 50.0)
+    inertial, rows = noised(truth, GRADES["tactical"], Fixes(rate_hz=5.0, velocity_mps=0.02), ARM, 11)
+    bad = (rows["kind"] == Kind.POSITION) & (rows["time_ns"] >= ns(300.0)) & (rows["time_ns"] < ns(320.0))
+    rows["value"][bad] += [0.9, 0.8, 1.0]
+    solved = solve(inertial, rows, setup_for(GRADES["tactical"], ARM), drawn_start(truth, 11))
+    assert solved.forward.counts["position rejected"] == bad.sum()
+    assert "position reacquired" not in solved.forward.counts
+    found = solved.smoothed
+    near = (found.time_ns > ns(295.0)) & (found.time_ns < ns(345.0))
+    t = truth.edges[np.searchsorted(ns(truth.edges), found.time_ns[near])]
+    off = errors(truth, t, found.position_e[near], found.velocity_e[near], found.q_e_from_b[near])
+    assert np.abs(off[:, :3] / found.position_sigma_l[near]).max() < 5.0
+    assert np.abs(off[:, 3:6] / found.velocity_sigma_l[near]).max() < 5.0
+
+
 def test_what_a_flight_says_nothing_of_is_told() -> None:
     """Straight and level, a lever arm sought: along the flight it moves like the start, the flight cannot tell."""
     truth = fly(survey(line_s=1000.0), 60.0, 50.0)
