@@ -22,7 +22,6 @@ from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline
 CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
 MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
 MAX_RATE_OFF = 1e-3  # of device time against GPS time
-KEPT_S = 0.5  # a wall clock whose greatest error is below this is kept by somebody
 
 
 @kept
@@ -140,7 +139,7 @@ class HostClocks:
         while readings and (until_ns is None or readings[0][1] + host_minus_ns <= until_ns):
             realtime_ns, _, raw_ns, max_error_s = readings.popleft()
             for clock in self._told:
-                clock.set_wall_clock(raw_ns, realtime_ns, disciplined=max_error_s < KEPT_S, sigma_s=max_error_s)
+                clock.set_wall_clock(raw_ns, realtime_ns, disciplined=math.isfinite(max_error_s), sigma_s=max_error_s)
 
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
         """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""

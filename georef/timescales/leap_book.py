@@ -85,7 +85,8 @@ class LeapBook:
     def _note_date(self, tag: TimeTag) -> None:
         """A leap count is often said without a date (NAV-TIMELS), also in a recording of years ago."""
         if tag.scale is TimeScale.GPS and tag.week is not None:
-            self._date = utc_from_gps(gps_ns_from_week(tag.week, tag.time_ns), 18)[0]
+            leap = table_leap_seconds(dt.date.max)[0]  # of years ago there were fewer: no other date but at midnight
+            self._date = utc_from_gps(gps_ns_from_week(tag.week, tag.time_ns), leap)[0]
         elif tag.date is not None:
             self._date = tag.date
 

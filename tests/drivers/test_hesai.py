@@ -295,10 +295,17 @@ def test_what_is_encoded_is_decoded(seed: int, mode: int, qt: bool) -> None:
     np.testing.assert_array_equal(rows["device_time_ns"], second * 10**9 + time.microsecond * 1000 + start[there])
 
 
+def utc_at(head: HesaiHead) -> int:
+    """Where in a packet the date begins."""
+    fields = head.packet_dtype().fields
+    assert fields is not None
+    return int(fields["utc"][1])
+
+
 def test_a_date_counted_in_seconds() -> None:
     """HesaiLidar_SDK_2.0: a year of 0 is followed by seconds since 1970, the highest byte first."""
     unit = bytearray(packet())
-    at = XT32.packet_dtype().fields["utc"][1]  # type: ignore[index]
+    at = utc_at(XT32)
     unit[at : at + 6] = b"\0\0" + (1_795_262_400).to_bytes(4, "big")
     assert decode(bytes(unit))["device_time_ns"][-1] == NOON_NS + 52_872
 
@@ -307,7 +314,7 @@ def test_a_date_counted_in_seconds() -> None:
 def test_a_year_of_either_century(head: HesaiHead, year: int) -> None:
     """HesaiLidar_SDK_2.0, udp_protocol_v3_1.h and v6_1.h, GetMicroLidarTimeU64: 2026 in all of these."""
     unit = bytearray(packet(head))
-    unit[head.packet_dtype().fields["utc"][1]] = year  # type: ignore[index]
+    unit[utc_at(head)] = year
     np.testing.assert_array_equal(decode(bytes(unit), head), decode(packet(head), head))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -188,6 +189,24 @@ def test_restart_is_a_new_segment() -> None:
     assert np.max(np.abs(late)) < 300
 
 
+def fed_whole_and_in_pieces(rows: StructArray, seconds: int) -> Iterator[DeviceClock]:
+    """As a log is read, and as it is followed."""
+    for step in (len(rows), 37):
+        clock = DeviceClock(host_clock(seconds), keep_history=True)
+        for start in range(0, len(rows), step):
+            clock.add(rows[start : start + step])
+        yield clock
+
+
+def head_rows(times: NDArray[np.float64], free: NDArray[np.bool_], free_s: NDArray[np.float64]) -> StructArray:
+    """Of a head whose second is the edge while it is locked; free for so long it is 20 ppm fast."""
+    rows = rows_of(times, latched=False)
+    rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * free_s, 0.0)) * NS)
+    rows["locked"] = ~free
+    rows["pps_time_ns"] = np.where(free, -1, rows["device_time_ns"] // NS * NS)
+    return rows
+
+
 @pytest.mark.parametrize("latched", [False, True])
 @pytest.mark.parametrize(("silent_s", "ahead_s"), [(0.02, 20.123), (0.02, 1.7e9), (60.0, -20.123)])
 def test_device_time_that_jumps_is_a_new_segment(silent_s: float, ahead_s: float, latched: bool) -> None:
@@ -200,10 +219,7 @@ def test_device_time_that_jumps_is_a_new_segment(silent_s: float, ahead_s: float
         later["pps_time_ns"] += round(ahead_s * NS)
     rows, times = np.concatenate((rows, later)), np.concatenate((times, after))
     rows["pps_count"] = -1
-    for step in (len(rows), 37):
-        clock = DeviceClock(host_clock(200), keep_history=True)
-        for start in range(0, len(rows), step):
-            clock.add(rows[start : start + step])
+    for clock in fed_whole_and_in_pieces(rows, 200):
         gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
         assert np.all(np.abs(gps - START_S * NS - np.rint(times * NS)) < 4.0 * sigma + 300)
         assert clock.status().segments == 2
@@ -265,14 +281,8 @@ def test_a_head_that_loses_its_pulse_is_not_called_latched_meanwhile() -> None:
     """A head whose second is the edge while locked drifts by 20 ppm for a minute, then is set right again: 1.2 ms."""
     times = np.arange(20.003, 160.0, 0.02)
     free = (times >= 60.0) & (times < 120.0)
-    rows = rows_of(times, latched=False)
-    rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * (times - 60.0), 0.0)) * NS)
-    rows["locked"] = ~free
-    rows["pps_time_ns"] = np.where(free, -1, rows["device_time_ns"] // NS * NS)
-    for step in (len(rows), 37):
-        clock = DeviceClock(host_clock(180), keep_history=True)
-        for start in range(0, len(rows), step):
-            clock.add(rows[start : start + step])
+    rows = head_rows(times, free, times - 60.0)
+    for clock in fed_whole_and_in_pieces(rows, 180):
         gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
         error = np.abs(gps - START_S * NS - np.rint(times * NS))
         assert np.all(error < 4.0 * sigma + 300)
@@ -284,14 +294,8 @@ def test_a_pulse_that_is_missed_costs_no_returns() -> None:
     """Unlocked for one second in five, 20 ppm off then: 20 µs, and not the 2 ms of arrivals, no time for returns."""
     times = np.arange(21.003, 160.0, 0.02)
     free = times // 1.0 % 5 == 0
-    rows = rows_of(times, latched=False)
-    rows["device_time_ns"] = np.rint((times + np.where(free, 20e-6 * (times % 1.0), 0.0)) * NS)
-    rows["locked"] = ~free
-    rows["pps_time_ns"] = np.where(free, -1, rows["device_time_ns"] // NS * NS)
-    for step in (len(rows), 37):
-        clock = DeviceClock(host_clock(180), keep_history=True)
-        for start in range(0, len(rows), step):
-            clock.add(rows[start : start + step])
+    rows = head_rows(times, free, times % 1.0)
+    for clock in fed_whole_and_in_pieces(rows, 180):
         gps, sigma = clock.gps_from_device(rows["device_time_ns"], rows["host_time_ns"])
         error = np.abs(gps - START_S * NS - np.rint(times * NS))
         assert np.all(error < 4.0 * sigma + 300)
