@@ -35,6 +35,10 @@ class Header:
         installation: id of the mounting.
         logs: name and SHA-256 (hex) of each.
         variance_factor, redundancy: of the adjustment; None: there was none.
+        verdict: one of `georef.calibration.VERDICTS`; empty: nobody judged it.
+        verdict_reasons: why it is not simply good, one sentence each.
+        held: keys of parameters that were asked for and not estimated.
+        trajectory: ``navigated``, ``ins`` or ``file``, from which it was made; empty: not known.
     """
 
     id: str
@@ -47,6 +51,10 @@ class Header:
     logs: tuple[tuple[str, str], ...] = ()
     variance_factor: float | None = None
     redundancy: float | None = None
+    verdict: str = ""
+    verdict_reasons: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    trajectory: str = ""
 
 
 def calibration_text(calibration: Calibration, header: Header) -> str:
@@ -92,6 +100,10 @@ def _header(calibration: Calibration, header: Header) -> list[str]:
         ("logs", f"[{logs}]"),
         ("variance_factor", _optional(header.variance_factor)),
         ("redundancy", None if header.redundancy is None else _number(header.redundancy)),
+        ("trajectory", _text(header.trajectory) if header.trajectory else None),
+        ("held", _texts(header.held) if header.verdict or header.held else None),
+        ("verdict", _text(header.verdict) if header.verdict else None),
+        ("verdict_reasons", _texts(header.verdict_reasons) if header.verdict else None),
     ]
     return ["[calibration]", *(f"{key} = {value}" for key, value in rows if value is not None)]
 
@@ -103,17 +115,22 @@ def _parameters(calibration: Calibration) -> list[str]:
 
 
 def _estimated(calibration: Calibration) -> list[list[str]]:
-    """Tables [sigma] and [correlation] of what was estimated."""
-    sigmas = calibration.sigmas.tolist()
-    at = [index for index, sigma in enumerate(sigmas) if sigma != 0.0]
-    if not at:
+    """Tables [sigma], [held_sigma] and [correlation], the last of both together."""
+    blocks = []
+    for title, sigmas in (("sigma", calibration.sigmas), ("held_sigma", calibration.held_sigmas)):
+        rows = [
+            f"{parameter.key} = {in_unit(sigma, parameter.factor)!r}"
+            for parameter, sigma in zip(PARAMETERS, sigmas.tolist(), strict=True)
+            if sigma != 0.0
+        ]
+        blocks += [[f"[{title}]", *rows]] if rows else []
+    at = np.flatnonzero(calibration.all_sigmas)
+    if not len(at):
         return []
-    keys = [PARAMETERS[index].key for index in at]
-    rows = (f"{PARAMETERS[index].key} = {in_unit(sigmas[index], PARAMETERS[index].factor)!r}" for index in at)
     matrix = calibration.correlation[np.ix_(at, at)]
     np.fill_diagonal(matrix, np.where(np.abs(np.diag(matrix) - 1.0) < ROUNDING, 1.0, np.diag(matrix)))
-    names = ", ".join(_text(key) for key in keys)
-    return [["[sigma]", *rows], ["[correlation]", f"names = [{names}]", f"matrix = {_long_matrix(matrix)}"]]
+    names = ", ".join(_text(PARAMETERS[index].key) for index in at)
+    return [*blocks, ["[correlation]", f"names = [{names}]", f"matrix = {_long_matrix(matrix)}"]]
 
 
 def _tables(calibration: Calibration) -> list[list[str]]:
@@ -188,6 +205,10 @@ def _time(value: dt.datetime) -> str:
     if value.utcoffset() is None:
         raise CalibrationFileError(f"created: {value.isoformat()} has no time zone; want UTC")
     return value.astimezone(dt.UTC).replace(tzinfo=None).isoformat() + "Z"
+
+
+def _texts(values: Iterable[str]) -> str:
+    return f"[{', '.join(map(_text, values))}]"
 
 
 def _list(values: Iterable[float]) -> str:

@@ -26,7 +26,8 @@ ROTATION_TOLERANCE = 1e-6
 LARGEST, LEAST_SIGMA = 1e18, 1e-15  # in the units of the file: far beyond what anything is, and still to be squared
 MOST = 65_535  # of channels, which have 16 bits, and of what is fewer
 ONE_TABLE = "want it once"
-TABLES = ("calibration", "parameters", "sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
+TABLES = ("calibration", "parameters", "sigma", "held_sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
+VERDICTS = ("good", "usable with care", "not to be used")
 
 
 class CalibrationError(ValueError):
@@ -35,32 +36,46 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter of the model: its key in files, its name here, and SI units a unit of the file."""
+    """A parameter of the model.
+
+    Attributes:
+        key: in calibration files.
+        name: in the code, with its SI unit.
+        factor: SI units per unit of the file.
+        likely: one sigma, in the file's unit, of its error where nobody has measured or calibrated it.
+        needed: whether a calibration file must give its value.
+    """
 
     key: str
     name: str
     factor: float
+    likely: float
     needed: bool = False
+
+    @property
+    def plausible(self) -> float:
+        """One sigma, SI, of its error where nobody has measured or calibrated it."""
+        return self.likely * self.factor
 
 
 _DEG, _PPM, _US = math.pi / 180.0, 1e-6, 1e-6
 PARAMETERS: tuple[Parameter, ...] = (
-    Parameter("omega_deg", "omega_rad", _DEG, needed=True),
-    Parameter("phi_deg", "phi_rad", _DEG, needed=True),
-    Parameter("kappa_deg", "kappa_rad", _DEG, needed=True),
-    Parameter("range_offset_m", "range_offset_m", 1.0, needed=True),
-    Parameter("range_scale_ppm", "range_scale", _PPM),
-    Parameter("scan_angle_offset_deg", "scan_angle_offset_rad", _DEG),
-    Parameter("scan_angle_scale_ppm", "scan_angle_scale", _PPM),
-    Parameter("scan_plane_tilt_deg", "scan_plane_tilt_rad", _DEG),
-    Parameter("lever_arm_x_m", "lever_arm_x_m", 1.0, needed=True),
-    Parameter("lever_arm_y_m", "lever_arm_y_m", 1.0, needed=True),
-    Parameter("lever_arm_z_m", "lever_arm_z_m", 1.0, needed=True),
-    Parameter("time_offset_us", "time_offset_s", _US),
-    Parameter("imu_latency_us", "imu_latency_s", _US),
-    Parameter("encoder_latency_us", "encoder_latency_s", _US),
-    Parameter("torsion_us2", "torsion_s2", _US * _US),
-    Parameter("pitch_slope_ppm", "pitch_slope", _PPM),
+    Parameter("omega_deg", "omega_rad", _DEG, 1.0, needed=True),
+    Parameter("phi_deg", "phi_rad", _DEG, 1.0, needed=True),
+    Parameter("kappa_deg", "kappa_rad", _DEG, 1.0, needed=True),
+    Parameter("range_offset_m", "range_offset_m", 1.0, 0.2, needed=True),
+    Parameter("range_scale_ppm", "range_scale", _PPM, 50.0),
+    Parameter("scan_angle_offset_deg", "scan_angle_offset_rad", _DEG, 0.02),
+    Parameter("scan_angle_scale_ppm", "scan_angle_scale", _PPM, 300.0),
+    Parameter("scan_plane_tilt_deg", "scan_plane_tilt_rad", _DEG, 0.02),
+    Parameter("lever_arm_x_m", "lever_arm_x_m", 1.0, 0.05, needed=True),
+    Parameter("lever_arm_y_m", "lever_arm_y_m", 1.0, 0.05, needed=True),
+    Parameter("lever_arm_z_m", "lever_arm_z_m", 1.0, 0.05, needed=True),
+    Parameter("time_offset_us", "time_offset_s", _US, 1000.0),
+    Parameter("imu_latency_us", "imu_latency_s", _US, 1000.0),
+    Parameter("encoder_latency_us", "encoder_latency_s", _US, 2.0),
+    Parameter("torsion_us2", "torsion_s2", _US * _US, 2000.0),
+    Parameter("pitch_slope_ppm", "pitch_slope", _PPM, 500.0),
 )
 INDEX = {parameter.name: index for index, parameter in enumerate(PARAMETERS)}  # of SI names in arrays (16,)
 _INDEX_OF_KEY = {parameter.key: index for index, parameter in enumerate(PARAMETERS)}
@@ -92,8 +107,8 @@ class Calibration:
     Attributes:
         id, scanner, method: of the file.
         parameters: (16,) in the order of `PARAMETERS`.
-        sigmas: (16,) one sigma; 0: held fixed.
-        correlation: (16, 16).
+        sigmas: (16,) one sigma of those that were estimated, with what the held ones may have wrong; 0: held.
+        correlation: (16, 16) of the estimated and held ones together.
         installation_matrix: (3, 3) T, b from s (inside a gimbal: its innermost stage from s).
         mirror_factor: of the encoder's angles it was estimated with; None: unsaid.
         ranges, refraction: the [atmosphere] settings it was estimated with; None: unsaid.
@@ -102,6 +117,7 @@ class Calibration:
         facet_tilt_rad: tilt of facets by index.
         beams: corrections of beams by channel.
         header: all of the file's table [calibration].
+        held_sigmas: (16,) one sigma that is plausible of those that were held; 0: estimated, or nothing is said.
     """
 
     id: str
@@ -119,6 +135,7 @@ class Calibration:
     facet_tilt_rad: Mapping[int, float] = field(default_factory=dict)
     beams: Mapping[int, BeamCorrection] = field(default_factory=dict)
     header: Mapping[str, Any] = field(default_factory=dict)
+    held_sigmas: FloatArray = field(default_factory=lambda: np.zeros(len(PARAMETERS)))
 
     def value(self, name: str) -> float:
         """A parameter by its name in SI units, as ``omega_rad``."""
@@ -129,9 +146,15 @@ class Calibration:
         """(3,) from the body's origin to the scanner's (to the first stage of its gimbal), metres."""
         return np.array([self.value(f"lever_arm_{axis}_m") for axis in "xyz"])
 
+    @property
+    def all_sigmas(self) -> FloatArray:
+        """(16,) one sigma of every parameter, estimated or held; 0: nothing is said of it."""
+        return self.sigmas + self.held_sigmas
+
     def covariance(self) -> FloatArray:
-        """(16, 16) of the parameters, SI units; zero where held fixed."""
-        scaled: FloatArray = self.correlation * np.outer(self.sigmas, self.sigmas)
+        """(16, 16) of the parameters, estimated and held, SI units; zero where nothing is said of them."""
+        sigmas = self.all_sigmas
+        scaled: FloatArray = self.correlation * np.outer(sigmas, sigmas)
         return scaled
 
     def changed(self, **values: float) -> Calibration:
@@ -186,18 +209,20 @@ class _Reader:
         header = self._table("calibration", needed=True)
         self._version(header)
         parameters, _ = self._values("parameters")
-        sigmas, estimated = self._values("sigma")
-        in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
-        for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
-            want = "at least 0" if sigmas[index] < 0.0 else f"0, which is held, or at least {LEAST_SIGMA:g}"
-            self._wrong(f"sigma.{PARAMETERS[index].key}", f"got {in_units[index]:g}, want {want}")
+        sigmas, estimated = self._sigmas("sigma")
+        held_sigmas, held = self._sigmas("held_sigma")
+        for index in np.flatnonzero((sigmas != 0.0) & (held_sigmas != 0.0)).tolist():
+            self._wrong(f"held_sigma.{PARAMETERS[index].key}", "is in [sigma] too; want it in one of the two tables")
+        if "verdict" in header:
+            self._choice(header, "verdict", VERDICTS)
         return Calibration(
             id=self._text(header, "id"),
             scanner=self._text(header, "scanner"),
             method=self._choice(header, "method", METHODS) or "nominal",
             parameters=parameters,
             sigmas=sigmas,
-            correlation=self._correlation(estimated),
+            held_sigmas=held_sigmas,
+            correlation=self._correlation(estimated | held),
             installation_matrix=self._rotation(header),
             mirror_factor=self._mirror_factor(header),
             ranges=self._choice(header, "ranges", RANGES),
@@ -282,15 +307,24 @@ class _Reader:
                 said.add(index)
         return values, said
 
-    def _correlation(self, estimated: set[int]) -> FloatArray:
-        """(16, 16) from the names and the matrix of those that were estimated."""
+    def _sigmas(self, section: str) -> tuple[FloatArray, set[int]]:
+        """(16,) sigmas in SI units, none negative or too small to be squared, and which of them were said."""
+        sigmas, said = self._values(section)
+        in_units = sigmas / [parameter.factor for parameter in PARAMETERS]
+        for index in np.flatnonzero((sigmas != 0.0) & (in_units < LEAST_SIGMA)).tolist():
+            want = "at least 0" if sigmas[index] < 0.0 else f"0, which is held, or at least {LEAST_SIGMA:g}"
+            self._wrong(f"{section}.{PARAMETERS[index].key}", f"got {in_units[index]:g}, want {want}")
+        return sigmas, said
+
+    def _correlation(self, known: set[int]) -> FloatArray:
+        """(16, 16) from the names and the matrix of those whose sigmas were said."""
         whole = np.eye(len(PARAMETERS))
         table = self._table("correlation")
         if not table:
             return whole
         names = table.get("names")
-        if not isinstance(names, list) or any(_INDEX_OF_KEY.get(str(name)) not in estimated for name in names):
-            self._wrong("correlation.names", "want a list of keys of [sigma]")
+        if not isinstance(names, list) or any(_INDEX_OF_KEY.get(str(name)) not in known for name in names):
+            self._wrong("correlation.names", "want a list of keys of [sigma] and [held_sigma]")
             return whole
         matrix = _array(table.get("matrix"), (len(names), len(names)))
         if matrix is None or len(set(names)) < len(names) or not _is_correlation(matrix):

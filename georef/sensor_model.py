@@ -70,7 +70,7 @@ class SensorModel:
     def needs_encoder_motion(self) -> bool:
         """Whether encoder latency or torsion, or their sigmas, ask for the encoder's rate and acceleration."""
         asking = [INDEX["encoder_latency_s"], INDEX["torsion_s2"]]
-        return bool(self.calibration.parameters[asking].any() or self.calibration.sigmas[asking].any())
+        return bool(self.calibration.parameters[asking].any() or self.calibration.all_sigmas[asking].any())
 
     def rays(
         self,

@@ -80,10 +80,11 @@ class Uncertainty:
         Raises:
             UncertaintyError: the calibration's correlations are no covariance.
         """
-        active = np.flatnonzero(calibration.sigmas > 0.0)
+        sigmas = calibration.all_sigmas
+        active = np.flatnonzero(sigmas > 0.0)
         try:
             correlation = calibration.correlation[np.ix_(active, active)]
-            factor = calibration.sigmas[active, np.newaxis] * np.linalg.cholesky(correlation)
+            factor = sigmas[active, np.newaxis] * np.linalg.cholesky(correlation)
         except np.linalg.LinAlgError as error:
             text = f"calibration {calibration.id}: its correlations are no covariance; want a positive definite matrix"
             raise UncertaintyError(text) from error

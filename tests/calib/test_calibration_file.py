@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime as dt
 import math
+import re
 import tomllib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.calibration_file import CalibrationFileError, Header, calibration_text
-from georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset, read_calibration
+from georef.calibration import (
+    INDEX,
+    PARAMETERS,
+    BeamCorrection,
+    Calibration,
+    CalibrationError,
+    RangeOffset,
+    read_calibration,
+)
 
 CREATED = dt.datetime(2026, 11, 21, 10, 15, tzinfo=dt.UTC)
 HEADER = Header("2026-11-21T10:15:00Z-ab12", CREATED, "planes", logs=(("a.mcap", "00ff"),))
@@ -32,12 +42,13 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     seed = draw(st.integers(0, 2**32 - 1))
     random = np.random.default_rng(seed)
     estimated = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+    held = ~estimated & np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
     factor = random.standard_normal((count, count + 3))
     covariance = factor @ factor.T
     correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     correlation = (correlation + correlation.T) / 2.0
     np.fill_diagonal(correlation, 1.0)
-    both = np.outer(estimated, estimated)
+    both = np.outer(estimated | held, estimated | held)
     turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
     intensity = np.sort(random.choice(10_000, draw(st.integers(1, 6)), replace=False)).astype(np.float64)
     offsets = st.builds(RangeOffset, REAL, st.integers(1, 7), st.none() | st.integers(0, 9), st.none() | REAL.map(abs))
@@ -48,6 +59,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
         parameters=np.array(draw(st.lists(REAL, min_size=count, max_size=count))),
         sigmas=np.where(estimated, random.lognormal(-8.0, 3.0, count), 0.0),
         correlation=np.where(both, correlation, np.eye(count)),
+        held_sigmas=np.where(held, random.lognormal(-8.0, 3.0, count), 0.0),
         installation_matrix=turn * np.linalg.det(turn),
         mirror_factor=draw(st.none() | REAL),
         ranges=draw(st.sampled_from([None, "corrected", "vacuum"])),
@@ -67,7 +79,7 @@ def close(read: Any, written: Any) -> None:
 def same(read: Calibration, written: Calibration, *, exactly: bool) -> None:
     """All that a file holds agrees."""
     check = np.testing.assert_array_equal if exactly else close
-    for name in ("parameters", "sigmas"):
+    for name in ("parameters", "sigmas", "held_sigmas"):
         check(getattr(read, name), getattr(written, name))
     for name in ("correlation", "installation_matrix"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
@@ -144,6 +156,46 @@ def test_the_file_of_the_conventions() -> None:
     assert list(document["parameters"]) == [parameter.key for parameter in PARAMETERS]
     assert document["sigma"] == {"omega_deg": 0.001, "range_scale_ppm": 2.0}
     assert document["correlation"] == {"names": ["omega_deg", "range_scale_ppm"], "matrix": [[1, 0.25], [0.25, 1]]}
+
+
+def judged() -> tuple[Calibration, Header]:
+    """Roll estimated beside a scan angle scale that was held, and the verdict on it."""
+    sigmas, held, correlation = np.zeros(16), np.zeros(16), np.eye(16)
+    roll, scale = INDEX["omega_rad"], INDEX["scan_angle_scale"]
+    sigmas[roll], held[scale] = math.radians(0.01), 3e-4
+    correlation[roll, scale] = correlation[scale, roll] = -0.99
+    header = Header("id", CREATED, "planes", verdict="usable with care", trajectory="navigated")
+    header = replace(header, verdict_reasons=('κ is "held"', "two"), held=("scan_angle_scale_ppm",))
+    return Calibration("x", "left", "nominal", np.zeros(16), sigmas, correlation, held_sigmas=held), header
+
+
+def test_the_verdict_and_the_held_parameters_stand_in_the_file() -> None:
+    calibration, header = judged()
+    read = read_calibration(calibration_text(calibration, header), "test")
+    assert read.header["verdict"] == "usable with care"
+    assert read.header["verdict_reasons"] == ['κ is "held"', "two"]
+    assert read.header["held"] == ["scan_angle_scale_ppm"]
+    assert read.header["trajectory"] == "navigated"
+    covariance, scale = read.covariance(), INDEX["scan_angle_scale"]
+    assert covariance[scale, scale] == pytest.approx(9e-8)
+    assert covariance[0, scale] == pytest.approx(-0.99 * math.radians(0.01) * 3e-4)
+    assert (read.sigmas[scale], read.held_sigmas[0]) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("said", "instead", "message"),
+    [
+        ("omega_deg = 0.01", "omega_deg = 0.01\nscan_angle_scale_ppm = 1.0", "is in [sigma] too"),
+        ("scan_angle_scale_ppm = 300.0", "scan_angle_scale_ppm = -1.0", "held_sigma.scan_angle_scale_ppm: got -1"),
+        ("scan_angle_scale_ppm = 300.0", "twist_deg = 1.0", "held_sigma.twist_deg: no parameter of the model"),
+        ('"usable with care"', '"fine"', "calibration.verdict: got 'fine', want one of good, usable with care"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(said: str, instead: str, message: str) -> None:
+    text = calibration_text(*judged())
+    assert said in text
+    with pytest.raises(CalibrationError, match=re.escape(message)):
+        read_calibration(text.replace(said, instead), "test")
 
 
 def test_tables_match_as_they_did() -> None:

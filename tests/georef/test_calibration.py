@@ -222,7 +222,10 @@ def test_mistakes_of_header_and_parameters(old: str, new: str, wrong: str) -> No
         ("[[beam]]\nchannel = 1\n[[beam]]\nchannel = 1", "beam[1].channel: beam 1 stands there twice; want it once"),
         ("[beam]\nchannel = 1", "beam: want tables [[beam]]"),
         ("[[range_offsets]]\nreturn_slot = 1\noffset_m = 1", "range_offsets: is not known; want calibration, param"),
-        ("[ibrcs]\nintensity = [1]", "ibrcs: is not known; want calibration, parameters, sigma, correlation, ibrc"),
+        (
+            "[ibrcs]\nintensity = [1]",
+            "ibrcs: is not known; want calibration, parameters, sigma, held_sigma, correlation, ibrc",
+        ),
         ("[[beam]]\nchannel = 1\nazimuth_rad = 0.1", "beam[0].azimuth_rad: is not known; want channel, azimuth_deg"),
         ("[[range_offset]]\nreturn_slot = 0\noffset_m = 1", "range_offset[0].return_slot: got 0, want a whole"),
         ("[[beam]]\nchannel = 70000", "beam[0].channel: got 70000, want a whole number from 0 to 65535"),

@@ -289,3 +289,18 @@ def test_an_encoder_latency_of_none_has_a_sigma_all_the_same() -> None:
     assert more == pytest.approx((60.0 * 1e-6 * geometry.range_m) ** 2, rel=1e-6)
     assert SensorModel(geometry.calibration, LineGeometry()).needs_encoder_motion
     assert not SensorModel(NOMINAL, LineGeometry()).needs_encoder_motion
+
+
+def test_a_held_parameter_counts_in_points_and_cancels_with_what_was_estimated() -> None:
+    """A range offset held to 5 cm makes points 5 cm uncertain; a lever arm estimated beside it takes that back."""
+    none, arm, offset = np.zeros(len(NAMES)), NAMES.index("lever_arm_z_m"), NAMES.index("range_offset_m")
+    held, sigmas, correlation = none.copy(), none.copy(), np.eye(len(NAMES))
+    held[offset] = sigmas[arm] = 0.05
+    silent = Noise(0.0, 0.0, 0.0, 0.0)
+    alone = sigmas_enu(level(replace(NOMINAL, held_sigmas=held)), silent)
+    exact = sigmas_enu(level(NOMINAL), silent)
+    up = 0.05 * np.cos(np.radians(20.0))
+    assert alone[2] == pytest.approx(np.hypot(exact[2], up), abs=1e-6)
+    correlation[arm, offset] = correlation[offset, arm] = -0.9999
+    both = sigmas_enu(level(replace(NOMINAL, sigmas=sigmas, held_sigmas=held, correlation=correlation)), silent)
+    assert both[2] == pytest.approx(exact[2], abs=2e-4)
