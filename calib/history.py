@@ -62,13 +62,18 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """Two calibrations: differences of the parameters that both estimated, and χ² of all with their correlations."""
+    """Two calibrations: differences of the parameters that both estimated, and χ² of all with their correlations.
+
+    Attributes:
+        weights: of each difference, diagonal of their covariance's inverse, SI: what an error of it adds to χ².
+    """
 
     earlier: str
     later: str
     rows: tuple[Difference, ...]
     chi2: float
     freedom: int
+    weights: tuple[float, ...] = ()
 
     @property
     def p(self) -> float:
@@ -109,8 +114,10 @@ def compare(earlier: Calibration, later: Calibration, names: Sequence[str] | Non
         for index, value, sigma in zip(at, difference, sigmas, strict=True)
     )
     scaled = covariance / np.outer(sigmas, sigmas)
-    whole = float((difference / sigmas) @ np.linalg.pinv(scaled, hermitian=True) @ (difference / sigmas)) if at else 0.0
-    return Compared(earlier.id, later.id, rows, whole, len(at))
+    inverse = np.linalg.pinv(scaled, hermitian=True) if at else np.zeros((0, 0))
+    whole = float((difference / sigmas) @ inverse @ (difference / sigmas))
+    weights = tuple((np.diag(inverse) / sigmas**2).tolist())
+    return Compared(earlier.id, later.id, rows, whole, len(at), weights)
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,11 +128,6 @@ def _to_knots(
     by_knot: FloatArray, prior: TrajectoryPrior, flown: int, time_ns: Int64Array, effects: FloatArray
 ) -> None:
     """Add effects (k, 6) at moments (k,) to those of the knots (knots, 6) between which they lie."""
-    mine = np.flatnonzero(prior.flown == flown)
-    knots = prior.time_ns[mine]
-    after = np.clip(np.searchsorted(knots, time_ns), 1, max(len(knots) - 1, 1))
-    before, after = after - 1, np.minimum(after, len(knots) - 1)
-    apart = np.maximum(knots[after] - knots[before], 1)
-    share = np.clip((time_ns - knots[before]) / apart, 0.0, 1.0)[:, np.newaxis]
-    np.add.at(by_knot, mine[before], (1.0 - share) * effects)
-    np.add.at(by_knot, mine[after], share * effects)
+    before, after, share = prior.between(flown, time_ns)
+    np.add.at(by_knot, before, (1.0 - share[:, np.newaxis]) * effects)
+    np.add.at(by_knot, after, share[:, np.newaxis] * effects)

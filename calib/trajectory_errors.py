@@ -107,6 +107,18 @@ class TrajectoryPrior:
         """(6k, 6k) inverse of the covariance; LinAlgError: it has none."""
         return inverted(self.covariance)
 
+    def between(self, flown: int, time_ns: Int64Array) -> tuple[Int64Array, Int64Array, FloatArray]:
+        """Return the knots (n,) before and after moments (n,) of a trajectory, and the share (n,) of the later one.
+
+        Outside of its knots the nearest counts alone.
+        """
+        mine = np.flatnonzero(self.flown == flown)
+        knots = self.time_ns[mine]
+        after = np.clip(np.searchsorted(knots, time_ns), 1, max(len(knots) - 1, 1))
+        before, after = after - 1, np.minimum(after, len(knots) - 1)
+        apart = np.maximum(knots[after] - knots[before], 1)
+        return mine[before], mine[after], np.clip((time_ns - knots[before]) / apart, 0.0, 1.0)
+
     def sigmas(self) -> FloatArray:
         """(k, 6) of the errors."""
         sigmas: FloatArray = np.sqrt(np.diag(self.covariance)).reshape(-1, ERRORS)

@@ -55,8 +55,8 @@ def command(
 ) -> None:
     """Validate a calibration by ISO/TS 19159-2, 6.8: six methods, each with numbers, a test and a sentence.
 
-    Exit code 1 when a test speaks against the calibration, when the boresight has moved, or when nothing could be
-    tested; 2 and 3 as ever.
+    Exit code 1 when a test speaks against the calibration, when the boresight has moved, or when nothing, or not all
+    that was asked for, could be tested; 2 and 3 as ever.
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
     from daemon.config import load_config

@@ -8,16 +8,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib.control import ControlError
-from calib.features import ControlPoint
+import numpy as np
+
+from calib.adjust import adjust
+from calib.control import ControlError, control_planes
+from calib.features import ControlPoint, Features
 from calib.flight import Flight, FlightError
 from calib.history import History, HistoryError, history
+from calib.normals import NormalError
+from calib.parameters import Wish as Model
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError
 from calib.record import Document
-from calib.validation import Method, Validation, same_logs, validate
+from calib.trajectory_errors import TrajectoryPrior
+from calib.validation import SIGMAS_DEG, SIGMAS_M, Asked, Method, Validation, same_logs, validate, with_sigmas
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import control_of
+from daemon.processing.calibrate_run import PLANES, prior_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
 from daemon.processing.flights import Wish
 from daemon.processing.json_values import finite
@@ -134,14 +141,18 @@ def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -
     refuse_installations(kept.logged)
     _refuse_others(wish, found, kept)
     flight = kept.flight
-    points, notes = ((), []) if wish.control is None else control_of(wish.control, flight, ["shift"])
+    points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])
+    named = sorted(found.calibrations)
+    found.notes += _assumed(kept)
+    _along(kept, found)
     told("planes", 0, 1)
     planes = find_planes(flight)
     if not planes.planes:
         raise UserError(f"{wish.logs.logs[0]}: no planes that two strips see; a validation wants strips that overlap")
-    anew = _anew(wish, found, kept, points, folder, told) if wish.anew else None
+    anew, why_not = _anew(wish, found, kept, points or (), folder, told) if wish.anew else (None, "")
     told("tests", 0, 1)
-    validation = validate(flight, planes, found.calibrations, points, anew)
+    asked = Asked(points, anew, why_not, named)
+    validation = validate(flight, planes, found.calibrations, asked, _prior(kept))
     paths = [part.path for logged in kept.logged for part in logged.session.parts]
     found.logs = [(path.name, sha256_of(path)) for path in paths]
     dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
@@ -159,24 +170,46 @@ def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
         made, flown = calibration.header.get("installation", ""), kept.logged[0].setup.config.profile.installation
         if made and flown and made != flown:
             found.notes.append(f'{log}: is of installation "{flown}", calibration {calibration.id} of "{made}"')
-    for name in sorted(scanners - set(found.calibrations)):
-        head = next(head for head in kept.flight.heads if head.name == name)
-        found.calibrations[name] = head.start
-        found.notes.append(f"{log}: {name}: no calibration named; validated along with {head.start.id}")
     if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
         raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
 
 
+def _along(kept: KeptFlight, found: _Found) -> None:
+    """Take the log's own calibration of scanners whose none was named; noted."""
+    for head in kept.flight.heads:
+        if head.name not in found.calibrations:
+            found.calibrations[head.name] = head.start
+            note = f"{kept.logged[0].log}: {head.name}: no calibration named; validated along with {head.start.id}"
+            found.notes.append(note)
+
+
+def _prior(kept: KeptFlight) -> TrajectoryPrior | None:
+    """Return the trajectory's errors as navigation knows them; None: a trajectory was given, and has sigmas at most."""
+    navigated = [flight.navigated for flight in kept.logged]
+    if any(one is None or len(one.legs) != 1 for one in navigated):
+        return None
+    return prior_of(kept)
+
+
+def _assumed(kept: KeptFlight) -> list[str]:
+    """Return a note for each trajectory that says no sigmas."""
+    filled = with_sigmas(kept.flight).trajectories
+    return [
+        f"{flight.log}: its trajectory lacks sigmas; {100 * SIGMAS_M:g} cm of position, {roll:g}° of roll and pitch "
+        f"and {heading:g}° of heading are assumed where it does"
+        for flight, before, after in zip(kept.logged, kept.flight.trajectories, filled, strict=True)
+        for roll, _, heading in [SIGMAS_DEG]
+        if not (
+            np.array_equal(before.position_sigma_l, after.position_sigma_l)
+            and np.array_equal(before.attitude_sigma_rad, after.attitude_sigma_rad)
+        )
+    ]
+
+
 def _anew(
     wish: ValidateWish, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
-) -> Mapping[str, Calibration]:
-    """Parameters from these logs and control alone, as `swath calibrate` finds them; none, and why is noted."""
-    from calib.adjust import adjust
-    from calib.control import control_planes
-    from calib.features import Features
-    from calib.normals import NormalError
-    from calib.parameters import Wish as Model
-    from daemon.processing.calibrate_run import PLANES, prior_of
+) -> tuple[Mapping[str, Calibration], str]:
+    """Return parameters from these logs and control alone, as `swath calibrate` finds them, or none and why."""
 
     def features(flight: Flight) -> Features:
         told("parameters anew", 0, 1)
@@ -185,18 +218,16 @@ def _anew(
     def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
         return features(replaced(kept.flight, calibrations, folder, "anew", wish.logs.workers))
 
-    log, start = kept.logged[0].log, found.calibrations
+    start = found.calibrations
     try:
         adjusted = adjust(
             kept.flight, features(kept.flight), Model("scanner"), prior_of(kept), start=start, rematch=found_anew
         )
-    except NormalError as error:
-        found.notes.append(f"{log}: parameters anew: {error}")
-        return {}
+    except (FlightError, NormalError) as error:
+        return {}, str(error)
     if not adjusted.converged:
-        found.notes.append(f"{log}: parameters anew: the adjustment does not converge")
-        return {}
-    return adjusted.calibrations
+        return {}, "the adjustment does not converge"
+    return adjusted.calibrations, ""
 
 
 # ---------------------------------------------------------------------- what is told
@@ -209,15 +240,13 @@ def _written(wish: ValidateWish, found: _Found) -> Validated:
     if found.validation is not None:
         record["validation"] = _record(found.validation)
         lines += [method.sentence for method in found.validation.methods] + [found.validation.sentence]
-        wrong += [] if found.validation.passed else [found.validation.sentence]
+        wrong += [] if found.validation.holds else [found.validation.sentence]
         found.notes += found.validation.dependent
     if found.histories:
         record["history"] = [one.record() for one in found.histories]
         for one in found.histories:
             lines += _table(one) + list(one.sentences)
-            wrong += list(one.sentences) if one.moved else []
-        if found.validation is None and not any(one.steps for one in found.histories):
-            wrong += [sentence for one in found.histories for sentence in one.sentences]  # nothing could be tested
+            wrong += list(one.sentences) if one.moved or not one.steps else []  # no step: nothing could be tested
     record["notes"] = found.notes
     record = finite(record)
     if wish.output is not None:
@@ -230,6 +259,8 @@ def _record(validation: Validation) -> dict[str, Any]:
         "passed": validation.passed,
         "sentence": validation.sentence,
         "independent": not validation.dependent,
+        "undone": list(validation.undone),
+        "smallest_errors": [one.record() for one in validation.detectable],
         "methods": [_method(method) for method in validation.methods],
     }
 
@@ -248,6 +279,7 @@ def _method(method: Method) -> dict[str, Any]:
         "numbers": None if numbers is None else {name: getattr(numbers, name) for name in names},
         "tests": tests,
         "sentence": method.sentence,
+        "smallest_errors": [one.record() for one in method.detectable],
     } | dict(method.more)
 
 

@@ -116,6 +116,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         logged: Any = SimpleNamespace(
             holes=[],
             log=path,
+            navigated=None,
             setup=SimpleNamespace(config=SimpleNamespace(profile=profile)),
             session=SimpleNamespace(parts=[SimpleNamespace(path=path)]),
         )
@@ -268,6 +269,51 @@ def test_check_points_are_counted_in_the_record(log: Path, made: Cast, tmp_path:
     methods = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]["methods"]
     (testfield,) = [one for one in methods if one["method"] == "testfield"]
     assert 5 < told["CA_TestRange.numberCheckPoints"]["value"] == testfield["points"] <= given
+
+
+def test_control_of_which_too_little_is_seen_is_a_problem(
+    log: Path, made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another site but for two points: what was asked for could not be done, and the verdict says so."""
+    control = tmp_path / "control.csv"
+    control_of(made, control)
+    header, *lines = control.read_text().splitlines()
+    away = [line.replace(",47.", ",48.") for line in lines[2:]]
+    control.write_text("\n".join([header, *lines[:2], *away]))
+    with pytest.raises(UserError, match=r"^not validated as asked: .*control: control is seen \d times only") as caught:
+        run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--control", str(control), "--json")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+    record = json.loads(capsys.readouterr().out)["validation"]
+    assert record["passed"] is True
+    assert record["undone"][0].startswith("control: control is seen")
+
+
+def test_parameters_that_cannot_be_measured_anew_are_a_problem(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(validate_run, "adjust", lambda *rest, **more: SimpleNamespace(converged=False))
+    monkeypatch.setattr(validate_run, "prior_of", lambda kept: None)
+    with pytest.raises(UserError, match="parameters anew: the adjustment does not converge") as caught:
+        run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--anew")
+    assert caught.value.exit_code == ExitCode.PROBLEM
+
+
+def test_a_history_that_says_nothing_is_a_problem_beside_logs_that_agree(log: Path, tmp_path: Path) -> None:
+    good, other = file_of(tmp_path / "good.toml", boresight(0.0)), tmp_path / "other.toml"
+    file_of(other, boresight(0.0), 2, place="elsewhere")
+    with pytest.raises(UserError, match="fewer than two calibrations with sigmas: no drift can be tested") as caught:
+        run(str(good), str(log), "--history", str(other))
+    assert caught.value.exit_code == ExitCode.PROBLEM
+
+
+def test_the_verdict_says_what_would_not_have_been_seen(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--json")
+    record = json.loads(capsys.readouterr().out)["validation"]
+    smallest = {one["parameter"]: one["smallest_error"] for one in record["smallest_errors"]}
+    assert 0.001 < smallest["omega_deg"] < 0.05
+    assert "; errors below omega " in record["sentence"]
 
 
 def test_a_scanner_that_the_log_has_not_is_named(log: Path, tmp_path: Path) -> None:
