@@ -3,6 +3,9 @@
     Week     GPSTime       Latitude      Longitude      H-Ell         Roll        Pitch      Heading
                (sec)     (+/-D M S)     (+/-D M S)        (m)        (deg)        (deg)        (deg)
 
+Columns stand apart by blanks, or by commas, semicolons or tabs; with other marks than commas between them, numbers may
+have decimal commas.
+
 Attitude is that of a body whose y axis points forward: roll, pitch and heading mean the same as here. Its yaw counts
 the other way round (Inertial Explorer User Guide 8.50, 3.2.3) and is not taken for a heading. Time is GPS time by week
 and second of the week, or by date; UTC needs the offset which the header may say.
@@ -65,6 +68,9 @@ FIX_TYPES = {
 }
 NEEDED = {"lat": "Latitude", "lon": "Longitude", "height": "H-Ell"}
 TOKEN = re.compile(r"\([^)]*\)|\S+")
+SEPARATORS = (";", "\t", ",")
+UNIT = re.compile(r"\((sec|m|deg|rad|HMS|\+/-D M S|D M S)\)")
+DECIMAL_COMMA = re.compile(r"(?<=[0-9]),(?=[0-9])")
 UTC_OFFSET = re.compile(r"^[ \t]*UTC Offset:[ \t]*-?([0-9]{1,3})(?:\.0*)?[ \t]*s?[ \t]*$", re.MULTILINE | re.IGNORECASE)
 SCALING = re.compile(r"^[ \t]*(Position|Attitude):[ \t]*([0-9]{1,6}(?:\.[0-9]{1,9})?)[ \t]*$", re.MULTILINE)
 MOST_COLUMNS = 200  # of an export; profiles have some 30
@@ -190,10 +196,43 @@ def read_waypoint(
 def _title_line(lines: list[str]) -> int | None:
     """Number of the line of names: those of a position are among them, and units stand below."""
     for number, (line, below) in enumerate(pairwise(lines)):
-        known = {NAMES.get(_plain(word)) for word in line.split()}
-        if {"lat", "lon"} <= known and re.search(r"\((sec|m|deg|rad|HMS|\+/-D M S|D M S)\)", below):
+        known = {NAMES.get(_plain(cell)) for cell in _cells(line, _separator(line))}
+        if {"lat", "lon"} <= known and UNIT.search(below):
             return number
     return None
+
+
+def _separator(titles: str) -> str | None:
+    """Return the mark between the names of columns; None: blanks."""
+    return next((mark for mark in SEPARATORS if titles.count(mark) > 1), None)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    """Return the cells of a line, without quotes."""
+    if separator is None:
+        return line.split()
+    return [cell.strip().strip('"').strip() for cell in line.split(separator)]
+
+
+def _names(titles: str, separator: str | None) -> list[str]:
+    """Return the names of columns; a mark behind the last one begins none."""
+    cells = _cells(titles, separator)
+    return cells[:-1] if cells and not cells[-1] else cells
+
+
+def _blank_separated(lines: list[str], separator: str | None, columns: int) -> list[str]:
+    """Return lines of data with blanks between columns and decimal points; an empty cell becomes ``nan``."""
+    if separator is None:
+        told = " ".join(lines)
+        return [DECIMAL_COMMA.sub(".", line) for line in lines] if "," in told and "." not in told else lines
+    made = []
+    for line in lines:
+        cells = _cells(line, separator) if line.strip() else []
+        if len(cells) == columns + 1 and not cells[-1]:  # a mark behind the last column
+            cells.pop()
+        joined = " ".join(cell or "nan" for cell in cells)
+        made.append(joined if separator == "," else DECIMAL_COMMA.sub(".", joined))
+    return made
 
 
 def _plain(title: str) -> str:
@@ -205,33 +244,44 @@ def _sheet(text: str, name: str) -> Sheet:
     at = _title_line(lines)
     if at is None:
         raise TrajectoryError(f"{name}: no line of column names (Latitude, Longitude, …) with their units below it")
-    if len(lines[at].split()) > MOST_COLUMNS:
+    separator = _separator(lines[at])
+    if len(_names(lines[at], separator)) > MOST_COLUMNS:
         raise TrajectoryError(
             f"{name}: line {at + 1} names more than {MOST_COLUMNS} columns; export those of a trajectory"
         )
-    columns, words = _layout(lines[at], lines[at + 1])
-    counts = [len(line.split()) for line in lines[at + 2 :]]
+    columns, words = _layout(lines[at], lines[at + 1], separator)
+    below = _blank_separated(lines[at + 2 :], separator, len(_names(lines[at], separator)))
+    counts = [len(line.split()) for line in below]
     rows = [number for number, count in enumerate(counts) if count == words]
     if not rows:
+        most = max(counts, default=0)
+        if separator == "," and words < most <= 2 * words:
+            raise TrajectoryError(
+                f"{name}: line {at + 3 + counts.index(most)} has {most} cells for {words} columns: decimal commas "
+                "cannot be told from commas between columns; export it with decimal points, or with semicolons or blanks"
+            )
         raise TrajectoryError(f"{name}: no line of {words} words, as its columns have, below line {at + 2}")
     for number in range(rows[0], rows[-1]):  # a header and a footer may be there; a gap between may not
         if counts[number] != words:
             what = f"{words} words are expected, {counts[number]} are there"
             raise TrajectoryError(f"{name}: line {number + at + 3}: {what}")
-    data = lines[at + 2 + rows[0] : at + 3 + rows[-1]]
+    data = below[rows[0] : rows[-1] + 1]
     return Sheet("\n".join(lines[:at]), columns, data, at + 3 + rows[0], name)
 
 
-def _layout(titles: str, units: str) -> tuple[dict[str, Column], int]:
-    """Columns, and the number of words in a line. A unit belongs to the name above it."""
-    names, below = list(TOKEN.finditer(titles)), list(TOKEN.finditer(units))
-    unit_of = _unit_of(names, below[: len(names)])
+def _layout(titles: str, units: str, separator: str | None) -> tuple[dict[str, Column], int]:
+    """Columns, and the number of words in a line. A unit belongs to the name above it, or in the same cell."""
+    if separator is None:
+        tokens, below = list(TOKEN.finditer(titles)), list(TOKEN.finditer(units))
+        names, unit_of = [token[0] for token in tokens], _unit_of(tokens, below[: len(tokens)])
+    else:
+        names, unit_of = _names(titles, separator), dict(enumerate(_cells(units, separator)))
     columns: dict[str, Column] = {}
     first = 0
     for i, title in enumerate(names):
         unit = unit_of.get(i, "")
         words = 3 if re.search(r"D M S", unit) else 1
-        columns.setdefault(NAMES.get(_plain(title[0]), title[0]), Column(unit, first, words))
+        columns.setdefault(NAMES.get(_plain(title), title), Column(unit, first, words))
         first += words
     return columns, first
 

@@ -182,6 +182,62 @@ def test_waypoint_export_is_read() -> None:
     np.testing.assert_allclose(back.attitude_sigma_rad, trajectory.attitude_sigma_rad, atol=1e-8)
 
 
+NAMED = "Week GPSTime Latitude Longitude H-Ell Roll Pitch Heading Q"
+UNITS = "(weeks) (sec) (deg) (deg) (m) (deg) (deg) (deg)"  # Q has none
+
+
+def separated(mark: str, comma: bool, dms_cells: bool = False) -> str:
+    """An export of four epochs with a mark between its columns, of which line 3 of the data has an empty Q."""
+    place = ("-8 30 0.0", "47 24 1.5") if dms_cells else ("-8.5000000000", "47.4004166667")
+    units = UNITS.replace("(deg) (deg) (m)", "(+/-D!M!S) (+/-D!M!S) (m)") if dms_cells else UNITS
+    lines = [mark.join(NAMED.split()), mark.join(units.split()).replace("!", " ")]
+    if mark == ";":  # some programs end every line with one
+        lines = [line + mark for line in lines]
+    for i in range(4):
+        cells = [
+            str(WEEK),
+            f"{SECOND}.{i}00",
+            place[1],
+            place[0],
+            "500.250",
+            "1.5",
+            "-2.5",
+            "359.0",
+            "" if i == 3 else "1",
+        ]
+        lines.append(mark.join(cell.replace(".", ",") if comma else cell for cell in cells) + mark * (mark == ";"))
+    return "\n".join([HEAD, *lines, ""])
+
+
+@pytest.mark.parametrize(
+    ("mark", "comma", "dms_cells"),
+    [
+        (",", False, False),
+        (",", False, True),
+        (", ", False, False),
+        (";", False, False),
+        (";", True, False),
+        (";", True, True),
+        ("\t", False, False),
+        ("\t", True, True),
+        ("  ", True, False),
+    ],
+)
+def test_waypoint_columns_may_stand_apart_by_marks(mark: str, comma: bool, dms_cells: bool) -> None:
+    text = separated(mark, comma, dms_cells)
+    trajectory = read(f"{text.rstrip()} 1" if mark == "  " else text)  # an empty cell is none between blanks
+    assert trajectory.span == (START_NS, START_NS + 300_000_000)
+    lat, lon, height = trajectory.geodetic()
+    assert np.degrees([lat[3], lon[3]]) == pytest.approx([47.4 + 1.5 / 3600, -8.5], abs=1e-9)
+    assert height == pytest.approx([500.25] * 4)
+    assert np.degrees([angle[3] for angle in trajectory.attitude()]) == pytest.approx([1.5, -2.5, 359.0])
+
+
+def test_waypoint_decimal_commas_between_commas_name_what_to_export() -> None:
+    told = refusal(separated(",", True))
+    assert "decimal commas cannot be told from commas between columns; export it with decimal points" in told
+
+
 def test_waypoint_sigmas_are_scaled_back_to_one() -> None:
     trajectory = flown(100)
     twice = HEAD.replace("Position: 1.0000", "Position: 2.0000")
