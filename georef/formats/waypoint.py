@@ -258,7 +258,7 @@ def _sheet(text: str, name: str) -> Sheet:
         if separator == "," and words < most <= 2 * words:
             raise TrajectoryError(
                 f"{name}: line {at + 3 + counts.index(most)} has {most} cells for {words} columns: decimal commas "
-                "cannot be told from commas between columns; export it with decimal points, or with semicolons or blanks"
+                "cannot be told from commas between columns; export it with decimal points, or semicolons or blanks"
             )
         raise TrajectoryError(f"{name}: no line of {words} words, as its columns have, below line {at + 2}")
     for number in range(rows[0], rows[-1]):  # a header and a footer may be there; a gap between may not
