@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from calib.flight import Flight, Head, Swath, Tangent
 from georef.beams import SpinningGeometry
 from georef.calibration import INDEX, PARAMETERS
+from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.records import Int64Array
 from georef.rotations import rot_from_quaternion
-from georef.trajectory import Trajectory
+from georef.trajectory import Poses, Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -115,6 +116,48 @@ def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
     return turned @ head.start.installation_matrix
 
 
+@dataclass(frozen=True, eq=False)
+class _Arms:
+    """Where points of a strip were seen from: poses (n,), rot_t_from_b (n, 3, 3), body to point in t and b (n, 3)."""
+
+    poses: Poses
+    rot_t_from_b: FloatArray
+    arm_t: FloatArray
+    arm_b: FloatArray
+
+    @classmethod
+    def of(cls, points_t: FloatArray, strip: int, time_ns: Int64Array, seen: SeenFrom) -> _Arms:
+        """Of points (n, 3) at GPS times (n,)."""
+        poses = seen.trajectories[seen.flown[strip]].poses(time_ns)
+        rot_t_from_b = seen.frame.rot_t_from_e @ rot_from_quaternion(poses.q_e_from_b)
+        arm_t = points_t - seen.frame.t_from_e(poses.position_e)
+        return cls(poses, rot_t_from_b, arm_t, np.einsum("nji,nj->ni", rot_t_from_b, arm_t))
+
+
+def error_columns(points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, seen: SeenFrom) -> FloatArray:
+    """Return how points move with errors of the trajectory at their moments.
+
+    Args:
+        points_t: (n, 3) metres.
+        strip: (n,) index.
+        time_ns: (n,) GPS time.
+        seen: where from.
+
+    Returns:
+        (n, 6, 3) in t, metres a unit of what is added to the trajectory: position north, east, down (m), then small
+        turns of the body about north, east, down (rad), as of `calib.trajectory_errors`.
+    """
+    moved = np.zeros((len(points_t), 6, 3))
+    for number in np.unique(strip).tolist():
+        own = strip == number
+        arms = _Arms.of(points_t[own], number, time_ns[own], seen)
+        lat, lon, _ = geodetic_from_e(arms.poses.position_e)
+        axes_t = np.swapaxes(seen.frame.rot_t_from_e @ rot_e_from_l(lat, lon), 1, 2)  # a row each: north, east, down
+        moved[own, :3] = axes_t
+        moved[own, 3:] = np.cross(axes_t, arms.arm_t[:, np.newaxis])
+    return moved
+
+
 def effect_columns(
     points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, direction: FloatArray, seen: SeenFrom
 ) -> tuple[FloatArray, FloatArray]:
@@ -132,13 +175,10 @@ def effect_columns(
         boresight's columns (a part in a thousand); position east, north, up, then turns about the body's axes.
     """
     columns, errors = np.zeros((len(points_t), len(EFFECTS), 3)), np.zeros((len(points_t), 6, 3))
-    for number in np.unique(strip):
+    for number in np.unique(strip).tolist():
         own = strip == number
-        trajectory = seen.trajectories[seen.flown[number]]
-        poses = trajectory.poses(time_ns[own])
-        rot_t_from_b = seen.frame.rot_t_from_e @ rot_from_quaternion(poses.q_e_from_b)
-        arm_t = points_t[own] - seen.frame.t_from_e(poses.position_e)
-        arm = np.einsum("nji,nj->ni", rot_t_from_b, arm_t)  # forward, right, down
+        arms = _Arms.of(points_t[own], number, time_ns[own], seen)
+        poses, rot_t_from_b, arm = arms.poses, arms.rot_t_from_b, arms.arm_b  # forward, right, down
         velocity = np.einsum("nji,nj->ni", rot_t_from_b, poses.velocity_e @ seen.frame.rot_t_from_e.T)
         turning = velocity + np.cross(poses.rate_eb_b, arm)
         arm_s = arm @ seen.rot_b_from_s[number]

@@ -2,36 +2,45 @@
 
 A difference of two strips on a plane is what is wrong with each of them there, along the plane's normal. Each effect
 moves points in a way of its own with scan angle, flight direction, scan direction, range and speed; how much of each
-is in the differences is estimated together with an error of position and attitude of every strip, which the sigmas of
-the trajectory bound: what is explained by them is not taken for a calibration.
+is in the differences is estimated together with the trajectory's errors at knots along the strips, of which the joint
+covariance is known beforehand: what is explained by them is not taken for a calibration. Errors that neighbouring
+strips share, or all of a flight, look like a boresight, and only the joint covariance keeps them apart from one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
-from calib.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns
+from calib.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
+from calib.flight import FlightError
 from calib.strips import Checks
+from calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
+from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.records import Int64Array
+from georef.rotations import rot_from_quaternion
+from georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
 SIGNIFICANT = 3.29  # sigmas; one in a thousand by chance
 MATTERS_M = 0.01  # on the ground, at the swath's edge
-TELLS_M, TELLS = (
-    0.02,
-    1.5,
-)  # at the edge, one sigma: what is known worse is not told; so many times what attitude leaves
+TELLS_M = 0.02  # at the edge, one sigma: what is known worse is not told
+TELLS = 1.5  # or so many times what the trajectory's attitude leaves to the best of flights
 NOT_APART = 5.0  # times that another effect's sigma may grow
+ROUGH_M = 0.3  # RMS of the differences: planes of one cell are not the same surface any more, and effects not linear
 MOST_ROWS = 12_000
-WANDER = 0.3  # of a trajectory's sigmas of height and roll: as much as its errors change within a strip
-MOST_PIECES, SHORTEST_PIECE_S = 150, 2.0  # of strips, each with a wander of its own
+MOST_KNOTS, KNOT_S = 150, 5.0  # of a trajectory of which no joint covariance is known
 POSITION_SIGMA_M, ATTITUDE_SIGMA_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
+# Of a trajectory's told sigmas: half of the variance of roll and pitch lasts for the whole flight, as accelerometers'
+# biases tilt it, and a fifth of the heading's. A smoothed tactical flight has 0.1 to 0.45 of it between any two strips.
+ASSUMED = Taus(position_s=100.0, lasting_tilt=0.5, lasting_heading=0.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +51,7 @@ class Signature:
         effect: which.
         value, sigma: to be added to the parameter to remove it, SI; nan: not told.
         edge_m: what the value moves at the swaths' edges.
-        level: ``none``, ``small``, ``significant``, ``not told``.
+        level: ``none``, ``small``, ``significant``, ``not told``, ``rough``.
         words: the verdict, one sentence.
     """
 
@@ -56,13 +65,14 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Signatures:
-    """All effects; and how much of the differences they and the strips' own errors explain.
+    """All effects; and how much of the differences they and the trajectory's errors explain.
 
     Attributes:
         found: an effect each, in the order of `EFFECTS`.
         rows: differences that were used.
         rms_m, left_rms_m: of the differences, before and after.
         variance_factor: of what is left, against its noise.
+        prior_notes: where the covariance of the trajectory's errors is from.
     """
 
     found: tuple[Signature, ...]
@@ -70,28 +80,46 @@ class Signatures:
     rms_m: float
     left_rms_m: float
     variance_factor: float
+    prior_notes: tuple[str, ...] = ()
+
+    @property
+    def rough(self) -> bool:
+        """Whether the strips are too far apart for effects to be told."""
+        return any(one.level == "rough" for one in self.found)
+
+    @property
+    def lines(self) -> list[str]:
+        """The verdicts for people: a line an effect, or one line where strips are too far apart."""
+        return list(dict.fromkeys(one.words for one in self.found))
 
 
-def signatures(checks: Checks, seen: SeenFrom, *, most_rows: int = MOST_ROWS) -> Signatures:
+def signatures(
+    checks: Checks, seen: SeenFrom, prior: TrajectoryPrior | None = None, *, most_rows: int = MOST_ROWS
+) -> Signatures:
     """Estimate every effect that the differences can tell.
 
     Args:
         checks: of `calib.strips`, points in t.
         seen: where from.
+        prior: joint covariance of the trajectory's errors, knots of the trajectories in the order of
+            ``seen.trajectories`` (`calib.trajectory_errors.from_smoother`); None: `assumed_prior`.
         most_rows: checks that are used, drawn evenly.
     """
     checks = checks.take(_known(checks, seen))
     if len(checks) > most_rows:
         checks = checks.take(np.random.default_rng(6_7).choice(len(checks), most_rows, replace=False))
     if len(checks) < 10:
-        return Signatures(
-            tuple(_not_told(effect, "too few differences") for effect in EFFECTS), len(checks), *[np.nan] * 3
-        )
-    pieces = _Pieces.of(checks, len(seen.flown))
-    design, strips, edges = _design(checks, seen, pieces)
-    bounds = _bounds(checks, seen, pieces)
-    fit = _Fit(design, strips, bounds, checks.distance_m, checks.noise_m)
-    taken, refused = _choose(fit, edges, _worst_m(bounds, edges, len(seen.flown)))
+        few = tuple(_not_told(effect, "too few differences") for effect in EFFECTS)
+        return Signatures(few, len(checks), math.nan, math.nan, math.nan)
+    rms_m = float(np.sqrt(np.mean(checks.distance_m**2)))
+    if rms_m > ROUGH_M:
+        words = f"rough: strips differ by {rms_m:.2f} m (RMS point to plane), too much to tell why: run swath calibrate"
+        rough = tuple(Signature(effect, math.nan, math.nan, math.nan, "rough", words) for effect in EFFECTS)
+        return Signatures(rough, len(checks), rms_m, math.nan, math.nan)
+    prior = assumed_prior(checks, seen) if prior is None else prior
+    design, errors, edges = _design(checks, seen, prior)
+    fit = _Fit(design, errors, prior.information, checks.distance_m, checks.noise_m)
+    taken, refused = _choose(fit, edges, _worst_m(prior, seen, edges))
     values, sigmas = fit.solve(taken)
     found = []
     for number, effect in enumerate(EFFECTS):
@@ -100,8 +128,7 @@ def signatures(checks: Checks, seen: SeenFrom, *, most_rows: int = MOST_ROWS) ->
         else:
             at = taken.index(number)
             found.append(_told(effect, float(values[at]), float(sigmas[at]), float(edges[number])))
-    rms_m = float(np.sqrt(np.mean(checks.distance_m**2)))
-    return Signatures(tuple(found), len(checks), rms_m, fit.left_rms_m, fit.variance_factor)
+    return Signatures(tuple(found), len(checks), rms_m, fit.left_rms_m, fit.variance_factor, prior.notes)
 
 
 def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
@@ -114,121 +141,148 @@ def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
     return known
 
 
+# ---------------------------------------------------------------------- the trajectory's errors
+
+
+def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
+    """Return the covariance of trajectories' errors by the sigmas they tell, and by what is usual of the rest.
+
+    Errors fade as of `ASSUMED`, whose lasting shares are on the safe side: a larger share makes larger sigmas of the
+    boresight. Trajectories that say no sigmas have `POSITION_SIGMA_M` and `ATTITUDE_SIGMA_DEG`.
+    """
+    spans = _spans(checks, seen)
+    trajectories = [_with_sigmas(trajectory) for trajectory in seen.trajectories]
+    prior = gauss_markov_at(knots_within(spans, KNOT_S, MOST_KNOTS), trajectories, ASSUMED)
+    lasting = f"{100 * ASSUMED.lasting_tilt:.0f} % of roll and pitch, {100 * ASSUMED.lasting_heading:.0f} % of heading"
+    note = f"trajectory's errors by its sigmas; assumed to last all flight: {lasting}"
+    return replace(prior, notes=(note,))
+
+
+def _spans(checks: Checks, seen: SeenFrom) -> list[tuple[int, int, int, int]]:
+    """(trajectory, number, begin, end) of stretches with checks; of several scanners at one time it is one."""
+    strip = np.concatenate([checks.first, checks.second])
+    time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
+    own = sorted(
+        (seen.flown[number], int(time_ns[strip == number].min()), int(time_ns[strip == number].max()))
+        for number in np.unique(strip).tolist()
+    )
+    joined: list[tuple[int, int, int]] = []
+    for flown, begin, end in own:
+        if joined and joined[-1][0] == flown and begin <= joined[-1][2]:
+            joined[-1] = (flown, joined[-1][1], max(end, joined[-1][2]))
+        else:
+            joined.append((flown, begin, end))
+    return [(flown, number, begin, max(end, begin + 1)) for number, (flown, begin, end) in enumerate(joined)]
+
+
+def _with_sigmas(trajectory: Trajectory) -> Trajectory:
+    position, attitude = trajectory.position_sigma_l, trajectory.attitude_sigma_rad
+    return replace(
+        trajectory,
+        position_sigma_l=np.where(np.isfinite(position), position, POSITION_SIGMA_M),
+        attitude_sigma_rad=np.where(np.isfinite(attitude), attitude, np.radians(ATTITUDE_SIGMA_DEG)),
+    )
+
+
 # ---------------------------------------------------------------------- columns
 
 
-def _design(checks: Checks, seen: SeenFrom, pieces: _Pieces) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Differences by effects (n, effects), by errors of both strips (n, strips · errors), and by effect what one unit
-    moves at the edges (effects,). Signs: what is to be added to a parameter, so that the difference goes."""
+def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[FloatArray, csr_array, FloatArray]:
+    """Return how differences go with what is to be added so that they vanish.
+
+    Returns:
+        (n, effects); (n, 6 knots) for the trajectory's errors, linear between knots; and by effect (effects,) what one
+        unit moves at the swaths' edges.
+    """
     sides = (
         (checks.point, checks.first, checks.point_ns, checks.point_direction, 1.0),
         (checks.centre, checks.second, checks.centre_ns, checks.centre_direction, -1.0),
     )
-    rows = np.arange(len(checks))
-    design = np.zeros((len(checks), len(EFFECTS)))
-    strips = np.zeros((len(checks), len(seen.flown), 6 + 2 * pieces.count))
-    edges = np.zeros(len(EFFECTS))
+    count = len(checks)
+    design, edges = np.zeros((count, len(EFFECTS))), np.zeros(len(EFFECTS))
+    values, rows, columns = [], [], []
     for points_t, strip, time_ns, direction, sign in sides:
-        columns, errors = effect_columns(points_t, strip, time_ns, direction, seen)
-        design -= sign * np.einsum("nki,ni->nk", columns, checks.normal)
-        own = -sign * np.einsum("nki,ni->nk", errors, checks.normal)
-        piece = pieces.at(strip, time_ns)
-        strips[rows, strip, :6] = own
-        strips[rows, strip, 6 + piece] = own[:, 2]
-        strips[rows, strip, 6 + pieces.count + piece] = own[:, 3]
-        edges = np.maximum(edges, np.percentile(np.linalg.norm(columns, axis=2), 95.0, axis=0))
-    return design, strips.reshape(len(checks), -1), edges
+        moved, _ = effect_columns(points_t, strip, time_ns, direction, seen)
+        design -= sign * np.einsum("nki,ni->nk", moved, checks.normal)
+        edges = np.maximum(edges, np.percentile(np.linalg.norm(moved, axis=2), 95.0, axis=0))
+        own = -sign * np.einsum("nki,ni->nk", error_columns(points_t, strip, time_ns, seen), checks.normal)
+        for knot, share in _shares(prior, np.asarray(seen.flown)[strip], time_ns):
+            values.append(share[:, np.newaxis] * own)
+            rows.append(np.repeat(np.arange(count), ERRORS).reshape(count, ERRORS))
+            columns.append(ERRORS * knot[:, np.newaxis] + np.arange(ERRORS))
+    entries = np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(columns).ravel())
+    return design, csr_array(entries, shape=(count, ERRORS * len(prior))), edges
 
 
-@dataclass(frozen=True, eq=False)
-class _Pieces:
-    """Strips in pieces of time: begin and length (strips,) ns, and how many of each."""
-
-    begin_ns: Int64Array
-    length_ns: FloatArray
-    count: int
-
-    @classmethod
-    def of(cls, checks: Checks, strips: int) -> _Pieces:
-        """As many as the longest strip wants, and not too many in all."""
-        strip = np.concatenate([checks.first, checks.second])
-        time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
-        begin, end = np.full(strips, np.iinfo(np.int64).max), np.full(strips, np.iinfo(np.int64).min)
-        np.minimum.at(begin, strip, time_ns)
-        np.maximum.at(end, strip, time_ns)
-        length = np.where(end > begin, (end.astype(np.float64) - begin), 1.0) + 1.0
-        wanted = int(length.max() / 1e9 / SHORTEST_PIECE_S)
-        count = max(1, min(wanted, MOST_PIECES // max(strips, 1)))
-        return cls(begin, length / count, count)
-
-    def at(self, strip: Int64Array, time_ns: Int64Array) -> Int64Array:
-        """(n,) the piece."""
-        piece = ((time_ns - self.begin_ns[strip]) / self.length_ns[strip]).astype(np.int64)
-        return np.clip(piece, 0, self.count - 1)
-
-
-def _bounds(checks: Checks, seen: SeenFrom, pieces: _Pieces) -> FloatArray:
-    """(strips · errors,) sigmas of the strips' errors, by their trajectories."""
-    bounds = np.tile(np.array([*[POSITION_SIGMA_M] * 3, *np.radians(ATTITUDE_SIGMA_DEG)]), (len(seen.flown), 1))
-    for number, flown in enumerate(seen.flown):
-        times = np.concatenate([checks.point_ns[checks.first == number], checks.centre_ns[checks.second == number]])
-        if len(times):
-            trajectory = seen.trajectories[flown]
-            within = trajectory.between(int(times.min()), int(times.max()))
-            for at, sigmas in ((0, within.position_sigma_l[:, [1, 0, 2]]), (3, within.attitude_sigma_rad)):
-                if np.isfinite(sigmas).any():
-                    bounds[number, at : at + 3] = np.sqrt(np.nanmean(sigmas**2, axis=0))
-    wander = WANDER * np.repeat(bounds[:, [2, 3]], pieces.count, axis=1)
-    return np.hstack([bounds, wander]).ravel()
+def _shares(
+    prior: TrajectoryPrior, flown: Int64Array, time_ns: Int64Array
+) -> tuple[tuple[Int64Array, FloatArray], tuple[Int64Array, FloatArray]]:
+    """The knots (n,) before and after each moment, and how much of each knot's error is there."""
+    before, after = np.zeros(len(time_ns), np.int64), np.zeros(len(time_ns), np.int64)
+    for number in np.unique(flown):
+        own, knots = flown == number, np.flatnonzero(prior.flown == number)
+        if not len(knots):
+            raise FlightError(f"trajectory errors: the covariance has no knot of trajectory {number + 1}")
+        at = np.searchsorted(prior.time_ns[knots], time_ns[own])
+        before[own], after[own] = knots[np.maximum(at - 1, 0)], knots[np.minimum(at, len(knots) - 1)]
+    apart = np.maximum((prior.time_ns[after] - prior.time_ns[before]).astype(np.float64), 1.0)
+    later = np.clip((time_ns - prior.time_ns[before]).astype(np.float64) / apart, 0.0, 1.0)
+    return (before, 1.0 - later), (after, later)
 
 
 # ---------------------------------------------------------------------- estimation
 
 
 class _Fit:
-    """Least squares of differences on chosen effects and all strips' errors, robust."""
+    """Least squares of differences on chosen effects and the trajectory's errors, robust."""
 
     def __init__(
-        self, design: FloatArray, strips: FloatArray, bounds: FloatArray, values: FloatArray, noise: FloatArray
+        self, design: FloatArray, errors: csr_array, information: FloatArray, values: FloatArray, noise: FloatArray
     ) -> None:
-        self._whole, self._values, self._noise = np.hstack([design, strips]), values, noise
-        self._effects = design.shape[1]
-        self._known = np.diag(np.concatenate([np.zeros(self._effects), 1.0 / bounds**2]))
+        self._design, self._errors, self._information = design, errors, information
+        self._values, self._noise = values, noise
         self._plain: FloatArray | None = None
         self.left_rms_m, self.variance_factor = math.nan, math.nan
 
     def sigmas(self, taken: Sequence[int]) -> FloatArray:
-        """(effects taken,) by the noise and the strips' bounds alone."""
+        """(effects taken,) by the noise and the trajectory's errors alone."""
         if self._plain is None:
-            self._plain = self._normal(np.ones(len(self._values)))
-        return _roots_of_inverse(self._part(self._plain, taken))[: len(taken)]
+            self._plain = self._reduced(np.ones(len(self._values)))[0]
+        return _roots_of_inverse(self._plain[np.ix_(taken, taken)])
 
     def solve(self, taken: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Values and sigmas (effects taken,), with Huber's weights and a variance factor where it is above 1."""
-        columns = self._columns(taken)
         huber = np.ones(len(self._values))
+        design = self._design[:, taken]
         for _ in range(5):
-            normal = self._part(self._normal(huber), taken)
-            right = self._whole[:, columns].T @ (huber / self._noise**2 * self._values)
-            unknowns = np.asarray(np.linalg.solve(normal, right), np.float64)
-            misfits = (self._values - self._whole[:, columns] @ unknowns) / self._noise
+            normal, right, factor, mixed, below = self._reduced(huber)
+            normal = normal[np.ix_(taken, taken)]
+            found = np.asarray(np.linalg.solve(normal, right[taken]), np.float64) if taken else np.zeros(0)
+            errors = cho_solve(factor, below - mixed[:, taken] @ found)
+            misfits = (self._values - design @ found - self._errors @ errors) / self._noise
             spread = max(1.4826 * float(np.median(np.abs(misfits))), 1.0)
             huber = np.minimum(1.0, 1.5 * spread / np.maximum(np.abs(misfits), 1e-9))
         self.left_rms_m = float(np.sqrt(np.mean((misfits * self._noise) ** 2)))
         self.variance_factor = float((huber * misfits**2).sum()) / max(len(misfits) - len(taken), 1)
-        sigmas = _roots_of_inverse(normal)[: len(taken)] * max(1.0, math.sqrt(self.variance_factor))
-        return unknowns[: len(taken)], sigmas
+        return found, _roots_of_inverse(normal) * max(1.0, math.sqrt(self.variance_factor))
 
-    def _normal(self, huber: FloatArray) -> FloatArray:
-        weighted = self._whole * (huber / self._noise**2)[:, np.newaxis]
-        normal: FloatArray = weighted.T @ self._whole + self._known
-        return normal
+    def _reduced(
+        self, huber: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, bool], FloatArray, FloatArray]:
+        """Return the equations of the effects with the trajectory's errors eliminated (Schur complement).
 
-    def _columns(self, taken: Sequence[int]) -> list[int]:
-        return [*taken, *range(self._effects, self._whole.shape[1])]
-
-    def _part(self, normal: FloatArray, taken: Sequence[int]) -> FloatArray:
-        return normal[np.ix_(self._columns(taken), self._columns(taken))]
+        Returns:
+            (e, e) matrix, (e,) right side; and of the errors the factor, (k, e) mixed part and (k,) right side.
+        """
+        weights = huber / self._noise**2
+        weighted = self._errors.multiply(weights[:, np.newaxis]).tocsr()
+        inner = np.asarray((weighted.T @ self._errors).todense()) + self._information
+        mixed, below = weighted.T @ self._design, weighted.T @ self._values
+        factor = cho_factor(inner, lower=True, overwrite_a=True, check_finite=False)
+        solved = cho_solve(factor, np.column_stack([mixed, below]), check_finite=False)
+        own = self._design * weights[:, np.newaxis]
+        normal = own.T @ self._design - mixed.T @ solved[:, :-1]
+        return normal, own.T @ self._values - mixed.T @ solved[:, -1], factor, mixed, below
 
 
 def _roots_of_inverse(normal: FloatArray) -> FloatArray:
@@ -240,11 +294,18 @@ def _roots_of_inverse(normal: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(inverse) / scale)
 
 
-def _worst_m(bounds: FloatArray, edges: FloatArray, strips: int) -> float:
-    """The largest sigma at the edge of an effect that is told: strips' attitude leaves some to the best of flights."""
-    attitude = bounds.reshape(strips, -1)[:, 3:5]
-    left_m = float(np.sqrt(np.mean(attitude**2) / strips) * edges[NAMES.index("pitch")])
-    return max(TELLS_M, TELLS * left_m)
+def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float:
+    """The largest sigma at the edge of an effect that is told: the attitude leaves some to the best of flights."""
+    row = np.zeros((len(prior), ERRORS))
+    for number in np.unique(prior.flown):
+        own = prior.flown == number
+        trajectory = seen.trajectories[number]
+        at = np.clip(np.searchsorted(trajectory.time_ns, prior.time_ns[own]), 0, len(trajectory) - 1)
+        right_e = rot_from_quaternion(trajectory.q_e_from_b[at])[:, :, 1]
+        lat, lon, _ = geodetic_from_e(trajectory.position_e[at])
+        row[own, 3:] = np.einsum("nij,ni->nj", rot_e_from_l(lat, lon), right_e) / len(prior)
+    pitch = math.sqrt(float(row.ravel() @ prior.covariance @ row.ravel()))
+    return max(TELLS_M, TELLS * pitch * float(edges[NAMES.index("pitch")]))
 
 
 def _choose(fit: _Fit, edges: FloatArray, worst_m: float) -> tuple[list[int], dict[int, str]]:
@@ -294,6 +355,8 @@ def record_of(found: Signatures) -> Mapping[str, object]:
         "rms_m": found.rms_m,
         "left_rms_m": found.left_rms_m,
         "variance_factor": found.variance_factor,
+        "rough": found.rough,
+        "trajectory_errors": list(found.prior_notes),
         "effects": [
             {
                 "name": one.effect.name,

@@ -43,15 +43,26 @@ class Taus:
     The defaults are those of a smoothed, tightly controlled INS with carrier-phase GNSS: what is left of its position
     are residual troposphere, ionosphere and multipath, which last about a minute; its tilt drifts with the
     accelerometers' biases between manoeuvres and its heading longer still, as nothing but turns tells it.
+
+    Attributes:
+        position_s, roll_pitch_s, heading_s: e-folding times.
+        lasting_tilt, lasting_heading: shares of the variances that do not fade but last for the whole flight, about
+            the body's axes.
     """
 
     position_s: float = 60.0
     roll_pitch_s: float = 100.0
     heading_s: float = 200.0
+    lasting_tilt: float = 0.0
+    lasting_heading: float = 0.0
 
     def of_components(self) -> FloatArray:
         """(6,) of north, east, down, roll, pitch, heading."""
         return np.array([self.position_s] * 3 + [self.roll_pitch_s] * 2 + [self.heading_s])
+
+    def lasting(self) -> FloatArray:
+        """Return the lasting shares (6,) likewise."""
+        return np.array([0.0] * 3 + [self.lasting_tilt] * 2 + [self.lasting_heading])
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +152,17 @@ def knots_of(flight: Flight, knot_s: float, most: int = MOST_KNOTS) -> Knots:
     strips = _strips(flight)
     if not strips:
         raise FlightError("trajectory errors: the flight has no strip with returns; want at least one")
+    return knots_within(strips, knot_s, most)
+
+
+def knots_within(strips: Sequence[tuple[int, int, int, int]], knot_s: float, most: int = MOST_KNOTS) -> Knots:
+    """Return knots over spans of time.
+
+    Args:
+        strips: trajectory, number, and GPS times of begin and end of each, by trajectory and time; they do not overlap.
+        knot_s: wanted distance.
+        most: knots in all; with more the distance is widened.
+    """
     lengths = np.array([end - begin for _, _, begin, end in strips]) / SECOND_NS
     apart_s = knot_s
     while _counts(lengths, apart_s).sum() > most and apart_s < lengths.max():
@@ -194,16 +216,25 @@ def gauss_markov(flight: Flight, taus: Taus = Taus(), knot_s: float = 5.0) -> Tr
     Raises:
         FlightError: a trajectory says no sigmas where they are needed.
     """
-    knots = knots_of(flight, knot_s)
+    return gauss_markov_at(knots_of(flight, knot_s), flight.trajectories, taus)
+
+
+def gauss_markov_at(knots: Knots, trajectories: Sequence[Trajectory], taus: Taus) -> TrajectoryPrior:
+    """Return `gauss_markov` at knots that are given.
+
+    Raises:
+        FlightError: a trajectory says no sigmas where they are needed.
+    """
     covariance = np.zeros((len(knots), ERRORS, len(knots), ERRORS))
-    for number, trajectory in enumerate(flight.trajectories):
+    for number, trajectory in enumerate(trajectories):
         at = np.flatnonzero(knots.flown == number)
         if not len(at):
             continue
         sigmas, turns = _told(trajectory, knots.time_ns[at])
         since_s = (knots.time_ns[at] - knots.time_ns[at[0]]) / SECOND_NS
         apart_s = np.abs(since_s[:, np.newaxis] - since_s)
-        fading = np.exp(-apart_s[..., np.newaxis] / taus.of_components())
+        lasting = taus.lasting()
+        fading = lasting + (1.0 - lasting) * np.exp(-apart_s[..., np.newaxis] / taus.of_components())
         own = fading * sigmas[:, np.newaxis] * sigmas[np.newaxis]
         block = np.zeros((len(at), ERRORS, len(at), ERRORS))
         for axis in range(3):
