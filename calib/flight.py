@@ -179,3 +179,10 @@ class Flight:
     def starts(self) -> dict[str, Calibration]:
         """The calibrations to start from, by scanner."""
         return {head.name: head.start for head in self.heads}
+
+
+def sensor_t(flight: Flight, swath: Swath, at: Int64Array) -> FloatArray:
+    """(n, 3) about where the scanner was when it sent returns: the body's origin at the epoch after."""
+    trajectory = flight.trajectories[swath.flown]
+    epoch = np.minimum(np.searchsorted(trajectory.time_ns, swath.time_ns[at]), len(trajectory) - 1)
+    return flight.frame.t_from_e(trajectory.position_e[epoch])

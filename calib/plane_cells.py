@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
-from calib.plane_fit import expected_sigma, sensor_t
+from calib.flight import Flight, Swath, sensor_t
+from calib.plane_fit import expected_sigma
 from calib.plane_kernels import (
     EMPTY,
     FEW,
@@ -30,6 +30,7 @@ from calib.plane_kernels import (
     grow,
 )
 from calib.plane_settings import PlaneError, PlaneSettings
+from calib.scale import spacing_m
 from georef.points import contiguous
 from georef.records import Int64Array
 
@@ -148,18 +149,6 @@ def _fill(flight: Flight, cell_m: float) -> float:
         if enough.any():
             shares.append(float((shorter > (1.3 * THIN_SPREAD * cell_m) ** 2)[enough].mean()))
     return float(np.median(shares)) if shares else 0.0
-
-
-def spacing_m(swath: Swath) -> float:
-    """√(area a return) of a swath, from how many cells of 8 m have any of a sample of them."""
-    step = max(1, len(swath) // 200_000)
-    points = np.asarray(swath.points_t[::step])
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < 100:
-        return np.inf
-    columns, rows = np.floor(points[:, :2].T / 8.0).astype(np.int64)
-    area = 64.0 * len(np.unique(keys_of(columns, rows)))
-    return float(np.sqrt(area / (len(points) * step)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
+from calib.flight import Flight, Swath, sensor_t
 from calib.plane_settings import PlaneSettings
 from georef.records import Int64Array
 from georef.uncertainty import Noise
@@ -44,13 +44,6 @@ class Sight:
     normal_sigma_rad: float
     sag_m: float
     sag_sigma_m: float
-
-
-def sensor_t(flight: Flight, swath: Swath, at: Int64Array) -> FloatArray:
-    """(n, 3) about where the scanner was when it sent returns: the body's origin at the epoch after."""
-    trajectory = flight.trajectories[swath.flown]
-    epoch = np.minimum(np.searchsorted(trajectory.time_ns, swath.time_ns[at]), len(trajectory) - 1)
-    return flight.frame.t_from_e(trajectory.position_e[epoch])
 
 
 def expected_sigma(noise: Noise, away_t: FloatArray, normal_t: FloatArray, settings: PlaneSettings) -> FloatArray:

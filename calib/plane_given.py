@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.features import Features, Plane
-from calib.flight import Flight, Swath
+from calib.flight import Flight, Swath, sensor_t
 from calib.plane_cells import cell_size, keys_of
-from calib.plane_fit import GATE, expected_sigma, sensor_t
+from calib.plane_fit import GATE, expected_sigma
 from calib.plane_returns import plane_of, returns_near, sights_of
-from calib.plane_settings import PlaneError, PlaneSettings
+from calib.plane_settings import PlaneError, PlaneSettings, scaled_to
 from georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +40,7 @@ def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEF
         PlaneError: a polygon has fewer than three corners, or is no face for its size, or two have the same name.
     """
     rings = _checked(polygons)
+    settings = scaled_to(flight, settings)
     cell_m = cell_size(flight, settings)
     found: dict[str, dict[int, Int64Array]] = {name: {} for name in rings}
     refused: Counter[str] = Counter()

@@ -19,7 +19,7 @@ from calib.flight import Flight
 from calib.plane_cells import cell_size, keys_of
 from calib.plane_fit import GATE, Sight, fit_sight, refusal
 from calib.plane_returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
-from calib.plane_settings import PlaneSettings
+from calib.plane_settings import PlaneSettings, scaled_to
 from georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +41,7 @@ def rematch(
     `map` calls: a pool's does it for several at a time, and the result is the same.
     """
     refused = Counter(features.refused)
+    settings = scaled_to(flight, settings)
     kept = [(plane, _agreeing(_sights(flight, plane, settings), settings)) for plane in features.planes]
     known = [(plane, sights) for plane, sights in kept if sights]
     refused[LOST] += len(kept) - len(known)
@@ -113,7 +114,7 @@ def _candidates(
         for label, (_, sights) in enumerate(known):
             if index in sights:
                 sight = sights[index]
-                rows[label] = [*sight.normal_t, sight.normal_t @ sight.centre_t, WIDE_M]
+                rows[label] = [*sight.normal_t, sight.normal_t @ sight.centre_t, max(WIDE_M, sight.gate_m)]
         return returns_near(flight.swaths[index], keys, labels, rows, cell_m)
 
     order = np.argsort(labels, kind="stable")

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight
+from calib.flight import Flight, sensor_t
 from calib.plane_cells import CELLS_LEAST, Segments, cell_middles
-from calib.plane_fit import sensor_t
 from calib.plane_settings import PlaneSettings
 from georef.records import Int64Array
 

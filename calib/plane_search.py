@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.features import Features, Plane
-from calib.flight import Flight
+from calib.flight import Flight, sensor_t
 from calib.plane_cells import Segments, cell_size, segments_of
 from calib.plane_faces import same_faces
-from calib.plane_fit import GATE, expected_sigma, sensor_t
+from calib.plane_fit import GATE, expected_sigma
 from calib.plane_given import given_planes
 from calib.plane_pieces import Pieces, choose, cut
 from calib.plane_returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
-from calib.plane_settings import PlaneError, PlaneSettings
+from calib.plane_settings import PlaneError, PlaneSettings, scaled_to
 from georef.records import Int64Array
 
 __all__ = ["PlaneError", "PlaneRow", "PlaneSettings", "find_planes", "given_planes", "plane_rows"]
@@ -44,6 +44,7 @@ def find_planes(flight: Flight, settings: PlaneSettings = _DEFAULT, each: Callab
         PlaneError: no swath has points.
     """
     refused: Counter[str] = Counter()
+    settings = scaled_to(flight, settings)
     cell_m = cell_size(flight, settings)
     segments = _grown(flight, cell_m, settings, refused, each)
     face = same_faces(segments, settings, refused)
@@ -84,8 +85,8 @@ def _returns(
     cell = np.flatnonzero(pieces.cell_sight >= 0)
     cell = cell[wanted[pieces.cell_sight[cell]]]
     normal, centre = segments.normal_t[pieces.segment], segments.moments[pieces.segment, 1:4]
-    planes = np.column_stack([normal, (normal * centre).sum(axis=1), np.full(len(normal), WIDE_M)])
     gate_m = GATE * _coarse_sigma(flight, segments, settings)[pieces.segment]
+    planes = np.column_stack([normal, (normal * centre).sum(axis=1), np.maximum(gate_m, WIDE_M)])
     by_segment = np.argsort(segments.cell_of, kind="stable")
     begin = np.searchsorted(segments.cell_of[by_segment], np.arange(len(segments) + 1))
     found: dict[int, dict[int, Int64Array]] = {piece: {} for piece in chosen.tolist()}

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from calib.flight import Flight
+from calib.scale import Scale, scale_of
+
+_CELLS_ACROSS, _CELL_LEAST_M = 50.0, 0.5  # cells that a swath should have across, at least; the smallest there are
+_TILES_ACROSS, _TILE_LEAST_M = 4.0, 4.0
 
 
 class PlaneError(ValueError):
@@ -57,3 +63,25 @@ class PlaneSettings:
     normal_sigma_rad: float = float(np.radians(1.0))
     angle_rad: float = float(np.radians(1.0))
     overlap: float = 0.3
+
+    def scaled(self, scale: Scale) -> PlaneSettings:
+        """Return the settings for a flight of these sizes; the fields are meant for 800 m above ground.
+
+        In narrow swaths cells and pieces are smaller, so that there are several side by side. From higher up the same
+        small angles lay strips farther apart.
+        """
+        higher = max(scale.of_reference, 1.0)
+        return replace(
+            self,
+            cell_m=max(min(self.cell_m, scale.width_m / _CELLS_ACROSS), _CELL_LEAST_M),
+            tile_m=max(min(self.tile_m, scale.width_m / _TILES_ACROSS), _TILE_LEAST_M),
+            displacement_m=self.displacement_m * higher,
+            offset_m=self.offset_m * higher,
+            tight_m=self.tight_m * higher,
+        )
+
+
+def scaled_to(flight: Flight, settings: PlaneSettings) -> PlaneSettings:
+    """Return the settings by the sizes of a flight, as they are where it has no points."""
+    scale = scale_of(flight)
+    return settings if scale is None else settings.scaled(scale)

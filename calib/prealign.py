@@ -7,8 +7,8 @@ any scanner and mount of the sensor model will do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from calib.flight import Flight, Swath
 from calib.height_grids import Lattice, Surface, surface
-from calib.plane_cells import spacing_m
+from calib.scale import Scale, area_spacing_m, scale_of
 from georef.calibration import INDEX, Calibration
 from georef.records import Int64Array
 
@@ -26,10 +26,17 @@ FloatArray = NDArray[np.float64]
 NAMES = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
 _STEPS = (1e-4, 1e-4, 1e-4, 0.1)  # by which parameters are changed to see what that does
 _CELLS_MOST, _CELLS_LEAST = 400_000, 200
-_CELL_LEAST_M = 3.0
+_SMOOTH_CELLS = 3.0  # cells a sigma of the smoothing
 _SMOOTH_POINTS = 2.0  # least sigma of the smoothing in units of the distance between points
-_CONTROL_REACH_M, _CONTROL_POINTS = 4.0, 3  # around a control point, returns whose median height counts
+_SMOOTH_HEIGHTS = (0.06, 0.03, 0.015, 0.0075)  # sigmas in heights above ground: 3.4° of boresight and a half, …
+_SMOOTH_FINEST_M = (1.0, 6.0)  # of the finest: below, edges of roofs are all there is; above, roofs are gone
+_SMOOTH_WIDTHS = 0.125  # greatest sigma in widths of a swath: nothing wider fits into it
+_CONTROL_SPACINGS, _CONTROL_POINTS = 1.3, 3  # around a control point, returns whose median height counts
+_RANGE_HEIGHTS, _RANGE_LEAST_M = 0.0075, 0.2
+_OVERSAMPLED = 4  # as many returns as are wanted are looked at for those where swaths overlap
+_OVERLAP_WIDTHS = 0.1  # side of the cells by which overlap is found, in widths of a swath
 _STEP_MOST_RAD = np.radians(2.0)
+_NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
 _REWEIGHTINGS, _HUBER, _SIGMA_LEAST_M = 3, 2.0, 0.02
 
 
@@ -42,16 +49,17 @@ class PrealignSettings:
     """How it is done.
 
     Attributes:
-        smooth_m: sigmas of the smoothing, coarse to fine.
+        smooth_m: sigmas of the smoothing, coarse to fine; None: by the flight's height, width and density.
         returns: of a swath that are placed.
         rounds: most a level.
-        boresight_sigma_rad, range_sigma_m: what is known before; holds what this flight does not determine.
+        boresight_sigma_rad, range_sigma_m: what is known before; holds what this flight does not determine. The range
+            offset is known to `_RANGE_HEIGHTS` of the height above ground where that is less.
         settled_rad: the finest level ends when no angle changes by more; a coarser one when by as much more.
         greatest_rad: beyond this it is no coarse error of a mounting but a wrong installation matrix.
         control_sigma_m: of control against heights of the surface.
     """
 
-    smooth_m: tuple[float, ...] = (48.0, 24.0, 12.0, 6.0)
+    smooth_m: tuple[float, ...] | None = None
     returns: int = 100_000
     rounds: int = 8
     boresight_sigma_rad: float = float(np.radians(2.0))
@@ -85,19 +93,26 @@ def prealign(
         raise PrealignError(f"prealignment: got {len(flight.swaths)} swath, want at least two that overlap")
     found = dict(start or flight.starts())
     began = {name: one.parameters.copy() for name, one in found.items()}
-    samples = [_sample(swath, settings.returns) for swath in flight.swaths]
+    samples, scale = _samples(flight, found, settings.returns)
+    range_m = min(settings.range_sigma_m, max(_RANGE_HEIGHTS * scale.height_m, _RANGE_LEAST_M))
+    settings = replace(settings, range_sigma_m=range_m)
     step = np.zeros((len(flight.heads), len(NAMES)))
-    apart_m = _spacing(flight, samples)
-    finest_m = max(settings.smooth_m[-1], _SMOOTH_POINTS * apart_m)
-    for smooth_m in dict.fromkeys(max(one, finest_m) for one in settings.smooth_m):
-        coarser = smooth_m / finest_m
+    levels, improved = _levels(scale, settings), None
+    control = None if control_t is None else _Control(control_t, _CONTROL_SPACINGS * scale.spacing_m)
+    for smooth_m in levels:
+        coarser = smooth_m / levels[-1]
         fewer = [at[:: max(1, int(0.5 * coarser))] for at in samples]
         motions = [_motion(flight, *one, found) for one in zip(flight.swaths, fewer, strict=True)]
         for _ in range(settings.rounds):
             placed = [_placed(flight, *one, found) for one in zip(flight.swaths, fewer, motions, strict=True)]
-            found, step = _improved(flight, placed, found, began, smooth_m, settings, control_t)
+            improved = _improved(flight, placed, found, began, smooth_m, settings, control)
+            if improved is None:  # a coarse level on a narrow overlap: a finer one may still do
+                break
+            found, step = improved
             if np.abs(step[:, :3]).max() < coarser * settings.settled_rad:
                 break
+    if improved is None:
+        raise PrealignError("prealignment: the swaths do not overlap; want strips over the same ground")
     _refuse(found, began, step, settings)
     return found
 
@@ -119,24 +134,71 @@ def _refuse(
         )
 
 
-def _sample(swath: Swath, count: int) -> Int64Array:
+@dataclass(frozen=True, eq=False)
+class _Control:
+    """Surveyed points (k, 3) and how far from them returns are taken."""
+
+    points_t: FloatArray
+    reach_m: float
+
+
+def _levels(scale: Scale, settings: PrealignSettings) -> tuple[float, ...]:
+    """Sigmas of the smoothing, coarse to fine: what the flight's sizes allow of those asked for."""
+    finest_m = _SMOOTH_POINTS * scale.spacing_m
+    if settings.smooth_m is not None:
+        return tuple(dict.fromkeys(max(one, finest_m) for one in settings.smooth_m))
+    wanted = [share * scale.height_m for share in _SMOOTH_HEIGHTS]
+    least, most = _SMOOTH_FINEST_M
+    while wanted[-1] > most:
+        wanted.append(max(0.5 * wanted[-1], most))
+    widest_m = max(_SMOOTH_WIDTHS * scale.width_m, least, finest_m)
+    return tuple(dict.fromkeys(min(max(one, least, finest_m), widest_m) for one in wanted))
+
+
+def _samples(flight: Flight, found: Mapping[str, Calibration], count: int) -> tuple[list[Int64Array], Scale]:
+    """By swath rising indexes of last returns where another swath is too, evenly; and the flight's sizes, whose
+    spacing is that of the thinnest of these samples.
+
+    Of a long line of which a short one crosses a part, that part alone is of use. Where no two swaths meet, all of
+    them is taken: a coarse boresight may be what keeps them apart.
+    """
+    many = [_last(swath, _OVERSAMPLED * count) for swath in flight.swaths]
+    points = [
+        flight.place(swath, found[flight.heads[swath.head].name], at)
+        for swath, at in zip(flight.swaths, many, strict=True)
+    ]
+    scale = scale_of(flight, list(zip(many, points, strict=True)))
+    there = [np.isfinite(one).all(axis=1) for one in points]
+    if scale is None or not all(one.any() for one in there):
+        raise PrealignError(f"prealignment: {_NO_POINTS}")
+    shared = _shared(points, _OVERLAP_WIDTHS * scale.width_m)
+    samples, spacings = [], []
+    for at, place, good, here in zip(many, points, there, shared, strict=True):
+        taken = np.flatnonzero(good & here if (good & here).any() else good)
+        taken = taken[:: max(1, len(taken) // count)]
+        samples.append(at[taken])
+        spacings.append(area_spacing_m(place[taken]))
+    return samples, Scale(scale.height_m, scale.width_m, max(spacings))
+
+
+def _shared(points: Sequence[FloatArray], cell_m: float) -> list[NDArray[np.bool_]]:
+    """By swath which of its points (n, 3) lie in a cell that another swath has points in or beside."""
+    of_swath = []
+    for place in points:
+        columns, rows = np.floor(np.nan_to_num(place[:, :2]).T / cell_m).astype(np.int64)
+        of_swath.append((rows << 32) + columns)
+    beside = np.array([(row << 32) + column for row in (-1, 0, 1) for column in (-1, 0, 1)], np.int64)
+    wide = [np.unique(np.unique(cells)[:, np.newaxis] + beside) for cells in of_swath]
+    keys, swaths = np.unique(np.concatenate(wide), return_counts=True)
+    return [np.isin(cells, keys[swaths > 1]) for cells in of_swath]
+
+
+def _last(swath: Swath, count: int) -> Int64Array:
     """Rising indexes of last returns, evenly over a swath."""
     at = np.arange(0, len(swath), max(1, len(swath) // count))
     rows = swath.rows[at]
     last: Int64Array = at[rows["return_number"] == rows["number_of_returns"]]
     return last
-
-
-def _spacing(flight: Flight, samples: list[Int64Array]) -> float:
-    """Metres from one of the sample's points to the next, of the thinnest swath; PrealignError: one has no points."""
-    spacings = [
-        spacing_m(swath) * np.sqrt(len(swath) / max(len(at), 1))
-        for swath, at in zip(flight.swaths, samples, strict=True)
-    ]
-    if not np.isfinite(spacings).all():
-        text = "a swath has no points; want a trajectory and a calibration that place them"
-        raise PrealignError(f"prealignment: {text}")
-    return float(max(spacings))
 
 
 def _improved(
@@ -146,22 +208,25 @@ def _improved(
     began: Mapping[str, FloatArray],
     smooth_m: float,
     settings: PrealignSettings,
-    control_t: FloatArray | None,
-) -> tuple[dict[str, Calibration], FloatArray]:
-    """One step: better calibrations, and by how much each head's parameters changed, (h, 4)."""
+    control: _Control | None,
+) -> tuple[dict[str, Calibration], FloatArray] | None:
+    """One step: better calibrations, and by how much each head's parameters changed, (h, 4); None: too few cells are
+    in two swaths."""
     if any(not len(points) for points, _ in placed):
-        text = "a swath has no points; want a trajectory and a calibration that place them"
-        raise PrealignError(f"prealignment: {text}")
-    lattice = Lattice.over([points for points, _ in placed], max(smooth_m / 3.0, _CELL_LEAST_M), _CELLS_MOST)
+        raise PrealignError(f"prealignment: {_NO_POINTS}")
+    lattice = Lattice.over([points for points, _ in placed], smooth_m / _SMOOTH_CELLS, _CELLS_MOST)
+    smooth_m = max(smooth_m, lattice.cell_m)
     surfaces = [surface(lattice, points, motion, smooth_m) for points, motion in placed]
     heads = [swath.head for swath in flight.swaths]
     apart, design = _differences(surfaces, heads, len(flight.heads))
+    if len(apart) < _CELLS_LEAST:
+        return None
     sigma_m, weight = _robust(apart, design)
     alike = max(1.0, 4.0 * np.pi * (smooth_m / lattice.cell_m) ** 2)  # cells that the smoothing makes one
     normal = (design * weight[:, np.newaxis]).T @ design / (sigma_m**2 * alike)
     right = design.T @ (weight * apart) / (sigma_m**2 * alike)
-    if control_t is not None and len(control_t):
-        above, rows = _against_control(placed, heads, len(flight.heads), np.asarray(control_t))
+    if control is not None and len(control.points_t):
+        above, rows = _against_control(placed, heads, len(flight.heads), control)
         normal += rows.T @ rows / settings.control_sigma_m**2
         right += rows.T @ above / settings.control_sigma_m**2
     names = [head.name for head in flight.heads]
@@ -207,8 +272,6 @@ def _differences(surfaces: list[Surface], heads: list[int], count: int) -> tuple
         rows[:, heads[other]] -= second.change[b]
         apart.append(first.height_m[a] - second.height_m[b])
         design.append(rows.reshape(len(a), count * len(NAMES)))
-    if sum(len(one) for one in apart) < _CELLS_LEAST:
-        raise PrealignError("prealignment: the swaths do not overlap; want strips over the same ground")
     return np.concatenate(apart), np.concatenate(design)
 
 
@@ -228,13 +291,13 @@ def _robust(apart: FloatArray, design: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _against_control(
-    placed: list[tuple[FloatArray, FloatArray]], heads: list[int], count: int, control_t: FloatArray
+    placed: list[tuple[FloatArray, FloatArray]], heads: list[int], count: int, control: _Control
 ) -> tuple[FloatArray, FloatArray]:
     """Heights of swaths above control points (m,), and their change with all unknowns (m, u)."""
     above, design = [np.zeros(0)], [np.zeros((0, count * len(NAMES)))]
     for (points, motion), head in zip(placed, heads, strict=True):
-        near = cKDTree(points[:, :2]).query_ball_point(control_t[:, :2], _CONTROL_REACH_M)
-        for place, at in zip(control_t, near, strict=True):
+        near = cKDTree(points[:, :2]).query_ball_point(control.points_t[:, :2], control.reach_m)
+        for place, at in zip(control.points_t, near, strict=True):
             if len(at) >= _CONTROL_POINTS:
                 row = np.zeros((count, len(NAMES)))
                 row[head] = np.median(motion[:, at, 2], axis=1)

@@ -88,6 +88,8 @@ def cast_flight(
     seed: int = 1,
     range_sigma_m: float = 0.02,
     angle_sigma_rad: float = 2e-5,
+    half_angle_rad: float = HALF_ANGLE_RAD,
+    speed_mps: float = SPEED_MPS,
 ) -> Cast:
     """Fly lines with gusts over a terrain (keys of the plan's ``[terrain]``).
 
@@ -98,21 +100,23 @@ def cast_flight(
         true: what the scanner really is, names of `georef.calibration.PARAMETERS`; None: `TRUE`.
         seed: of noise and gusts.
         range_sigma_m, angle_sigma_rad: noise of a return.
+        half_angle_rad: of the scan.
+        speed_mps: over the ground.
     """
     draws = np.random.default_rng(seed)
     plan = parse_plan(_plan(terrain, lines), Path())
     site = Site.at(*ORIGIN_DEG)
-    corners = _corners(lines)
+    corners = _corners(lines, half_angle_rad)
     scene = build_scene(plan, site, corners)
     truth = nominal("left", np.zeros(3), np.eye(3)).changed(**(TRUE if true is None else true))
-    tracks = [_track(line, site, index, draws) for index, line in enumerate(lines)]
+    tracks = [_track(line, site, index, draws, speed_mps) for index, line in enumerate(lines)]
     time_ns, *columns = (np.concatenate(parts) for parts in zip(*tracks, strict=True))
     trajectory = Trajectory(time_ns, columns[0], columns[1], columns[2], columns[3], columns[4])
     frame = Tangent.at(site.e_from_site(np.zeros((1, 3)))[0])
     head = Head("left", nominal("left", np.zeros(3), np.eye(3)), LineGeometry(), Noise(range_sigma_m, angle_sigma_rad))
     swaths, surfaces, points = [], [], []
     for index, track in enumerate(tracks):
-        rows, time_ns, surface, true_e = _shoot(scene, track, truth, prf_hz)
+        rows, time_ns, surface, true_e = _shoot(scene, track, truth, prf_hz, half_angle_rad)
         rows["range_m"] += range_sigma_m * draws.standard_normal(len(rows))
         rows["encoder_rad"] += angle_sigma_rad * draws.standard_normal(len(rows))
         swaths.append(Swath(f"{index:02d}", 0, index, 0, rows, time_ns, np.zeros((len(rows), 3))))
@@ -130,20 +134,22 @@ def _plan(terrain: str, lines: Sequence[Line]) -> str:
     return text
 
 
-def _corners(lines: Sequence[Line]) -> FloatArray:
+def _corners(lines: Sequence[Line], half_angle_rad: float) -> FloatArray:
     """All of the lines, and as far to all sides as the scanner sees."""
     ends = np.array([[line[0:2], line[2:4]] for line in lines]).reshape(-1, 2)
-    reach = 1.1 * np.tan(HALF_ANGLE_RAD) * max(line[4] - 380.0 for line in lines)
+    reach = 1.1 * np.tan(half_angle_rad) * max(line[4] - 380.0 for line in lines)
     low, high = ends.min(axis=0) - reach, ends.max(axis=0) + reach
     return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
-def _track(line: Line, site: Site, index: int, draws: np.random.Generator) -> tuple[NDArray[Any], ...]:
+def _track(
+    line: Line, site: Site, index: int, draws: np.random.Generator, speed_mps: float
+) -> tuple[NDArray[Any], ...]:
     """Columns of a trajectory along a line, with slow gusts."""
     begin, end = np.array(line[:2]), np.array(line[2:4])
     length = float(np.linalg.norm(end - begin))
-    second = np.arange(0.0, length / SPEED_MPS, POSE_S)
-    place = begin + (end - begin) * (SPEED_MPS / length) * second[:, np.newaxis]
+    second = np.arange(0.0, length / speed_mps, POSE_S)
+    place = begin + (end - begin) * (speed_mps / length) * second[:, np.newaxis]
     place_site = site.site_from_ground(place[:, 0], place[:, 1], line[4] + 2.0 * np.sin(0.4 * second))
     position_e = site.e_from_site(place_site)
     lat, lon, _ = geodetic_from_e(position_e)
@@ -167,12 +173,13 @@ def _shoot(
     track: tuple[NDArray[Any], ...],
     truth: Calibration,
     prf_hz: float,
+    half_angle_rad: float,
 ) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.uint8], FloatArray]:
     """Rows, their times, surfaces, and points (n, 3) in e, of all pulses along a track: a polygon's even sweeps."""
     time_ns, position_e, q = track[0].astype(np.int64), track[1], track[2]
     span_s = 1e-9 * float(time_ns[-1] - time_ns[0])
     second = np.arange(0.0, span_s - POSE_S, 1.0 / prf_hz)
-    angle = HALF_ANGLE_RAD * (2.0 * (SCAN_HZ * second % 1.0) - 1.0)
+    angle = half_angle_rad * (2.0 * (SCAN_HZ * second % 1.0) - 1.0)
     at = np.minimum((second / POSE_S).astype(np.int64), len(position_e) - 2)
     share = (second / POSE_S - at)[:, np.newaxis]
     place_e = position_e[at] + share * (position_e[at + 1] - position_e[at])

@@ -10,7 +10,9 @@ import pytest
 from calib.flight import Flight
 from calib.height_grids import Lattice, surface
 from calib.plane_search import find_planes
+from calib.plane_settings import PlaneSettings
 from calib.prealign import NAMES, PrealignError, PrealignSettings, prealign
+from calib.scale import scale_of
 from georef.calibration import Calibration
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
@@ -34,6 +36,14 @@ houses = 40
 center_m = [130.0, 90.0]
 size_m = [80.0, 60.0]
 trees_per_ha = 200.0
+"""
+YARD = """
+height_m = 450.0
+[[terrain.village]]
+center_m = [0.0, 0.0]
+size_m = [{size}, {size}]
+heading_deg = 25.0
+houses = {houses}
 """
 FAST = PrealignSettings(returns=40_000)
 COARSE, FINE = replace(FAST, smooth_m=(48.0,)), replace(FAST, smooth_m=(24.0, 8.0))
@@ -73,6 +83,53 @@ def test_so_also_over_flat_ground_where_houses_are_all_there_is(seed: int) -> No
     signs = np.random.default_rng(seed).choice([-3.0, 3.0], 3).tolist()
     found = prealign(flat.flight, FAST, off(flat, (signs[0], signs[1], signs[2])))
     assert np.abs(errors_deg(flat, found)).max() < 0.05
+
+
+LOW: tuple[Line, ...] = ((-70, 0, 70, 0, 510), (70, 0, -70, 0, 530), (0, -70, 0, 70, 510))
+LOWEST: tuple[Line, ...] = ((-45, 0, 45, 0, 470), (45, 4, -45, 4, 480), (0, -45, 0, 45, 470))
+HIGH: tuple[Line, ...] = ((-900, 0, 900, 0, 3450), (900, 500, -900, 500, 3450), (0, -900, 0, 900, 3450))
+
+
+@pytest.mark.parametrize(
+    ("lines", "half_angle_deg", "prf_hz", "speed_mps", "size_m", "houses"),
+    [
+        pytest.param(LOW, 15.0, 5_000.0, 10.0, 150.0, 30, id="32 m wide from 60 m and 80 m"),
+        pytest.param(LOWEST, 35.0, 5_000.0, 10.0, 90.0, 14, id="from 20 m"),
+        pytest.param(HIGH, 20.0, 6_000.0, 75.0, 1000.0, 250, id="from 3,000 m", marks=pytest.mark.slow),
+    ],
+)
+def test_strips_of_any_height_become_good_enough_for_planes(
+    lines: tuple[Line, ...], half_angle_deg: float, prf_hz: float, speed_mps: float, size_m: float, houses: int
+) -> None:
+    """Two degrees off; then what is left moves no point of the swath's edge by more than a plane may be displaced."""
+    half_angle_rad = float(np.radians(half_angle_deg))
+    low = cast_flight(
+        YARD.format(size=size_m, houses=houses),
+        lines,
+        prf_hz=prf_hz,
+        half_angle_rad=half_angle_rad,
+        speed_mps=speed_mps,
+    )
+    found = prealign(low.flight, FAST, off(low, (2.0, -2.0, 2.0)))
+    roll, pitch, heading = np.radians(errors_deg(low, found))
+    sizes = scale_of(low.flight)
+    assert sizes is not None
+    allowed_m = PlaneSettings().scaled(sizes).displacement_m
+    assert np.hypot(roll, pitch) * sizes.height_m < 0.3 * allowed_m
+    assert abs(heading) * 0.5 * sizes.width_m < 0.3 * allowed_m
+    assert np.degrees(abs(heading)) < 1.0
+
+
+@pytest.mark.slow
+def test_a_long_line_is_aligned_by_the_part_that_a_short_one_crosses() -> None:
+    """Of 2 km and 60 m beside: samples spread over all of the long line would lie too far apart."""
+    corridor: tuple[Line, ...] = ((-1000, 0, 1000, 0, 510), (40, 5, -40, 5, 510), (0, -60, 0, 60, 510))
+    flight = cast_flight(
+        YARD.format(size=150.0, houses=30), corridor, prf_hz=4_000.0, half_angle_rad=np.radians(15.0), speed_mps=20.0
+    )
+    found = prealign(flight.flight, replace(FAST, returns=15_000), off(flight, (1.0, -1.0, 1.0)))
+    roll, pitch, _ = errors_deg(flight, found)
+    assert np.hypot(roll, pitch) < 0.2
 
 
 def test_afterwards_planes_are_found() -> None:
