@@ -83,9 +83,15 @@ class ClockPlan:
 
 
 class HostClocks:
-    """The host's clock in GPS time: one `PpsClock` a pulse per second, and one a receiver that is wired to none."""
+    """The host's clock in GPS time: one `PpsClock` a pulse per second, and one a receiver that is wired to none.
 
-    def __init__(self, plan: ClockPlan, *, keep_history: bool = False) -> None:
+    Args:
+        plan: the clocks.
+        keep_history: answers of all times stay possible.
+        wall_names: a disciplined wall clock may name the seconds of pulses that no receiver names.
+    """
+
+    def __init__(self, plan: ClockPlan, *, keep_history: bool = False, wall_names: bool = False) -> None:
         self.plan = plan
         self.timeline = HostTimeline(plan.host_minus_monotonic_ns, keep_history=keep_history)
         self.by_source: dict[str, PpsClock] = {}
@@ -100,7 +106,8 @@ class HostClocks:
             )
         self._readings: deque[tuple[int, int, int, float]] = deque()
         self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
-        self._told: set[PpsClock] = set()  # by a receiver: a wall clock decides between seconds, and is no time alone
+        # by a receiver: a wall clock decides between seconds, and is no time alone unless the caller takes it for one
+        self._told: set[PpsClock] = set(self.by_source.values()) if wall_names else set()
 
     def add_reading(
         self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf

@@ -25,6 +25,12 @@ def command(
         typer.Option(metavar="FILE", help="Post-processed positions of the antenna: RTKLIB .pos or Waypoint text."),
     ] = None,
     week: Annotated[int | None, typer.Option(help="GPS week of such a file that says none.", min=0)] = None,
+    lever_arm: Annotated[
+        str | None,
+        typer.Option(
+            "--lever-arm", metavar="X,Y,Z", help="Of such a file's antenna, metres from the IMU: forward, right, down."
+        ),
+    ] = None,
     csv: Annotated[bool, typer.Option("--csv", help="Also as CSV, with sigmas.")] = False,
     events: Annotated[
         Path | None, typer.Option(metavar="FILE", help="CSV of the event marks, each with its pose.")
@@ -51,14 +57,19 @@ def command(
     """
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
     from daemon.config import load_config
-    from daemon.processing.navigate import NavigateWish, attitude_of_text
+    from daemon.processing.navigate import NavigateWish, arm_of_text, attitude_of_text
     from daemon.processing.navigation_inputs import INS_USES, InputWish
     from daemon.processing.progress import progress_bar
     from daemon.processing.trajectory_run import TrajectoryWish, make_trajectory
 
     if ins not in INS_USES:
         raise UserError(f'--ins: got "{ins}", want {", ".join(INS_USES)}', ExitCode.USAGE)
-    inputs = InputWish(imu, gnss_name, None if config is None else load_config(config), gnss, week, ins)
+    arm = None if lever_arm is None else arm_of_text(lever_arm)
+    if arm is not None and gnss is None:
+        raise UserError(
+            "--lever-arm: is of the antenna of --gnss FILE; the log's own is gnss.….lever_arm_m", ExitCode.USAGE
+        )
+    inputs = InputWish(imu, gnss_name, None if config is None else load_config(config), gnss, week, arm, ins)
     attitude = None if start is None else attitude_of_text(start)
     wish = TrajectoryWish(
         logs,

@@ -169,7 +169,9 @@ class ImuConfig(Section):
     )
     stamp: Literal["end", "middle", "start"] = Field("end", description="what of the interval the stamp is")
     group: Literal["last", "first"] | None = Field(
-        None, description="the message with sample_ticks closes (last) or opens (first) a sample; absent: last for dbc"
+        None,
+        description="the message with sample_ticks closes (last) or opens (first) a sample; "
+        "absent: dbc: by the frames' spacing",
     )
     signals: SignalsConfig | None = Field(None, description="the map of the DBC's signals")
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="for the navigation filter")

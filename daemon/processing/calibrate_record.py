@@ -51,7 +51,7 @@ def instruments_of(kept: KeptFlight) -> dict[str, Value]:
     if navigated is None:
         return {}
     sources = navigated.inputs.sources
-    arm_b = tuple(sources.gnss.lever_arm_m)
+    arm_b = tuple(navigated.inputs.setup.lever_arms_b[0].tolist())
     note = f"antenna of gnss.{sources.gnss_name} from the IMU: forward, right, down"
     found = {
         "CA_IMU.dataRate": Value(_duration(1.0 / sources.imu.rate_hz), "", f"of imu.{sources.imu_name}, nominal"),

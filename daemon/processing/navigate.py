@@ -15,6 +15,7 @@ from daemon.log.reader import Session
 from daemon.processing.ins_point import point_doubts
 from daemon.processing.mapped_storage import MappedStorage
 from daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from daemon.processing.navigation_times import Stretch
 from georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     Kind,
@@ -24,7 +25,7 @@ from georef.navigation.inputs import (
 )
 from georef.navigation.stores import IN_MEMORY, Storage
 from georef.records import FixType, StructArray
-from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, gps_text
+from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 from georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is that of a receiver's rate
 NAVIGATED = "navigation of the log's IMU and GNSS"
 GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # of an attitude that somebody says by hand
 COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
@@ -89,6 +91,7 @@ class Navigated:
         legs: those that could be navigated.
         holes: what is missing, a line each, those of the inputs included.
         doubts: lines for the user.
+        missing: stretches of the samples without a trajectory, by time; a line of holes each.
     """
 
     inputs: NavigationInputs
@@ -96,6 +99,12 @@ class Navigated:
     legs: list[NavigatedLeg]
     holes: list[str]
     doubts: list[str]
+    missing: list[Stretch] = field(default_factory=list)
+
+    @property
+    def missing_s(self) -> float:
+        """Return how long in all samples have no trajectory."""
+        return sum(part.seconds for part in self.missing)
 
     @property
     def session_id(self) -> str:
@@ -141,22 +150,27 @@ def navigate_inputs(
         UserError: no leg of it can be navigated, a line each.
     """
     legs: list[NavigatedLeg] = []
-    holes = list(inputs.holes)
+    holes, missing = list(inputs.holes), list(inputs.missing)
     for number, leg in enumerate(inputs.legs):
         tell("filter and smoother" if wish.smooth else "filter", number, len(inputs.legs))
         try:
             legs.append(_navigated(inputs, leg, wish, storage))
             storage.rest()
         except NavigationError as error:
-            holes.append(f"{inputs.log}: from {gps_text(leg.span[0])} to {gps_text(leg.span[1])}: {error}")
+            missing.append(Stretch(*leg.span, str(error)))
+            holes.append(f"{inputs.log}: {missing[-1].text}")
             holes += _why_not(inputs, leg)
     if not legs:
         why = holes[len(inputs.holes) :] or [
             f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough to be navigated"
         ]
         raise UserError("\n".join(why))
-    doubts = [*inputs.doubts, *_unreached(inputs, legs, smooth=wish.smooth)]
-    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts)
+    doubts = list(inputs.doubts)
+    for part, has_fixes in _unreached(legs, smooth=wish.smooth):
+        if wish.smooth and has_fixes:
+            missing.append(part)
+        (holes if wish.smooth and has_fixes else doubts).append(f"{inputs.log}: {part.text}")
+    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts, sorted(missing, key=lambda part: part.begin_ns))
     navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
     return navigated
 
@@ -194,18 +208,19 @@ def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> Struct
     return sort_observations(np.concatenate([leg.observations, row]))
 
 
-def _unreached(inputs: NavigationInputs, legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[str]:
-    """Where samples are and the trajectory is not: before the start that was found."""
-    lines: list[str] = []
+def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stretch, bool]]:
+    """Return the stretches before the starts that were found, and for each whether it has positions to begin from."""
+    found: list[tuple[Stretch, bool]] = []
     for leg in legs:
-        first = int(leg.solution(smooth=smooth).time_ns[0])
-        missing_s = (first - leg.leg.span[0]) / 1e9
-        if missing_s > 1.0:
-            lines.append(
-                f"{inputs.log}: {missing_s:.1f} s before {gps_text(first)} have no trajectory: no start was found "
-                "earlier"
-            )
-    return lines
+        first, rows = int(leg.solution(smooth=smooth).time_ns[0]), leg.leg.observations
+        fixes_ns = rows["time_ns"][(rows["kind"] == Kind.POSITION) & (rows["time_ns"] >= leg.leg.span[0])]
+        fix_ns = int(fixes_ns[0]) if len(fixes_ns) else first
+        if fix_ns - leg.leg.span[0] > UNTIL_A_FIX_NS:
+            part = Stretch(leg.leg.span[0], min(fix_ns, first), "no trajectory before the first position")
+            found.append((part, False))
+        if first - fix_ns > UNTIL_A_FIX_NS:
+            found.append((Stretch(fix_ns, first, "no trajectory: no start was found earlier"), True))
+    return found
 
 
 def _ins_doubts(inputs: NavigationInputs, navigated: Trajectory) -> list[str]:
@@ -225,6 +240,21 @@ def joined_trajectory(parts: Sequence[Trajectory], name: str, max_gap_ns: int = 
         return replace(parts[0], name=name, max_gap_ns=max_gap_ns)
     columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in COLUMNS}
     return Trajectory(**columns, max_gap_ns=max_gap_ns, name=name)
+
+
+def arm_of_text(text: str) -> tuple[float, float, float]:
+    """Return a lever arm, m in b, of ``x,y,z`` in metres.
+
+    Raises:
+        UserError: the text says none.
+    """
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not max(abs(x), abs(y), abs(z)) < 1000.0:
+        raise UserError(f'--lever-arm: got "{text}", want x,y,z in metres, as 0.35,-0.12,-1.1', ExitCode.USAGE)
+    return x, y, z
 
 
 def attitude_of_text(text: str) -> tuple[float, float, float]:

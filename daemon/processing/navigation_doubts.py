@@ -20,15 +20,19 @@ from georef.trajectory import gps_text
 TIME_IS_KNOWN_S = 1e-4  # a better time of the IMU's samples needs no offset to be found: 6 mm at 60 m/s
 
 
-def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path) -> None:
-    """A log without one of the two that navigation needs."""
+def refuse_nothing(found: NavigationLog, sources: NavigationSources, log: Path, *, outside: bool) -> None:
+    """Refuse a log that lacks samples, or positions where none come from ``outside``.
+
+    Raises:
+        UserError: it lacks either.
+    """
     if not len(found.imu):
         hint = "; it has an INS's own solutions: want --ins as-is for these" if len(found.ins) else ""
         raise UserError(f"{log}: no samples of {sources.imu_source}: {_heard(found, sources.imu_source)}{hint}")
-    if not found.fixes:
+    if not found.fixes and not outside and sources.gnss_source is not None:
         raise UserError(
             f"{log}: no position of {sources.gnss_source}, and an IMU alone cannot be navigated: "
-            f"{_heard(found, sources.gnss_source)}"
+            f"{_heard(found, sources.gnss_source)}; or --gnss FILE with post-processed positions"
         )
 
 
@@ -48,15 +52,32 @@ def no_time(found: NavigationLog, sources: NavigationSources, log: Path) -> str:
     if sources.clock is None:
         return f"{log}: the configuration has neither [pps.…] nor [gnss.…]: nobody tells GPS time"
     status = found.host.status(sources.clock, int(found.imu["host_time_ns"][-1]))
+    if sources.gnss_source is None:
+        return (
+            f"{log}: {sources.clock}: no receiver says which second its edges are, and no disciplined wall clock "
+            f"either, so no sample of {sources.imu_source} has GPS time; want [gnss.NAME] with its time messages, a "
+            "host that chrony keeps, or an IMU that says GPS time itself"
+        )
     return (
         f"{log}: {sources.clock}: the host's clock is {status.state.value}, so no sample of {sources.imu_source} has "
         f"GPS time; want PPS edges, or at least time messages of {sources.gnss_source}"
     )
 
 
-def refuse_elsewhere(inertial: Inertial, observations: StructArray, sources: NavigationSources, log: Path) -> None:
-    """Observations there must be, and of the time of the samples."""
+def refuse_elsewhere(
+    inertial: Inertial, observations: StructArray, sources: NavigationSources, outside: Path | None, log: Path
+) -> None:
+    """Refuse observations without a position, or of another time than the samples.
+
+    Args:
+        outside: file of the positions; None: they are the receiver's.
+
+    Raises:
+        UserError: they are so.
+    """
     positions = observations[observations["kind"] == Kind.POSITION]
+    if not len(positions) and outside is not None:
+        raise UserError(f"--gnss {outside}: none of its positions has a fix that is navigated with; want another file")
     if not len(positions):
         raise UserError(
             f"{log}: no usable position of {sources.gnss_source}: its fixes have no ellipsoidal height, no time, or "
@@ -88,6 +109,16 @@ def input_doubts(
             f"{log}: the times of {sources.imu_source} are good to {times.sigma_s * 1e3:.1f} ms only; want PPS edges "
             "that it latches; an offset is estimated"
         )
+    if sources.gnss_source is None and times.by != "gps":
+        lines.append(
+            f"{log}: the host's wall clock alone names the seconds of {sources.clock}, for there is no receiver; an "
+            "error of it moves the trajectory along its track"
+        )
+    if not sources.arm_is_said:
+        lines.append(
+            f"{log}: nobody says the lever arm of the positions' antenna: it is estimated with the flight, from "
+            "0 m on; want --lever-arm X,Y,Z, forward, right, down from the IMU"
+        )
     if sources.imu_is_in_receiver and not parts["fix"].refused["blended_by_ins"]:
         blended = sorted({fix.message for fix in found.fixes} & {"BESTPOS", "BESTVEL"})
         if blended:
@@ -95,6 +126,7 @@ def input_doubts(
                 f"{log}: {' and '.join(blended)} of a receiver with an INS are blended with it, so that its errors "
                 "come twice; want BESTGNSSPOS and BESTGNSSVEL"
             )
+    lines += [f"{log}: {doubt}" for doubt in found.doubts]
     without = parts["heading"].refused["no_secondary_lever_arm"]
     if without:
         lines.append(

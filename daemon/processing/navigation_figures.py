@@ -16,7 +16,7 @@ from daemon.processing.navigation_series import (
     outages_of,
     used_positions,
 )
-from georef.navigation.inputs import Fate, Kind, Solution
+from georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Solution
 from georef.records import FixType, StructArray
 from georef.timescales.gps_time import SECOND_NS
 
@@ -53,6 +53,8 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
         "start_gps_ns": flight.start_ns,
         "end_gps_ns": int(best.time_ns[-1]),
         "duration_s": flight.duration_s,
+        "missing_s": flight.missing_s,
+        "missing_share": flight.missing_s / max(flight.missing_s + flight.duration_s, 1e-9),
         "epochs": len(best),
         "rate_hz": SECOND_NS / float(np.median(intervals)) if len(intervals) else None,
         "not_finite": _not_finite(best),
@@ -230,7 +232,7 @@ def _lever_arm(flight: Flight) -> Figures | None:
         return None
     given = np.asarray(flight.setup.lever_arms_b, np.float64)[0]
     estimate, sigma = best.lever_arm_b[-1], best.lever_arm_sigma[-1]
-    moved = np.abs(estimate - given)
+    moved = np.abs(estimate - given) if prior_m < ARM_UNSAID_M else np.zeros(3)  # of what nobody said
     return {
         "given_m": given.tolist(),
         "estimate_m": estimate.tolist(),

@@ -24,14 +24,14 @@ from daemon.processing.navigation_observations import (
     joined,
 )
 from daemon.processing.navigation_sources import NavigationSources, config_of_log, files_of
-from daemon.processing.navigation_times import ImuTimes, imu_times
+from daemon.processing.navigation_times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
 from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_unreadable
+from daemon.processing.refusals import refuse_no_time
 from georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
 from georef.navigation.samples import Sampler
 from georef.navigation.stores import IN_MEMORY, Storage
 from georef.records import EventMark, GnssFix, GnssHeading, StructArray, TimeTag
 from georef.timescales import SECOND_NS
-from georef.trajectory import gps_text
 from georef.trajectory_buffer import SOLUTION_STATUS
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ class NavigationInputs:
         refused: fixes, headings and solutions that are no observation, by reason, with their kind before it.
         assumed: observations whose sigmas are defaults, by kind.
         doubts: lines for the user; holes: what is missing, a line each.
+        missing: stretches of the samples that no leg holds, longer than `LEAST_HOLE_S`; each is a hole too.
     """
 
     session: Session
@@ -97,6 +98,7 @@ class NavigationInputs:
     counts: dict[str, Counter[str]]
     doubts: list[str] = field(default_factory=list)
     holes: list[str] = field(default_factory=list)
+    missing: list[Stretch] = field(default_factory=list)
 
     @property
     def log(self) -> Path:
@@ -113,6 +115,7 @@ class InputWish:
         config: instead of the log's own.
         positions: of an antenna, from outside, instead of the receiver's; None: the receiver's.
         week: of such a file that says none.
+        arm_b: x, y, z from the body's origin to its antenna, m; None: as the configuration has the receiver's.
         ins: ``observe``: the attitude of the device's own INS too; ``ignore``: not.
     """
 
@@ -121,6 +124,7 @@ class InputWish:
     config: Config | None = None
     positions: Path | None = None
     week: int | None = None
+    arm_b: tuple[float, float, float] | None = None
     ins: str = "ignore"
 
 
@@ -136,24 +140,24 @@ def read_inputs(session: Session, wish: InputWish, storage: Storage = IN_MEMORY)
         refuse_unreadable(wish.positions)
     sources = _sources(session, wish)
     found = read_navigation_log(session, sources)
-    refuse_nothing(found, sources, log)
+    refuse_nothing(found, sources, log, outside=wish.positions is not None)
     times = imu_times(found.imu, found.host, sources.clock, sources.imu.rate_hz)
     if not len(times.gps_ns):
         raise UserError(no_time(found, sources, log))
+    if times.by != "gps" and sources.clock is not None:
+        last_ns = int(found.imu["host_time_ns"][-1])
+        refuse_no_time(log, sources.clock, found.host.status(sources.clock, last_ns), sources.config)
     inertial, sampler = _sampled(times, sources, storage)
     placed = _Placed(found, sources)
     outside = None if wish.positions is None else _outside(wish.positions, wish.week, inertial, placed)
     parts = placed.observations(outside, use_ins=wish.ins == "observe")
     observations = joined(list(parts.values()))
-    refuse_elsewhere(inertial, observations, sources, log)
-    legs = _legs(inertial, observations)
+    refuse_elsewhere(inertial, observations, sources, wish.positions, log)
+    legs, short = _legs(inertial, observations)
     doubts = input_doubts(found, sources, times, parts, log)
-    holes = session_holes(session)
+    missing = _missing(times, sampler, short, sources.imu.rate_hz)
+    holes = [*session_holes(session), *(f"{log}: {sources.imu_source}: {part.text}" for part in missing)]
     samples = sampler.counts + times.refused + Counter(taken=len(inertial))
-    for begin, end in sampler.gaps:
-        holes.append(
-            f"{log}: {sources.imu_source}: no samples from {gps_text(begin)} on for {(end - begin) / 1e9:.1f} s"
-        )
     kinds = {int(kind): kind.name.lower() for kind in Kind}
     return NavigationInputs(
         session=session,
@@ -172,6 +176,7 @@ def read_inputs(session: Session, wish: InputWish, storage: Storage = IN_MEMORY)
         counts=found.counts,
         doubts=doubts,
         holes=holes,
+        missing=missing,
     )
 
 
@@ -179,7 +184,8 @@ def _sources(session: Session, wish: InputWish) -> NavigationSources:
     log = session.parts[0].path
     try:
         files = files_of(session, wish.config)
-        return NavigationSources(wish.config or config_of_log(files), files, wish.imu, wish.gnss)
+        config, outside = wish.config or config_of_log(files), wish.positions is not None
+        return NavigationSources(config, files, wish.imu, wish.gnss, outside=outside, arm_b=wish.arm_b)
     except UserError as error:
         prefix = "" if wish.config is not None or error.message.startswith("--") else f"{log}: "
         lines = [f"{prefix}{line}" for line in error.message.splitlines()]
@@ -210,22 +216,67 @@ def _sampled(times: ImuTimes, sources: NavigationSources, storage: Storage) -> t
     return Inertial(*columns), sampler
 
 
-def _legs(inertial: Inertial, observations: StructArray) -> list[Leg]:
-    """Pieces between the gaps that are not bridged, each with the observations of its time."""
+def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_hz: float) -> list[Stretch]:
+    """Return, by time, what of the samples no leg holds; a gap that samples without a time explain is told once."""
+    rows = times.rows
+    finite = np.isfinite(rows["specific_force_b"]).all(axis=1) & np.isfinite(rows["angular_rate_b"]).all(axis=1)
+    dropped = [*times.dropped]
+    dropped += stretches(rows["host_time_ns"], finite, times.gps_ns[finite], rate_hz, "samples that are not numbers")
+    gaps = [Stretch(begin, end, "no samples") for begin, end in sampler.gaps]
+    gaps = [
+        gap
+        for gap in gaps
+        if not any(
+            min(gap.end_ns, one.end_ns) - max(gap.begin_ns, one.begin_ns) > 0.5 * (gap.end_ns - gap.begin_ns)
+            for one in dropped
+        )
+    ]
+    return sorted([*dropped, *gaps, *_misplaced(sampler, rate_hz), *short], key=lambda part: part.begin_ns)
+
+
+def _misplaced(sampler: Sampler, rate_hz: float) -> list[Stretch]:
+    """Return the runs of samples whose stamps lie before those that came earlier, by these stamps."""
+    words = {
+        "time_jumped_back": "samples whose time jumped back",
+        "out_of_order": "samples out of order",
+        "duplicate": "samples of a time that another had",
+        "stamp_outlier": "samples whose time stands alone",
+    }
+    runs: list[list[tuple[int, str]]] = []
+    for stamp_ns, reason in sampler.left_out:
+        follows = runs and runs[-1][-1][1] == reason and abs(stamp_ns - runs[-1][-1][0]) < LEAST_HOLE_S * SECOND_NS
+        if follows:
+            runs[-1].append((stamp_ns, reason))
+        else:
+            runs.append([(stamp_ns, reason)])
+    return [
+        Stretch(run[0][0], run[0][0] + round(len(run) / rate_hz * SECOND_NS), words[run[0][1]])
+        for run in runs
+        if len(run) / rate_hz > LEAST_HOLE_S
+    ]
+
+
+def _legs(inertial: Inertial, observations: StructArray) -> tuple[list[Leg], list[Stretch]]:
+    """Return the pieces between gaps that are not bridged, with the observations of their time; and those too short."""
     begins_ns = inertial.time_ns - np.rint(inertial.interval_s * SECOND_NS).astype(np.int64)
     apart = np.flatnonzero(begins_ns[1:] - inertial.time_ns[:-1] > inertial.interval_s[1:] * SECOND_NS / 2) + 1
     bounds = [0, *apart.tolist(), len(inertial)]
     legs: list[Leg] = []
+    short: list[Stretch] = []
     for first, last in pairwise(bounds):
         piece = inertial.between(first, last)
         if len(piece) < 2 or piece.time_ns[-1] - piece.time_ns[0] < MIN_LEG_S * SECOND_NS:
+            part = Stretch(
+                int(piece.time_ns[0]), int(piece.time_ns[-1]), f"shorter than {MIN_LEG_S:.0f} s between gaps"
+            )
+            short += [part] if part.seconds > LEAST_HOLE_S else []
             continue
         inside = slice(
             int(np.searchsorted(observations["time_ns"], piece.time_ns[0] - LEG_MARGIN_NS)),
             int(np.searchsorted(observations["time_ns"], piece.time_ns[-1] + LEG_MARGIN_NS)),
         )
         legs.append(Leg(piece, observations[inside]))
-    return legs
+    return legs, short
 
 
 # ---------------------------------------------------------------------- observations
@@ -261,9 +312,9 @@ class _Placed:
 
     def leap_seconds(self) -> int | None:
         """GPS − UTC as the receiver said it; None: it is a guess."""
-        newest = max((fix.host_time_ns for fix in self.found.fixes), default=None)
-        if newest is None:
+        if self.sources.gnss_source is None:
             return None
+        newest = max([int(self.found.imu["host_time_ns"][-1]), *(fix.host_time_ns for fix in self.found.fixes)])
         status = self.found.host.status(self.sources.gnss_source, newest)
         return status.leap_seconds if status.leap_origin != "guess" else None
 

@@ -13,6 +13,7 @@ from daemon.processing.feed import edges_of, readings_of
 from daemon.processing.log_index import SCANNER, Listening
 from daemon.processing.unread import refused_by
 from daemon.replay import source_of_topic
+from drivers.core.parser import PacketParser
 from georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
@@ -47,6 +48,7 @@ class NavigationLog:
         refused: messages that gave nothing, by source and reason.
         heard: bytes, those of them that belong to no message, and messages by name, by source.
         lost: units that the recorder lost, by source.
+        doubts: what the sources' messages leave uncertain, a line each.
     """
 
     session: Session
@@ -60,13 +62,15 @@ class NavigationLog:
     refused: dict[str, Counter[str]] = field(default_factory=dict)
     heard: dict[str, tuple[int, int, Counter[str]]] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
 
 
 class _Reader:
     """Collects the records of a session."""
 
     def __init__(self, sources: NavigationSources, session: Session) -> None:
-        host = HostClocks(sources.clock_plan(session.info), keep_history=True)
+        unnamed = sources.gnss_name is None
+        host = HostClocks(sources.clock_plan(session.info), keep_history=True, wall_names=unnamed)
         self.found = NavigationLog(session, host, np.empty(0, IMU_DTYPE))
         self._sources = sources
         self._parsers = sources.parsers()
@@ -102,6 +106,8 @@ class _Reader:
             found.refused[name] = refused_by(parser)
             counters = parser.counters
             found.heard[name] = counters.bytes, counters.bytes_skipped, counters.messages
+            if isinstance(parser, PacketParser):
+                found.doubts += [f"{name}: {doubt}" for doubt in parser.doubts]
         found.host.update()
         if self._imu:
             found.imu = np.concatenate(self._imu)

@@ -61,18 +61,18 @@ class Observed:
 
 
 def gps_times(
-    host: HostClocks, source: str, host_ns: Sequence[int], tags: Sequence[TimeTag | None]
+    host: HostClocks, source: str | None, host_ns: Sequence[int], tags: Sequence[TimeTag | None]
 ) -> list[int | None]:
     """GPS ns of a receiver's tags by what arrived when; None where one cannot be placed.
 
     Args:
         host: complete clocks.
-        source: of the receiver, ``gnss/rover``.
+        source: of the receiver, ``gnss/rover``; None: there is none, and no tag.
         host_ns: of arrival.
         tags: None: it says no time.
     """
-    if not tags:
-        return []
+    if source is None or not tags:
+        return [None] * len(tags)
     clock = host.by_source[source]
     near, sigma = host.gps_from_host(source, np.array(host_ns, np.int64))
     placed: list[int | None] = []

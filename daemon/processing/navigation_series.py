@@ -42,6 +42,7 @@ class Flight:
         start: how the start was found, in words.
         noise_found: factor on a kind's sigmas that the innovations ask for, by the name of what it is of.
         notes: lines for the user, of whoever read the log.
+        missing_s: how long in all the log's samples have no trajectory.
     """
 
     title: str
@@ -51,6 +52,7 @@ class Flight:
     start: str = ""
     noise_found: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    missing_s: float = 0.0
 
     @property
     def best(self) -> Solution:

@@ -21,7 +21,7 @@ from daemon.processing.setup import Options
 from daemon.processing.setup import Setup as PointSetup
 from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
 from drivers.core.registry import UnknownProtocolError, find_driver
-from georef.navigation.inputs import GRADES, ImuNoise, Setup, imu_noise
+from georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
 from georef.records import FixType
 from georef.stream_clocks import ClockPlan, DevicePlan
 
@@ -42,9 +42,11 @@ class NavigationSources:
         config: of the log, or another one.
         attachments: the files that it names, by their names in a log.
         imu, gnss: names; None: the first IMU that is no gimbal's, the first receiver.
+        outside: positions come from a file, so that a receiver is not needed.
+        arm_b: (3,) lever arm of the primary antenna, m, in place of the receiver's; None: the receiver's.
 
     Attributes:
-        imu_name, gnss_name: of the configuration.
+        imu_name, gnss_name: of the configuration; gnss_name is None where it has no receiver.
         clock: source that shows the host's time beside the IMU.
         ins_source: whose own INS there may be; None: nobody's.
 
@@ -53,15 +55,25 @@ class NavigationSources:
     """
 
     def __init__(
-        self, config: Config, attachments: Mapping[str, bytes], imu: str | None = None, gnss: str | None = None
+        self,
+        config: Config,
+        attachments: Mapping[str, bytes],
+        imu: str | None = None,
+        gnss: str | None = None,
+        *,
+        outside: bool = False,
+        arm_b: Sequence[float] | None = None,
     ) -> None:
         self.config = config
+        self._arm_b = arm_b
         self._attachments = dict(attachments)
         gimbals = {source for name in config.scanner for _, source in gimbal_sources(config, name)}
         of_aircraft = [name for name in config.imu if f"imu/{name}" not in gimbals]
         self.imu_name = _chosen("imu", imu, list(config.imu), of_aircraft)
         receivers = [name for name in config.gnss if f"gnss/{name}" not in gimbals]
-        self.gnss_name = _chosen("gnss", gnss, list(config.gnss), receivers)
+        self.gnss_name: str | None = None
+        if receivers or gnss is not None or not outside:
+            self.gnss_name = _chosen("gnss", gnss, list(config.gnss), receivers)
         table = {self.imu_name: config.imu[self.imu_name]}
         self._points = PointSetup(without_scanners(config, imu=table), attachments, Options(uncertainty=False))
         self.clock = self._points.clock_of_imu
@@ -73,9 +85,9 @@ class NavigationSources:
         return self.config.imu[self.imu_name]
 
     @property
-    def gnss(self) -> GnssConfig:
-        """The receiver's table."""
-        return self.config.gnss[self.gnss_name]
+    def gnss(self) -> GnssConfig | None:
+        """The receiver's table; None: there is no receiver."""
+        return None if self.gnss_name is None else self.config.gnss[self.gnss_name]
 
     @property
     def imu_source(self) -> str:
@@ -83,9 +95,14 @@ class NavigationSources:
         return f"imu/{self.imu_name}"
 
     @property
-    def gnss_source(self) -> str:
-        """``gnss/rover``."""
-        return f"gnss/{self.gnss_name}"
+    def gnss_source(self) -> str | None:
+        """``gnss/rover``; None: there is no receiver."""
+        return None if self.gnss_name is None else f"gnss/{self.gnss_name}"
+
+    @property
+    def arm_is_said(self) -> bool:
+        """True if the lever arm of the positions' antenna is known before the flight."""
+        return self.gnss is not None or self._arm_b is not None
 
     @property
     def imu_is_in_receiver(self) -> bool:
@@ -149,12 +166,17 @@ class NavigationSources:
 
     def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
         """Lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be found."""
-        arms = [np.array(self.gnss.lever_arm_m, dtype=np.float64)]
-        if self.gnss.secondary_lever_arm_m is not None:
-            arms.append(np.array(self.gnss.secondary_lever_arm_m, dtype=np.float64))
-            for problem in check_antennas(f"gnss.{self.gnss_name}", self.gnss):
+        table = self.gnss
+        arms = [np.zeros(3) if table is None else np.array(table.lever_arm_m, dtype=np.float64)]
+        if table is not None and table.secondary_lever_arm_m is not None:
+            arms.append(np.array(table.secondary_lever_arm_m, dtype=np.float64))
+            for problem in check_antennas(f"gnss.{self.gnss_name}", table):
                 raise ConfigError(problem)
-        return filter_setup(noise_of(self.imu.noise), arms, time_sigma_s=time_sigma_s)
+        setup = filter_setup(noise_of(self.imu.noise), arms, time_sigma_s=time_sigma_s)
+        if self._arm_b is not None:
+            own = np.stack([np.array(self._arm_b, dtype=np.float64), *arms[1:]])
+            setup = replace(setup, lever_arms_b=own)
+        return setup if self.arm_is_said else replace(setup, estimate_lever_arm=ARM_UNSAID_M)
 
 
 def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s: float = 0.0) -> Setup:
@@ -221,7 +243,7 @@ def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -
         return usual[0]
     what = {
         "imu": "no IMU of the aircraft: want [imu.NAME], or a finished trajectory from elsewhere",
-        "gnss": "no GNSS receiver, which tells where it was and when: want [gnss.NAME]",
+        "gnss": "no GNSS receiver, which tells where it was and when: want [gnss.NAME], or --gnss FILE",
     }[kind]
     raise UserError(f"the configuration names {what}", ExitCode.USAGE)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,35 @@ from numpy.typing import NDArray
 from georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
 from georef.stream_clocks import HostClocks
 from georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
+from georef.trajectory import gps_text
 
 GREATEST_SIGMA_NS = 1e9  # of a time that is of any use: an offset of this size can still be found
 PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is taken to have missed samples
+LEAST_HOLE_S = 0.5  # a longer stretch without samples is told by itself; shorter ones are bridged, and counted
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A stretch of time in which samples do not become a trajectory.
+
+    Attributes:
+        begin_ns, end_ns: GPS time; of samples without a time, as their arrival beside others tells it.
+        why: the reason, which follows "from … to …, … s:".
+    """
+
+    begin_ns: int
+    end_ns: int
+    why: str
+
+    @property
+    def seconds(self) -> float:
+        """Return its length."""
+        return (self.end_ns - self.begin_ns) / SECOND_NS
+
+    @property
+    def text(self) -> str:
+        """Return it in words: begin, end, length and reason."""
+        return f"from {gps_text(self.begin_ns)} to {gps_text(self.end_ns)}, {self.seconds:.1f} s: {self.why}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +53,7 @@ class ImuTimes:
         sigma_s: usual standard deviation (median).
         by: gps (it says GPS time itself), latch (of the PPS), counter, arrival.
         refused: samples without a time, by reason.
+        dropped: stretches of such samples that are longer than `LEAST_HOLE_S`.
     """
 
     rows: StructArray
@@ -33,6 +61,7 @@ class ImuTimes:
     sigma_s: float
     by: str
     refused: Counter[str]
+    dropped: tuple[Stretch, ...] = ()
 
 
 def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: float) -> ImuTimes:
@@ -48,7 +77,8 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     if own.any():
         taken = rows[own]
         gps_ns = taken["gps_week"].astype(np.int64) * WEEK_NS + taken["device_time_ns"]
-        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())))
+        dropped = stretches(rows["host_time_ns"], own, gps_ns, rate_hz, "samples without a GPS week")
+        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())), dropped)
     if clock is None or not len(rows):
         return ImuTimes(rows[:0], np.empty(0, np.int64), 0.0, "arrival", _reasons(no_clock=len(rows)))
     counted = rows["device_time_ns"] >= 0
@@ -61,7 +91,43 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     by = "arrival" if not counted.any() else "latch" if latched else "counter"
     sigma_s = float(np.median(sigma_ns[good])) / SECOND_NS if good.any() else 0.0
     refused = _reasons(no_device_time=len(rows) - len(taken), no_clock=int((~good).sum()))
-    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused)
+    placed = counted.copy() if counted.any() else np.ones(len(rows), np.bool_)
+    placed[placed] = good
+    why = f"the clock of {clock} gives these samples no time that is good to {GREATEST_SIGMA_NS / 1e9:.0f} s"
+    dropped = stretches(rows["host_time_ns"], placed, gps_ns[good], rate_hz, why)
+    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused, dropped)
+
+
+def stretches(
+    host_ns: Int64Array, placed: NDArray[np.bool_], gps_ns: Int64Array, rate_hz: float, why: str
+) -> tuple[Stretch, ...]:
+    """Return the stretches of samples left out that are longer than `LEAST_HOLE_S`.
+
+    Args:
+        host_ns: (n,) of arrival.
+        placed: (n,) samples that are used.
+        gps_ns: (m,) times of the m samples used.
+        rate_hz: nominal rate: so long is a stretch of many samples at the least.
+        why: reason to tell.
+    """
+    if not len(gps_ns):
+        return ()
+    number = np.cumsum(placed) - 1  # of the latest sample used
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], placed, [True]]).astype(np.int8)))
+    used = np.flatnonzero(placed)
+    found = []
+    for first, after in pairwise(edges.tolist()):
+        if placed[first]:
+            continue
+        before, beyond = int(number[first]), int(number[first]) + 1
+        near = used[max(before, 0)] if before >= 0 else used[0]
+        shift_ns = int(gps_ns[max(before, 0)]) - int(host_ns[near])
+        begin_ns = int(gps_ns[before]) if before >= 0 else int(host_ns[first]) + shift_ns
+        end_ns = int(gps_ns[beyond]) if beyond < len(gps_ns) else int(host_ns[after - 1]) + shift_ns
+        end_ns = max(end_ns, begin_ns + round((after - first) / rate_hz * SECOND_NS))
+        if end_ns - begin_ns > LEAST_HOLE_S * SECOND_NS:
+            found.append(Stretch(begin_ns, end_ns, why))
+    return tuple(found)
 
 
 def _by_device(

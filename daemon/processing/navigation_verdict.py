@@ -183,6 +183,22 @@ RULES: tuple[Rule, ...] = (
         "look for damage in the log with swath info; navigate without the source that breaks off",
     ),
     Rule(
+        "missing",
+        _one("missing_s"),
+        0.5,
+        None,
+        "{value:.1f} s of the log's inertial samples have no trajectory",
+        "the holes below say from when to when and why; navigate anew when their cause is mended",
+    ),
+    Rule(
+        "missing share",
+        _one("missing_share"),
+        None,
+        0.5,
+        "{value:.0%} of the log's inertial samples have no trajectory",
+        "the holes below say from when to when and why; navigate anew when their cause is mended",
+    ),
+    Rule(
         "positions used",
         _one("positions", "used"),
         60,

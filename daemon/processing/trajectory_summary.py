@@ -63,7 +63,9 @@ def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
             title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
             smoothed = leg.solved.smoothed if flight.smooth else None
             start, noise = start_words(leg.start), leg.noise_found()
-            page = Flight(title, leg.solved.forward, smoothed, leg.setup, start, noise, notes)
+            page = Flight(
+                title, leg.solved.forward, smoothed, leg.setup, start, noise, notes, missing_s=flight.missing_s
+            )
             yield Page(page, leg.findings)
 
 
@@ -100,6 +102,7 @@ def summary_head(
             "gnss": wanted.gnss,
             "ins": wanted.ins,
             "week": wanted.week,
+            "lever_arm_m": None if wanted.arm_b is None else list(wanted.arm_b),
             "config": None if wanted.config is None else wanted.config.path.name,
             "start_deg": None if wish.navigate.attitude_rad is None else list(np.degrees(wish.navigate.attitude_rad)),
         },
@@ -148,11 +151,15 @@ def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, 
         },
         "gnss": {
             "source": inputs.sources.gnss_source,
-            "datum": inputs.sources.gnss.datum,
+            "datum": None if inputs.sources.gnss is None else inputs.sources.gnss.datum,
             "observations": dict(sorted(inputs.observed.items())),
             "refused": dict(sorted(inputs.refused.items())),
             "sigmas_assumed": dict(sorted(inputs.assumed.items())),
         },
+        "missing": [
+            {"begin_gps_ns": part.begin_ns, "end_gps_ns": part.end_ns, "seconds": part.seconds, "reason": part.why}
+            for part in flight.missing
+        ],
         "legs": [_leg(leg, *next(judged)) for leg in flight.legs],
     }
 

@@ -105,7 +105,13 @@ class StreamParser(Parser):
 
 
 class PacketParser(Parser):
-    """For datagrams and CAN frames, whose units are whole: `parse_units` is written, both feeds follow."""
+    """For datagrams and CAN frames, whose units are whole: `parse_units` is written, both feeds follow.
+
+    Attributes:
+        doubts: what the units leave uncertain, a line for the user each.
+    """
+
+    doubts: tuple[str, ...] = ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """One unit is a batch of one row."""

@@ -42,6 +42,7 @@ from georef.records import (
 )
 
 TIME_NAMING = frozenset(("BESTPOS", "INSPVAX"))  # besides TIME: computed at the epoch in their header
+RAW_RANGES = {43: "RANGE", 140: "RANGECMP", 1273: "RANGECMP2", 2050: "RANGECMP4"}  # measured at the epoch in theirs
 
 
 GIVES: dict[type[nov.Body], tuple[type, ...]] = {  # what a body can become; the rest need not be decoded for it
@@ -94,6 +95,7 @@ class NovatelParser(StreamParser):
         self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
         self._state = State(self.counters, week_of(read_date_floor(settings)), imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
+        self._has_solutions = False  # that name seconds: raw measurements come later and need not
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """Take one read."""
@@ -109,7 +111,10 @@ class NovatelParser(StreamParser):
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
         """One frame; a short body is counted."""
-        layout = nov.LAYOUTS.get(int.from_bytes(frame.data[4:6], "little"))
+        number = int.from_bytes(frame.data[4:6], "little")
+        if number in RAW_RANGES:
+            return self._second_of_raw(frame, RAW_RANGES[number])
+        layout = nov.LAYOUTS.get(number)
         if layout is None or layout.body not in self._bodies:
             return []
         header, body = _split(frame, layout.name, self._state.floor_week)
@@ -132,8 +137,22 @@ class NovatelParser(StreamParser):
             return []
         if not header.time_valid or header.time_status is None:
             return []
-        self._last_named = epoch
+        self._last_named, self._has_solutions = epoch, True
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=header.name)]
+
+    def _second_of_raw(self, frame: Frame, name: str) -> list[Record | Row]:
+        """Name the whole second of raw measurements, in a log for post-processing that holds no solution."""
+        header, _ = _split(frame, name, self._state.floor_week)
+        wanted = self._wanted is None or TimeMessage in self._wanted
+        if header is None or self._has_solutions or not wanted:
+            return []
+        epoch = (header.week, header.milliseconds)
+        if header.milliseconds % 1000 or epoch == self._last_named or not header.time_valid:
+            return []
+        if header.time_status is None:
+            return []
+        self._last_named = epoch
+        return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=name)]
 
 
 def _split(frame: Frame, name: str, floor_week: int) -> tuple[Header | None, bytes]:

@@ -59,6 +59,7 @@ GIVES: dict[int, tuple[type, ...]] = {  # what a block can become, or help to be
     sbf.VEL_COV_GEODETIC.number: (GnssFix,),
     sbf.END_OF_PVT.number: (GnssFix,),
     sbf.RECEIVER_TIME.number: (TimeMessage,),
+    sbf.MEAS_EPOCH: (TimeMessage,),
     sbf.XPPS_OFFSET.number: (TimeMessage,),
     sbf.EXT_EVENT.number: (EventMark,),
     sbf.ATT_EULER.number: (GnssHeading,),
@@ -89,6 +90,7 @@ class SbfParser(StreamParser):
         self._headings: EpochGatherer[HeadingPart] = EpochGatherer(self.counters)
         self._synchronised: bool | None = None  # by the latest ReceiverTime
         self._last_named = -1
+        self._has_solutions = False  # that name seconds: raw measurements come later and need not
         decoders: dict[int, Callable[[Stamp, bytes], Items]] = {
             sbf.PVT_GEODETIC.number: self._pvt_geodetic,
             sbf.PVT_CARTESIAN.number: self._pvt_cartesian,
@@ -96,6 +98,7 @@ class SbfParser(StreamParser):
             sbf.VEL_COV_GEODETIC.number: self._vel_cov,
             sbf.END_OF_PVT.number: self._end_of_pvt,
             sbf.RECEIVER_TIME.number: self._receiver_time,
+            sbf.MEAS_EPOCH: self._meas_epoch,
             sbf.XPPS_OFFSET.number: self._xpps_offset,
             sbf.EXT_EVENT.number: self._ext_event,
             sbf.ATT_EULER.number: self._att_euler,
@@ -192,9 +195,18 @@ class SbfParser(StreamParser):
         tag = stamp.tag()
         if tag is None or tag.time_ns % records.NS_PER_S or stamp.epoch == self._last_named:
             return []
-        self._last_named = stamp.epoch
+        self._last_named, self._has_solutions = stamp.epoch, True
         valid = computed and self._trusted(stamp)
         return [TimeMessage(stamp.host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=stamp.name)]
+
+    def _meas_epoch(self, stamp: Stamp, frame: bytes) -> Items:
+        """Name the whole second of raw measurements, in a stream for post-processing that holds no solution."""
+        tag = stamp.tag()
+        if self._has_solutions or tag is None or tag.time_ns % records.NS_PER_S:
+            return []
+        return [
+            TimeMessage(stamp.host_time_ns, tag, NamesEdge.PREVIOUS, valid=stamp.week is not None, message=stamp.name)
+        ]
 
     def _trusted(self, stamp: Stamp) -> bool:
         return stamp.week is not None and self._synchronised is not False

@@ -245,6 +245,7 @@ ATT_EULER = Layout(5938, AttEuler, "BBH2x6f")
 ATT_COV_EULER = Layout(5939, AttCovEuler, "xB6f")
 INS_NAV_GEOD = Layout(4226, InsNavGeod, "BBHHdddfHHBxH")
 EXT_SENSOR_MEAS = Layout(4050, ExtSensorMeas, "BB")
+MEAS_EPOCH = 4027  # its header says its time; the measurements are for post-processing
 
 
 def ins_triples(frame: bytes, block: InsNavGeod) -> dict[int, Triple]:

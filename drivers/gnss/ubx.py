@@ -1,6 +1,7 @@
 """u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
 
-Everything else, RXM-RAWX, RTCM3 and NMEA on the same port included, is framed, checked and counted.
+RXM-RAWX gives its time where no other message of the stream gives one: a log of raw measurements for post-processing.
+Everything else, RTCM3 and NMEA on the same port included, is framed, checked and counted.
 
 Time: NAV-TIMEGPS and NAV-SOL carry GPS week and time of week in one message, NAV-PVT the UTC date; they name the
 previous PPS edge. TIM-TP names the next and is bound to it; its quantisation is the edge's own error, edge = true
@@ -82,6 +83,7 @@ class UbxParser(StreamParser):
             ubx.NAV_TIMELS.key: self._nav_timels,
             ubx.NAV_SOL.key: self._nav_sol,
             ubx.TIM_TP.key: self._tim_tp,
+            ubx.RXM_RAWX.key: self._rxm_rawx,
         }
         if not time_only:
             self._decoders |= {
@@ -204,6 +206,20 @@ class UbxParser(StreamParser):
     def _nav_eoe(self, host_time_ns: int, frame: bytes) -> list[Record]:
         message = _checked(ubx.NAV_EOE.decode(frame))
         return self._fixes(self._epochs.end()) if message.itow_ms == self._epochs.key else []
+
+    def _rxm_rawx(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        """Name the second of raw measurements; of no use beside navigation messages, which do not come so late."""
+        if self._vouched is not None:
+            return []
+        message = _present(ubx.RXM_RAWX.decode(frame))
+        if not 0.0 <= message.receiver_tow_s < WEEK_MS / 1000:
+            raise MessageError("time of week")
+        known = message.status & ubx.RAWX_LEAP_KNOWN != 0
+        leap = message.leap_seconds if known else None
+        time_ns = round(message.receiver_tow_s * 1000) * MS_NS % (WEEK_MS * MS_NS)
+        tag = TimeTag(TimeScale.GPS, time_ns, week=message.week, leap_seconds=leap)
+        valid = known and self._week_believed(message.week)
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="RXM-RAWX")]
 
     # --- pulse and event messages ---
 

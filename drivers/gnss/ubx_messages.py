@@ -195,6 +195,19 @@ TP_UTC_BASE, TP_UTC_AVAILABLE, TP_QUANTISATION_INVALID, TP_NOT_LOCKED = 1, 2, 0x
 TP_REFERENCE_MASK, TP_REFERENCE_GPS = 0x0F, 0
 
 
+class RxmRawx(NamedTuple):
+    """RXM-RAWX, 3.17.5, without its measurements."""
+
+    receiver_tow_s: float  # by the receiver's clock, some ten microseconds from GPS time, steered to whole milliseconds
+    week: int
+    leap_seconds: int
+    measurements: int
+    status: int  # RAWX_*
+
+
+RAWX_LEAP_KNOWN = 1
+
+
 class TimTm2(NamedTuple):
     """TIM-TM2, 3.20.1: edges on an EXTINT pin."""
 
@@ -223,6 +236,7 @@ NAV_SOL = Layout(b"\x01\x06", "IihBB", NavSol, 52)
 NAV_EOE = Layout(b"\x01\x61", "I", NavEoe, 4)
 TIM_TP = Layout(b"\x0d\x01", "IIiHBB", TimTp, 16)
 TIM_TM2 = Layout(b"\x0d\x03", "BBHHHIIIII", TimTm2, 28)
+RXM_RAWX = Layout(b"\x02\x15", "dHbBB", RxmRawx, 16)
 
 
 def encode_nav_pvt(message: NavPvt) -> bytes:

@@ -16,7 +16,15 @@ from drivers.core.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frame
 from drivers.core.parser import DeviceSettings, Driver, PacketParser
 from drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
 from drivers.imu.dbc_settings import MappedSignal, Part, SignalMap, map_signals
-from drivers.imu.sample_groups import Frames, SampleGrouper, Samples, no_frames
+from drivers.imu.sample_groups import (
+    Frames,
+    GroupRule,
+    SampleGrouper,
+    Samples,
+    closing_part,
+    has_evidence,
+    no_frames,
+)
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     IMU_DTYPE,
@@ -73,7 +81,9 @@ class DbcParser(PacketParser):
         self._map = signal_map or map_signals(settings)
         self._clock_only = clock_only
         self._width = 8 if all(part.needs_bytes <= 8 for part in self._map.parts) else 64
-        self._grouper = SampleGrouper(self._map.grouped, self._map.rule, self._map.key_part, self._width)
+        self._rule_is_open = not self._map.rule_is_said
+        self._unread = no_frames(self._width)  # frames that wait for the rule
+        self._grouper = self._grouper_of(self._map.rule, self._map.key_part)
         ticks, latch = self._map.sample_ticks, self._map.pps_ticks
         self._unwrapper = CounterUnwrapper(ticks.layout.length, float(self._map.tick_hz)) if ticks else None
         self._latch = LatchTracker(latch.layout.length) if latch else None
@@ -89,11 +99,36 @@ class DbcParser(PacketParser):
         self.counters.bytes += units.size
         frames = self._configured_frames(host_time_ns, units)
         self._count_gaps(frames)
+        if self._rule_is_open:
+            frames = self._unread = frames.after(self._unread)
+            if not has_evidence(frames.part[frames.part < self._map.grouped], self._map.grouped):
+                return []
+            self._settle_rule()
         return self._samples_of(frames) if len(frames.part) else []
 
     def close(self) -> list[Record]:
         """The last sample of rule "first", which only the end of the stream completes."""
-        return self._samples_of(no_frames(self._width), at_end=True)
+        frames = self._unread
+        if self._rule_is_open:
+            self._settle_rule()
+        return self._samples_of(frames, at_end=True)
+
+    def _grouper_of(self, rule: GroupRule, key_part: int) -> SampleGrouper:
+        return SampleGrouper(self._map.grouped, rule, key_part, self._width)
+
+    def _settle_rule(self) -> None:
+        """Take the rule that the spacing of the first frames shows; where they come evenly, doubt the usual one."""
+        grouped = self._unread.part < self._map.grouped
+        last = closing_part(self._unread.part[grouped], self._unread.host_time_ns[grouped], self._map.grouped)
+        if last is not None:
+            self._grouper = self._grouper_of("last", last)
+        elif grouped.any():
+            names = " and ".join(dict.fromkeys(part.message for part in self._map.parts[: self._map.grouped]))
+            self.doubts = (
+                f"the frames of {names} come evenly, so that which of them are one sample is not certain: specific "
+                'force and angular rate may be a sample apart; say group = "last" or "first"',
+            )
+        self._rule_is_open, self._unread = False, no_frames(self._width)
 
     # -- frames
 

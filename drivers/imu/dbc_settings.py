@@ -68,6 +68,7 @@ class SignalMap:
         sample_ticks, pps_ticks, temperature, status, packet_counter: None where not configured.
         tick_hz: rate of the counters.
         rule, key_part: how frames make samples.
+        rule_is_said: by the configuration; else the frames' spacing goes before it.
     """
 
     parts: tuple[Part, ...]
@@ -81,6 +82,7 @@ class SignalMap:
     tick_hz: Fraction
     rule: GroupRule
     key_part: int
+    rule_is_said: bool = True
 
 
 @dataclass(slots=True)
@@ -160,6 +162,7 @@ def map_signals(settings: DeviceSettings) -> SignalMap:
         tick_hz=_tick_hz(config, ticks),
         rule=rule,
         key_part=ticks.part if ticks else 0,
+        rule_is_said=grouped == 1 or bool(config.get("group")),
     )
 
 

@@ -8,7 +8,8 @@ does not depend on where a batch ends:
 - ``first``: the opening part begins one, the sample is complete when the next begins;
 - ``repeat``: a sample ends when every part was there, or before the first part that repeats.
 
-A sample is good when each part was there exactly once.
+A sample is good when each part was there exactly once. Where the configuration states no rule, `closing_part` reads it
+from the frames: a device sends the frames of a sample one after the other and pauses before the next sample.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from numpy.typing import NDArray
 from georef.records import ByteRows, Int64Array
 
 GroupRule = Literal["last", "first", "repeat"]
+EVIDENCE = 32  # frames of each part that tell where a sample ends
+PAUSE = 3.0  # times the next longest gap: so much longer a pause between samples must be
 IndexArray = NDArray[np.intp]
 
 
@@ -149,6 +152,32 @@ class SampleGrouper:
             return pending
         keep = np.concatenate([np.flatnonzero(pending.part == number)[:2] for number in range(self._parts)])
         return pending.take(np.sort(keep))
+
+
+def has_evidence(part: NDArray[np.int8], parts: int) -> bool:
+    """Return whether frames (n,) of grouped parts are enough for `closing_part`; a part that never comes waits not."""
+    counts = np.bincount(part, minlength=parts)
+    return bool(counts.min() >= EVIDENCE or counts.max() >= 4 * EVIDENCE)
+
+
+def closing_part(part: NDArray[np.int8], host_time_ns: Int64Array, parts: int) -> int | None:
+    """Return the part after which the device pauses, which closes a sample; None where no pause stands out.
+
+    Args:
+        part: (n,) of grouped frames in the order of their arrival.
+        host_time_ns: (n,) of their arrival.
+        parts: number of parts of a sample.
+    """
+    gap_ns = np.diff(host_time_ns)
+    by_part = [gap_ns[part[1:] == number] for number in range(parts)]
+    if parts < 2 or min(map(len, by_part)) < 3:
+        return None
+    usual = np.array([float(np.median(gaps)) for gaps in by_part])
+    opening, other = np.argsort(usual)[::-1][:2]
+    if usual[opening] <= PAUSE * usual[other]:
+        return None
+    before = part[:-1][part[1:] == opening]
+    return int(np.argmax(np.bincount(before, minlength=parts)))
 
 
 def _next_start(part: NDArray[np.int8], parts: int) -> IndexArray:

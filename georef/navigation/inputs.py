@@ -18,6 +18,7 @@ from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+ARM_UNSAID_M = 2.0  # prior sigma of a lever arm that nobody says: it is estimated with the flight
 _SQRT_HOUR = 60.0  # √3600 s
 _HOUR_S = 3600.0
 _MILLI_G = 9.80665e-3  # m/s², the standard g₀ / 1000

@@ -55,6 +55,7 @@ class Sampler:
         counts: rows by what was wrong with them: not_finite, duplicate, out_of_order, time_jumped_back,
             stamp_outlier (all dropped), saturated (kept, marked); and bridged, intervals made up.
         gaps: (begin, end) GPS ns of what was not bridged.
+        left_out: (GPS ns of its stamp, reason) of each sample that its stamp let drop.
 
     Raises:
         NavigationError: a rate that is not positive, no rotation, or another word than those above.
@@ -77,6 +78,7 @@ class Sampler:
             raise NavigationError(f'stamp: got "{stamp}", want "end", "middle" or "start"')
         self.counts: Counter[str] = Counter()
         self.gaps: list[tuple[int, int]] = []
+        self.left_out: list[tuple[int, str]] = []
         self._nominal_s = 1.0 / rate_hz
         self._nominal_ns = SECOND_NS / rate_hz
         self._sample = sample
@@ -116,6 +118,10 @@ class Sampler:
         if number:
             self.counts[reason] += number
 
+    def _leave_out(self, end_ns: int, reason: str) -> None:
+        self._count(reason, 1)
+        self.left_out.append((end_ns, reason))
+
     def _in_order(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> NDArray[np.intp]:
         """Which rows to take; counts the others, holds the one that only the next can judge."""
         if len(ends_ns) and self._last_ns is not None:
@@ -130,11 +136,13 @@ class Sampler:
                     kept.append(held)
                     last = int(ends_ns[held])
                 else:
-                    self._count("stamp_outlier", 1)
+                    self._leave_out(int(ends_ns[held]), "stamp_outlier")
                 held = -1
             if last is not None and end <= last:
                 late = last - end
-                self._count("duplicate" if not late else "time_jumped_back" if late > _BACK else "out_of_order", 1)
+                self._leave_out(
+                    end, "duplicate" if not late else "time_jumped_back" if late > _BACK else "out_of_order"
+                )
             elif last is None or end - last > self._max_gap_ns:
                 held = row
             else:

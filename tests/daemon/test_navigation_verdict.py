@@ -89,6 +89,8 @@ def test_a_filter_alone_is_judged_without_separation(sound: Flight) -> None:
 
 PLACES: dict[str, Callable[[Figures, float], Any]] = {
     "not finite": lambda f, v: f.update(not_finite=v),
+    "missing": lambda f, v: f.update(missing_s=v),
+    "missing share": lambda f, v: f.update(missing_share=v),
     "positions used": lambda f, v: f["positions"].update(used=v),
     "position sigma": lambda f, v: f["sigma_p95"].update(east_m=v),
     "tilt sigma": lambda f, v: f["sigma_p95"].update(pitch_deg=v),

@@ -202,7 +202,7 @@ class TestRefusals:
         config = flown.changed("nmea.toml", **{'protocol = "novatel"': 'protocol = "nmea"'})
         said = self.refused(flown, InputWish(config=config))
         assert "no position of gnss/rover" in said
-        assert said.endswith("of no message it knows; want another protocol, or other messages of the device")
+        assert "of no message it knows; want another protocol, or other messages of the device" in said
 
     def test_a_log_without_a_configured_receiver(self, flown: Flown) -> None:
         config = flown.changed("other_receiver.toml", **{"[gnss.rover]": "[gnss.away]"})

@@ -24,7 +24,7 @@ from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Par
 from drivers.core.registry import find_driver
 from drivers.imu.counters import CounterUnwrapper
 from drivers.imu.dbc import DbcParser, make_clock_parser
-from georef.records import ChunkBatch, DeviceClockSamples, Record, StructArray
+from georef.records import ChunkBatch, DeviceClockSamples, Int64Array, Record, StructArray
 from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
 from tests.drivers.imu_dbc import (
     ACC,
@@ -484,3 +484,47 @@ def test_a_makers_own_dbc_with_the_counter_first() -> None:
     np.testing.assert_allclose(rows["angular_rate_b"], [[0.1, 0.0, -0.1]])
     assert rows["temperature_c"].tolist() == [21.5]
     assert rows["device_time_ns"].tolist() == [10_000_000]
+
+
+# ---------------------------------------------------------------------- samples without a stated rule
+
+
+def _burst(order: str, pauses_ms: float, samples: int = 80) -> tuple[list[bytes], Int64Array]:
+    """Frames of numbered samples in an order, 0.2 ms apart and a pause after each sample; the first lacks its begin."""
+    frames, times, at = [], [], 0.0
+    for number in range(samples):
+        for kind in order[1:] if number == 0 else order:
+            frames.append(_numbered(kind, number))
+            times.append(round(at * 1e6))
+            at += 0.2
+        at += pauses_ms
+    return frames, np.array(times, np.int64)
+
+
+@pytest.mark.parametrize("order", ["AGT", "TAG", "ATG", "GTA"])
+@pytest.mark.parametrize("drop", [(), ("sample_ticks", "pps_ticks", "temperature")], ids=["ticks", "bare"])
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_an_unsaid_group_is_read_from_the_pauses_between_samples(order: str, drop: tuple[str, ...], batch: int) -> None:
+    """Whichever frame comes last: force and rate are of one sample, though the log begins within one."""
+    order = order.replace("T", "") if drop else order
+    parser = DbcParser(settings(signals=without(*drop) if drop else None, group=None))
+    frames, times = _burst(order, 4.4)
+    records: list[Record] = []
+    for first in range(0, len(frames), batch):
+        part = slice(first, first + batch)
+        records += feed(parser, frames[part], times[part])
+    rows = imu_rows(records + parser.close())
+    assert len(rows) >= 79
+    force, rate = rows["specific_force_b"][:, 0], rows["angular_rate_b"][:, 0]  # as their samples' numbers
+    assert np.allclose(force * rate[-1], rate * force[-1])
+    assert parser.doubts == ()
+
+
+def test_frames_that_come_evenly_leave_the_group_in_doubt() -> None:
+    parser = DbcParser(settings(group=None))
+    frames, _ = _burst("TAG", 0.0)
+    rows = imu_rows(feed(parser, frames) + parser.close())
+    assert len(rows) > 70
+    (doubt,) = parser.doubts
+    assert 'say group = "last" or "first"' in doubt
+    assert DbcParser(settings()).doubts == ()
