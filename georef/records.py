@@ -146,6 +146,7 @@ class GnssFix:
         antenna: "primary", "secondary" or the receiver's name for it.
         valid: the receiver vouches for the solution.
         message: name of the message.
+        undulation_m: geoid above the ellipsoid by the receiver's own model; None where unsaid.
     """
 
     host_time_ns: int
@@ -161,6 +162,7 @@ class GnssFix:
     antenna: str = "primary"
     valid: bool = True
     message: str = ""
+    undulation_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,6 +82,7 @@ class Part:
     velocity_l: tuple[float, float, float] | None = None
     position_cov_l: NDArray[np.float64] | None = None
     date: dt.date | None = None
+    undulation_m: float | None = None
 
 
 class NmeaParser(StreamParser):
@@ -144,6 +145,7 @@ class NmeaParser(StreamParser):
             position,
             altitude + separation if altitude is not None and separation is not None else None,
             int(satellites) if satellites is not None else None,
+            undulation_m=separation,
         )
         return self._add("GGA", part)
 
@@ -229,6 +231,7 @@ def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
         satellites=solution.satellites,
         valid=solution.fix_type in VOUCHED and lat_rad is not None,
         message="GGA" if "GGA" in parts else "RMC",
+        undulation_m=solution.undulation_m,
     )
 
 

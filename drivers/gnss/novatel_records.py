@@ -131,6 +131,7 @@ def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Re
             antenna="secondary" if header.source == 1 else "primary",
             valid=state.time_counts(header) and there and position.solution_status == tables.SOL_COMPUTED,
             message=header.name,
+            undulation_m=position.undulation_m if there else None,
         )
     ]
 

@@ -152,6 +152,7 @@ def geodetic_fix(parts: dict[str, FixPart]) -> GnssFix | None:
         satellites=pvt.satellites if pvt.satellites != sbf.U1_UNSET else None,
         valid=there and pvt.error == 0,
         message=stamp.name,
+        undulation_m=usable(pvt.undulation_m) if there and isfinite(usable(pvt.undulation_m)) else None,
     )
 
 

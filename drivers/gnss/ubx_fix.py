@@ -52,6 +52,7 @@ def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> Gn
         satellites=pvt.satellites if pvt is not None else None,
         valid=position is not None and (pvt is None or pvt.flags & ubx.PVT_FIX_OK != 0),
         message="NAV-PVT" if pvt is not None else "NAV-HPPOSLLH",
+        undulation_m=_undulation_m(pvt, high) if position else None,
     )
 
 
@@ -91,6 +92,12 @@ def _position(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> Position 
         pvt.height_mm / 1e3,
         _accuracy_cov(pvt.horizontal_accuracy_mm / 1e3, pvt.vertical_accuracy_mm / 1e3),
     )
+
+
+def _undulation_m(pvt: ubx.NavPvt | None, high: ubx.NavHpposllh | None) -> float | None:
+    """Return the geoid above the ellipsoid: the height above it less the height above mean sea level, m."""
+    told = high if high is not None else pvt
+    return None if told is None else (told.height_mm - told.height_msl_mm) / 1e3
 
 
 def _accuracy_cov(horizontal: float, vertical: float) -> NDArray[np.float64]:
