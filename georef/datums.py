@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.crs import CoordinateOperation
 from pyproj.datadir import get_user_data_dir
@@ -23,14 +24,18 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from georef.earth import A_M, B_M
+from georef.earth import A_M, B_M, e_from_geodetic, geodetic_from_e
 
+FloatArray = NDArray[np.float64]
 Area = tuple[float, float, float, float]
 
 ACCURACY_M = 0.05
 ELLIPSOID_M = 0.01  # of its axes: GRS 80 and WGS 84 are a tenth of a millimetre apart
 WGS84 = "EPSG:4978"
 SAME = "same"
+# Geographic CRS of EPSG's that coordinates are often in: of plates (within metres of ITRF), and of older surveys.
+CONTINENTS = (4258, 6318, 4617, 7844, 4283, 4167, 6668, 4674, 4148)
+NATIONS = (4230, 4314, 4312, 4275, 4277, 4289, 4313, 4149, 4156, 4284, 4179, 4265, 4124, 4267, 4301, 4202, 4618, 4214)
 _NAMED = 'name their datum (gnss.datum or --trajectory-datum, such as "EPSG:7912", ITRF2014, with output.epoch)'
 _SAME = 'say "same" if they are in {datum} already'
 _NOTHING = "PROJ knows no operation there"
@@ -322,6 +327,75 @@ def transformer_of(operation: Operation) -> Transformer:
     except ProjError as error:
         grids = ", ".join(operation.grids) or "none"
         raise MappingError(f"PROJ cannot set up '{_short(operation.name)}' (grids: {grids}): {error}") from error
+
+
+def between_datums(positions_e: FloatArray, source: CRS, target: CRS, epoch: float) -> FloatArray | None:
+    """Return positions (n, 3) of one geocentric CRS in another at a decimal year; None where PROJ knows no way."""
+    set_network_enabled(False)
+    try:
+        transformer = Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
+        x, y, z = positions_e.T
+        found = transformer.transform(x, y, z, np.full(len(positions_e), epoch), errcheck=False)
+    except ProjError:
+        return None
+    moved = np.stack(found[:3], axis=-1)
+    return moved if np.isfinite(moved).all() else None
+
+
+def datum_that_explains(fix_e: FloatArray, apart_e: FloatArray, tolerance_m: float, epoch: float) -> str:
+    """Return the name of the datum in which a position would lie so far from where it is; empty: none known there.
+
+    Datums of continents and nations whose area of use holds the place are tried, with their heights and with those of
+    the place as they are. Coordinates on another ellipsoid are taken to be read on that of WGS 84, as they were here.
+
+    Args:
+        fix_e: (3,) where it is, in WGS 84 or ITRF, m.
+        apart_e: (3,) where it is said to be, less that, m.
+        tolerance_m: difference that is none.
+        epoch: decimal year.
+    """
+    lat, lon, height = (float(value[0]) for value in geodetic_from_e(fix_e[np.newaxis]))
+    place = math.degrees(lon), math.degrees(lat), height
+    best, named = tolerance_m, ""
+    for source, codes in (("EPSG:7912", CONTINENTS), ("EPSG:4979", NATIONS)):
+        for code in codes:
+            for there_e in _misread(source, code, place, epoch):
+                for sign in (1.0, -1.0):
+                    rest = float(np.linalg.norm(apart_e - sign * (there_e - fix_e)))
+                    if rest < best:
+                        best, named = rest, str(CRS.from_epsg(code).name)
+    return named
+
+
+def _misread(source: str, code: int, place: tuple[float, float, float], epoch: float) -> list[FloatArray]:
+    """Return where (3,) coordinates of a place in a geographic CRS lie if they are read on the ellipsoid of WGS 84."""
+    lon_deg, lat_deg, height = place
+    area = CRS.from_epsg(code).area_of_use
+    if area is None or not (area.south <= lat_deg <= area.north and _between_lon(lon_deg, area.west, area.east)):
+        return []
+    transformer = _to_geographic(source, code)
+    if transformer is None:
+        return []
+    lon, lat, above, _ = transformer.transform(lon_deg, lat_deg, height, epoch, errcheck=False)
+    if not (math.isfinite(lon) and math.isfinite(lat) and math.isfinite(above)):
+        return []
+    return [e_from_geodetic(math.radians(lat), math.radians(lon), one) for one in (above, height)]
+
+
+def _between_lon(lon_deg: float, west_deg: float, east_deg: float) -> bool:
+    return (lon_deg - west_deg) % 360.0 <= ((east_deg - west_deg) % 360.0 or 360.0)
+
+
+@functools.lru_cache(maxsize=64)
+def _to_geographic(source: str, code: int) -> Transformer | None:
+    """Return the way to a geographic CRS with ellipsoidal heights, which takes PROJ some tenths of a second to find."""
+    set_network_enabled(False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return Transformer.from_crs(source, CRS.from_epsg(code).to_3d(), always_xy=True, allow_ballpark=False)
+        except (ProjError, CRSError):
+            return None
 
 
 def _how_to_get(grids: tuple[tuple[str, bool], ...]) -> str:

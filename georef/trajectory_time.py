@@ -81,7 +81,7 @@ class TimeShift:
 
 
 @dataclass(frozen=True, slots=True)
-class _Turning:
+class Turning:
     """Mean rates over steps from a whole multiple of a step on.
 
     Attributes:
@@ -110,7 +110,7 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     if len(trajectory) < 2 or len(imu_time_ns) < 2:
         raise TrajectoryError(f"trajectory {trajectory.name}: too few epochs or inertial samples to compare")
     steps = -(-int(imu_time_ns[0]) // STEP_NS), int(imu_time_ns[-1]) // STEP_NS
-    felt = _turning(imu_time_ns, imu_rate_b[1:], 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS, steps)
+    felt = turning(imu_time_ns, imu_rate_b[1:], 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS, steps)
     first_ns, last_ns = trajectory.span
     apart_days = round((int(imu_time_ns[0] + imu_time_ns[-1]) - first_ns - last_ns) / (2 * DAY_NS))
     day, _ = utc_from_gps(int(imu_time_ns[0]), 0)
@@ -128,7 +128,7 @@ def correlate_turn_rates(trajectory: Trajectory, imu_time_ns: Int64Array, imu_ra
     return best
 
 
-def _told_near(trajectory: Trajectory, felt: _Turning, coarse: int) -> _Turning | None:
+def _told_near(trajectory: Trajectory, felt: Turning, coarse: int) -> Turning | None:
     """What a trajectory tells, some steps away, of the time that was felt and what is looked at around it."""
     first = felt.first - REACH_STEPS - coarse
     last = felt.first + len(felt.rate_b) + REACH_STEPS - coarse
@@ -137,10 +137,10 @@ def _told_near(trajectory: Trajectory, felt: _Turning, coarse: int) -> _Turning 
         return None
     begin, end = -(-part.span[0] // STEP_NS), part.span[1] // STEP_NS  # beyond a gap, these may be years away
     steps = max(first, begin), min(last, end)
-    return None if steps[1] <= steps[0] else _turning(part.time_ns, part.turn_rates_b("i"), part.max_gap_ns, steps)
+    return None if steps[1] <= steps[0] else turning(part.time_ns, part.turn_rates_b("i"), part.max_gap_ns, steps)
 
 
-def _turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tuple[int, int]) -> _Turning:
+def turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tuple[int, int]) -> Turning:
     """Of rates (n − 1, 3) over the intervals between times (n,): what was turned, at the ends of steps, differenced.
 
     Gaps are unknown, and so is what has no number.
@@ -159,10 +159,10 @@ def _turning(time_ns: Int64Array, rate_b: FloatArray, max_gap_ns: int, steps: tu
     if known.any():
         rate -= rate[known].mean(axis=0)
     rate[~known] = 0.0
-    return _Turning(first, rate, known.astype(np.float64))
+    return Turning(first, rate, known.astype(np.float64))
 
 
-def _best_shift(told: _Turning, felt: _Turning, coarse: int) -> tuple[float, float, float, float] | None:
+def _best_shift(told: Turning, felt: Turning, coarse: int) -> tuple[float, float, float, float] | None:
     """Seconds, correlation, sigma and the correlation at the coarse shift itself; None: too little in common."""
     begin = felt.first - REACH_STEPS - told.first - coarse  # of told's rows, which may lie outside
     wanted = np.arange(begin, begin + len(felt.rate_b) + 2 * REACH_STEPS)

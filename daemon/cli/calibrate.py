@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import AcceptVerdict, ForceCrs, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -61,12 +61,14 @@ def command(
     ] = None,
     datum: TrajectoryDatum = None,
     crs: Annotated[str | None, typer.Option(help="Coordinate system; over output.crs.")] = None,
+    force_crs: ForceCrs = False,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
     strips: Annotated[str, typer.Option(help="auto, whole, or a CSV of times.")] = "auto",
     limit_deg: Annotated[float, typer.Option("--limit-deg", help="Boresight may change by so much.", min=0.0)] = 5.0,
     limit_m: Annotated[float, typer.Option("--limit-m", help="The range offset likewise.", min=0.0)] = 10.0,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="The outcome to stdout, for scripts.")] = False,
 ) -> None:
     """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
@@ -93,9 +95,10 @@ def command(
         logs=Wish(
             logs=logs,
             output=output,
-            trajectory=TrajectoryWish(trajectory, week, at, navigate=True),
+            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, accept=accept_verdict),
             options=Options(
                 crs=crs,
+                force_crs=force_crs,
                 datum=datum,
                 scanners=tuple(scanner or ()),
                 calibrations=calibrations_given(start or []),

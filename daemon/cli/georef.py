@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.cli.options import TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import AcceptVerdict, ForceCrs, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -29,6 +29,7 @@ def command(
         typer.Option(metavar="[SCANNER=]FILE", help="Instead of the log's own; once a scanner."),
     ] = None,
     crs: Annotated[str | None, typer.Option(help="Coordinate system, as EPSG:25832+7837; over output.crs.")] = None,
+    force_crs: ForceCrs = False,
     epoch: Annotated[float | None, typer.Option(help="Of the positions, as 2026.9; over output.epoch.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="Instead of the logs' own.")] = None,
     strips: Annotated[str, typer.Option(help="auto: by turns and laser; whole: by laser; or a CSV of times.")] = "auto",
@@ -47,6 +48,7 @@ def command(
         typer.Option("--write-dropped", help="Also returns left out: beyond the range gate flagged, others listed."),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
 ) -> None:
     """Georeference logs: one LAZ file a strip, the trajectory, and a JSON file that says what they are made of.
@@ -66,9 +68,10 @@ def command(
     wish = Wish(
         logs=logs,
         output=output,
-        trajectory=TrajectoryWish(trajectory, week, at),
+        trajectory=TrajectoryWish(trajectory, week, at, accept=accept_verdict),
         options=Options(
             crs=crs,
+            force_crs=force_crs,
             datum=datum,
             epoch=epoch,
             calibrations=calibrations_given(calibration or []),

@@ -31,6 +31,7 @@ from georef.records import (
     INS_DTYPE,
     ChunkBatch,
     DeviceClockSamples,
+    GnssFix,
     ImuSamples,
     InsSolution,
     PpsEdge,
@@ -300,6 +301,8 @@ class LogClocks:
             trajectory's motion is this flight's.
         angles: of gimbals, by the source that told them.
         counts: records by source.
+        imu_force_b: (n, 3) m/s², axes of b, and fixes: of receivers, by source. To check that a trajectory is of this
+            flight; empty unless asked for.
     """
 
     clocks: FrozenClocks
@@ -308,19 +311,23 @@ class LogClocks:
     imu_rate_b: np.ndarray[Any, np.dtype[np.float64]]
     angles: dict[str, AngleSeries] = field(default_factory=dict)
     counts: dict[str, Counter[str]] = field(default_factory=dict)
+    imu_force_b: np.ndarray[Any, np.dtype[np.float64]] = field(default_factory=lambda: np.empty((0, 3)))
+    fixes: dict[str, list[GnssFix]] = field(default_factory=dict)
 
 
 class _ClockReader:
     """Collects what all but the scanners say."""
 
-    def __init__(self, setup: Setup, session: Session) -> None:
+    def __init__(self, setup: Setup, session: Session, *, positions: bool) -> None:
         self.host = HostClocks(setup.clock_plan(session.info), keep_history=True)
+        self.fixes: dict[str, list[GnssFix]] = {}
+        self._positions = positions
         self.ins: list[StructArray] = []
         self.imu: list[StructArray] = []
         self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.gimbal_sources}
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
-        self._parsers = setup.parsers(("gnss", "imu"))
+        self._parsers = setup.parsers(("gnss", "imu"), whole=positions)
         self._runs: dict[str, _Run] = {}
 
     def take(self, batch: LogBatch) -> None:
@@ -378,23 +385,29 @@ class _ClockReader:
                 self.gimbals[source].append(record.rows)
             elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
                 self.imu.append(record.rows)
+            elif isinstance(record, GnssFix) and self._positions:
+                self.fixes.setdefault(source, []).append(record)
 
 
-def read_clocks(session: Session, setup: Setup) -> LogClocks:
+def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> LogClocks:
     """Read all but the scanners' messages of a session, a first pass before its returns are georeferenced.
 
-    What belongs to scanners is passed over chunk by chunk: a chunk holds one class of channels.
+    What belongs to scanners is passed over chunk by chunk: a chunk holds one class of channels. With ``positions``
+    the receivers' fixes and the IMU's specific forces are kept too.
     """
-    reader = _ClockReader(setup, session)
+    reader = _ClockReader(setup, session, positions=positions)
     for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
         reader.take(batch)
     reader.close()
     ins = setup.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
     imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
-    gps_ns, rate_b = np.empty(0, np.int64), np.empty((0, 3))
+    gps_ns, rate_b, force_b = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
     clock = setup.clock_of_imu
     if len(imu) and clock is not None:
         gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
         known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock says nothing of a trajectory's
-        gps_ns, rate_b = gps_ns[known], setup.imu_rates_b(imu["angular_rate_b"][known])
-    return LogClocks(FrozenClocks(reader.host), ins, gps_ns, rate_b, reader.angles(), reader.counts)
+        gps_ns, rate_b = gps_ns[known], setup.in_b(imu["angular_rate_b"][known])
+        if positions:
+            force_b = setup.in_b(imu["specific_force_b"][known])
+    host = FrozenClocks(reader.host)
+    return LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)

@@ -74,6 +74,7 @@ class Wish:
             "crs": self.options.crs,
             "datum": self.options.datum,
             "epoch": self.options.epoch,
+            "force_crs": self.options.force_crs,
             "calibrations": {name: file for name, (_, file) in self.options.calibrations.items()},
             "strips": self.strips,
             "sigmas": self.sigmas,
@@ -164,7 +165,7 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
-        flights.append(_read(session, setup))
+        flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
     flights[0].holes += [f"passed over: {line}" for line in passed_over]
     refusals.refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come by their hosts' clocks, which may be wrong
@@ -190,10 +191,10 @@ def _setup(wish: Wish, session: Session) -> Setup:
     return setup
 
 
-def _read(session: Session, setup: Setup) -> Flight:
+def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     log = session.parts[0].path
     listening = Listening(session)
-    clocks = read_clocks(listening, setup)
+    clocks = read_clocks(listening, setup, positions=positions)
     session.growing = listening.growing
     try:
         setup.take_angles(clocks.angles)
@@ -220,7 +221,13 @@ def _choose(wish: Wish, flight: Flight) -> None:
     flight.troubles += chosen.doubts
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)
-    flight.setup.mapping.settle(within.position_e[:: max(1, len(within) // 100)])
+    places_e = within.position_e[:: max(1, len(within) // 100)]
+    flight.setup.mapping.settle(places_e)
+    misfit = flight.setup.mapping.misfit(places_e)
+    if misfit and not wish.options.force_crs:
+        lines = refusals.of_log(flight.log, [misfit], wish.options)
+        raise UserError(f"{lines[0]}; --force-crs takes it as it is", ExitCode.USAGE)
+    flight.troubles += [misfit] if misfit else []
 
 
 def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.errors import ExitCode, UserError
+from daemon.processing.given_trajectory import Given, judge_given, points_of
 from daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
 from daemon.processing.trajectory_files import smrmsg_beside
 from georef.formats.trajectory_file import read_trajectory
@@ -35,12 +36,14 @@ class TrajectoryWish:
         at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
         navigate: without a file IMU and GNSS are navigated and smoothed where the log has both, whatever the device's
             own INS said.
+        accept: a file that does not belong to the log is taken all the same, and warned of.
     """
 
     file: Path | None = None
     week: int | None = None
     at: str = "body"
     navigate: bool = False
+    accept: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +103,24 @@ def choose_trajectory(
             doubts.append(f"{log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at")
         elif offset is not None:
             trajectory = trajectory.at_body(offset)
+        if wish.file is not None:
+            doubts += _belonging(wish, wish.file, trajectory, setup, clocks, log)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
     return Chosen(trajectory, doubts, solutions, navigated)
+
+
+def _belonging(
+    wish: TrajectoryWish, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
+) -> list[str]:
+    """Return what is doubtful of a file's trajectory against the log; UserError where it does not belong to it."""
+    offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
+    given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
+    found = judge_given(given, setup, clocks, log)
+    if found.refused and not wish.accept:
+        raise UserError("\n".join(f"{line}; --accept-verdict takes it as it is" for line in found.refused))
+    return [*found.refused, *found.warnings]
 
 
 def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:

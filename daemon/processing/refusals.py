@@ -30,7 +30,6 @@ NO_TIME = Fate.NO_TIME.name.lower()
 GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
 MUCH = 0.01  # share of returns without time that is worth a warning
 LATE_S = 0.06  # more than an IMU's samples are late at the host
-UNLIKE = 0.3  # correlation of turn rates below which two motions are hardly one
 LOOKED_AT = 10_000  # epochs, whether the body flies forward and upright
 UNSAID = "a datum that is not said"
 LONGEST_NAME = 200  # bytes of a session's name, whose products' names are longer
@@ -237,10 +236,9 @@ def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:
 
 
 def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> list[str]:
-    """The trajectory turns when the log's IMU does; one in UTC, of another week or of another flight does not.
+    """The trajectory turns when the log's IMU does; one in UTC or of another week does not.
 
-    Gives a line of doubt where it turns a little earlier or later, or quite otherwise: motion that the IMU's noise
-    hides would look so too.
+    Gives a line of doubt where it turns a little earlier or later.
 
     Raises:
         UserError: it turns at other times; the line says by how much.
@@ -254,11 +252,6 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
         raise UserError(f"{file}: {shift.what}, by how it turns and how the IMU in {log} does")
     if shift.is_certain and abs(shift.seconds) > LATE_S:
         return [f"{file}: turns {-shift.seconds:.3f} s later than the IMU in {log} does; its time may be off by that"]
-    if shift.unshifted < UNLIKE:
-        return [
-            f"{file}: does not turn as the IMU in {log} does (correlation {shift.unshifted:.2f}); it may be of another "
-            "flight, or imu.….rotation_b_imu be another"
-        ]
     return []
 
 

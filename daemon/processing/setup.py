@@ -55,6 +55,7 @@ class Options:
 
     Attributes:
         crs, datum, epoch: of the products, over ``[output]`` and the receiver's ``datum``.
+        force_crs: a CRS that does not suit the place is taken, and warned of.
         scanners: only these; empty: all.
         calibrations: text of a calibration file and its name, by scanner; over the configuration's.
         uncertainty: sigmas are computed with the points.
@@ -65,6 +66,7 @@ class Options:
     crs: str | None = None
     datum: str | None = None
     epoch: float | None = None
+    force_crs: bool = False
     scanners: tuple[str, ...] = ()
     calibrations: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     uncertainty: bool = True
@@ -166,8 +168,10 @@ class Setup:
         within = [f"imu/{imu}" for imu, table in self.config.imu.items() if table.transport == f"gnss:{name}"]
         return [source, *(within if kind == "gnss" else [])]
 
-    def parsers(self, kinds: tuple[DeviceKind, ...]) -> dict[str, Parser]:
-        """New parsers of these kinds of sources, by source; a receiver's gives times only unless its INS is wanted.
+    def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
+        """New parsers of these kinds of sources, by source.
+
+        A receiver's gives times only unless its INS is wanted, or all that it says (``whole``).
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -179,7 +183,7 @@ class Setup:
             source = f"{kind}/{name}"
             driver = self._driver(kind, name, table)
             make = driver.make_parser
-            wanted = source == self.ins_source or source in self.gimbal_sources
+            wanted = whole or source == self.ins_source or source in self.gimbal_sources
             if kind == "gnss" and not wanted and driver.make_time_parser is not None:
                 make = driver.make_time_parser
             try:
@@ -300,9 +304,9 @@ class Setup:
         turned["roll_rad"], turned["pitch_rad"], turned["heading_rad"] = attitude
         return turned
 
-    def imu_rates_b(self, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 3) turn rates along the axes of b."""
-        turned: NDArray[np.float64] = rates @ self._rotation_b_imu(self.imu_source).T
+    def in_b(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 3) turn rates or specific forces of the IMU along the axes of b."""
+        turned: NDArray[np.float64] = measured @ self._rotation_b_imu(self.imu_source).T
         return turned
 
     def _rotation_b_imu(self, source: str | None) -> NDArray[np.float64]:

@@ -112,7 +112,7 @@ def test_the_attitude_of_an_ins_is_that_of_the_body(tmp_path: Path) -> None:
     rot_b_from_imu = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert (got.inv() * told * rot_b_from_imu.inv()).magnitude() < 1e-12
     # the same turn of the aircraft, seen by gyroscopes along the IMU's axes
-    assert setup.imu_rates_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
+    assert setup.in_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
     assert row["roll_rad"][0] == 0.1
 
 

@@ -283,3 +283,49 @@ def test_a_grid_that_is_installed_gives_orthometric_heights(tmp_path: Path) -> N
     assert stated["grids"] == ["us_nga_egm96_15.tif"]
     assert stated["stated_accuracy_m"] == 1.0
     assert wkt == "COMPD_CS["
+
+
+@pytest.mark.parametrize(
+    ("crs", "lat_deg", "lon_deg", "words"),
+    [
+        # 12° E − 8.9° E at 47.5° N: 3.1 · 111.2 km · cos 47.5° = 233 km
+        ("EPSG:32633", 47.5, 8.9, ("used from 12° to 18° E", "and 233 km away", '"EPSG:32632"')),
+        ("EPSG:25833", 47.5, 8.9, ('"EPSG:25832"',)),
+        ("EPSG:3857", 47.5, 8.9, ("1.48", '"EPSG:32632"')),  # 1 / cos 47.5° = 1.480
+        ("EPSG:32732", 47.5, 8.9, ("is used from", '"EPSG:32632"')),
+        ("EPSG:3857", -33.0, 151.0, ('"EPSG:32756"',)),
+    ],
+)
+def test_a_frame_of_another_place_or_scale_names_the_zone_there(
+    crs: str, lat_deg: float, lon_deg: float, words: tuple[str, ...]
+) -> None:
+    said = Mapping(crs, datum="same").misfit(at(lat_deg, lon_deg))
+    assert "\n" not in said
+    for word in words:
+        assert word in said
+
+
+@pytest.mark.parametrize(
+    ("crs", "lat_deg", "lon_deg"),
+    [
+        ("EPSG:32632", 47.5, 8.9),
+        ("EPSG:32632", 47.5, 12.4),  # 30 km beyond the zone: within the overlap of neighbours
+        ("EPSG:2154", 46.5, 3.0),
+        ("EPSG:3857", 2.0, 8.0),  # near the equator its metre is one
+        ("EPSG:4978", 47.5, 8.9),
+    ],
+)
+def test_a_frame_that_suits_the_place_is_taken(crs: str, lat_deg: float, lon_deg: float) -> None:
+    assert Mapping(crs, datum="same").misfit(at(lat_deg, lon_deg)) == ""
+
+
+def test_one_place_beyond_the_overlap_is_enough() -> None:
+    assert Mapping("EPSG:32632").misfit(np.vstack([at(47.5, 11.9), at(47.5, 12.6)]))
+
+
+def test_convergence_is_that_of_the_formula_sheet() -> None:
+    """Of a transverse Mercator, to first order: Δλ sin φ."""
+    (position,) = at(47.5, 11.4)
+    assert Mapping("EPSG:32632").convergence_rad(position) == pytest.approx(
+        np.radians(2.4) * np.sin(np.radians(47.5)), rel=2e-3
+    )

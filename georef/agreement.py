@@ -1,0 +1,478 @@
+"""Does a trajectory belong to a log? Where it lies against the receiver's fixes, and how it turns against the IMU.
+
+Positions are compared as medians over blocks of time, whose sigma holds what a kind of fix is wrong by for a whole
+flight: a receiver's own sigma is that of its noise from epoch to epoch. Turn rates are compared with what the attitude
+would give if its angles had other signs, so that a wrong convention is named and not only seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product as combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.earth import geodetic_from_e
+from georef.navigation.gravity import gravity_e
+from georef.quaternions import about, conjugate, product, rotated
+from georef.records import FixType, Int64Array, StructArray
+from georef.timescales.gps_time import SECOND_NS
+from georef.trajectory import EARTH_RATE_RADPS, Trajectory
+from georef.trajectory_time import STEP_NS, Turning, turning
+
+FloatArray = NDArray[np.float64]
+
+# One sigma, horizontal and vertical, m, of what stays the same for a whole flight: the base's place and the troposphere
+# over a baseline; ionosphere, orbits and multipath where there is no base. Usual figures, for receivers in flight.
+LASTING_M: dict[FixType, tuple[float, float]] = {
+    FixType.RTK_FIXED: (0.02, 0.03),
+    FixType.PPP: (0.1, 0.2),
+    FixType.RTK_FLOAT: (0.3, 0.5),
+    FixType.DIFFERENTIAL: (0.6, 1.2),
+    FixType.SINGLE: (1.5, 3.0),
+}
+UNSAID_M = 0.05  # one sigma of a trajectory that says none
+FEWEST_FIXES = 10
+BLOCK_NS = 10 * SECOND_NS  # errors of fixes that are farther apart are taken as independent
+FEWEST_BLOCKS = 5  # from which on their scatter is measured
+LONGEST_S, TRIED_S = 40.0, 0.25  # more than all leap seconds; steps that are straight
+MOST_FITTED = 1000
+NOISIEST = 3.0  # scatter of fixes over what lasts
+MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
+MEDIAN = 1.2533  # sigma of a median over that of a mean
+SHORTEST_STEPS = round(8 * SECOND_NS / STEP_NS)
+SECOND_STEPS = SECOND_NS // STEP_NS
+SLOW_STEPS = 20  # a second: attitude noise and vibration are averaged out
+MUCH_BETTER = 0.5  # residual of another convention over that of the attitude as it is
+SURE = 4.0  # sigmas
+LIKE = 0.7  # share of a motion below which it is surely another, SURE sigmas included
+FEWEST_TURNS = 10.0  # seconds with horizontal acceleration, for a heading
+ACCELERATES = 0.5  # m/s²
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Fixes of one kind beside the trajectory, epoch by epoch.
+
+    Attributes:
+        fix_type: their kind.
+        time_ns: (n,) GPS time.
+        fix_e: (n, 3) the antenna by the receiver, m.
+        apart_e: (n, 3) the antenna by the trajectory less that, m.
+        q_e_from_b, velocity_e: (n, 4), (n, 3) of the trajectory.
+        arm_b: (3,) the antenna's lever arm, m.
+        sigma_l: (3,) median of the fixes' own sigmas, north, east, down, m.
+        own_sigma_l: (3,) median of the trajectory's, m.
+    """
+
+    fix_type: FixType
+    time_ns: Int64Array
+    fix_e: FloatArray
+    apart_e: FloatArray
+    q_e_from_b: FloatArray
+    velocity_e: FloatArray
+    arm_b: FloatArray
+    sigma_l: FloatArray
+    own_sigma_l: FloatArray
+
+    def in_l(self, vectors_e: FloatArray) -> FloatArray:
+        """Return vectors (n, 3) along north, east and up."""
+        turned = rotated(conjugate(_q_e_from_l(self.fix_e)), vectors_e)
+        upward: FloatArray = turned * np.array([1.0, 1.0, -1.0])
+        return upward
+
+    @property
+    def apart_b(self) -> FloatArray:
+        """Return (n, 3) the difference along the body's axes, m."""
+        return rotated(conjugate(self.q_e_from_b), self.apart_e)
+
+    def blocks(self, values: FloatArray) -> FloatArray:
+        """Return the medians (k, 3) of values (n, 3) over the blocks of time that hold any."""
+        number = (self.time_ns - self.time_ns[0]) // BLOCK_NS
+        return np.array([np.median(values[number == one], axis=0) for one in np.unique(number)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Apart:
+    """How far a trajectory lies from fixes.
+
+    Attributes:
+        median_l: (3,) north, east, up, m.
+        scatter_l: (3,) robust sigma of single differences, m.
+        size_l: (3,) of the median, or the usual size in a block where that is larger: differences may change sign.
+        fix_sigma_l: (3,) one sigma of the median by the fixes alone, what lasts included, m.
+        sigma_l: (3,) with the trajectory's own, m.
+        of: what was compared.
+    """
+
+    median_l: FloatArray
+    scatter_l: FloatArray
+    size_l: FloatArray
+    fix_sigma_l: FloatArray
+    sigma_l: FloatArray
+    of: Compared
+
+    @property
+    def sigmas(self) -> float:
+        """Return the size in its sigmas, along the worst axis."""
+        return float(np.max(self.size_l / self.sigma_l))
+
+    @property
+    def fix_sigmas(self) -> float:
+        """Return the size in the sigmas of the fixes alone, along the worst axis."""
+        return float(np.max(self.size_l / self.fix_sigma_l))
+
+    @property
+    def metres(self) -> float:
+        """Return the size along the axis where it is largest."""
+        return float(np.max(self.size_l))
+
+
+def apart_from_fixes(trajectory: Trajectory, positions: StructArray, arms_b: FloatArray) -> Apart | None:
+    """Compare a trajectory plus lever arm with a receiver's fixes of the kind that tells most.
+
+    Args:
+        trajectory: of the body's origin, with attitude.
+        positions: OBSERVATION_DTYPE, positions only, in the trajectory's datum.
+        arms_b: (k, 3) lever arms of the receiver's antennas, m.
+
+    Returns:
+        None where fewer than ten fixes of a kind lie within the trajectory.
+    """
+    within = trajectory.fates(positions["time_ns"]) == 0 if len(positions) else np.zeros(0, bool)
+    rows = positions[within]
+    found = []
+    for fix_type in LASTING_M:
+        for antenna in range(len(arms_b)):
+            own = rows[(rows["fix_type"] == int(fix_type)) & (rows["antenna"] == antenna)]
+            if len(own) >= FEWEST_FIXES:
+                found.append(_apart(_compared(trajectory, own, fix_type, arms_b[antenna])))
+    return min(found, key=lambda one: float(np.max(one.fix_sigma_l)), default=None)
+
+
+def _compared(trajectory: Trajectory, rows: StructArray, fix_type: FixType, arm_b: FloatArray) -> Compared:
+    poses = trajectory.poses(rows["time_ns"])
+    antenna_e = poses.position_e + rotated(poses.q_e_from_b, np.broadcast_to(arm_b, (len(rows), 3)))
+    said = np.isfinite(poses.position_sigma_l)
+    own = np.median(np.where(said, poses.position_sigma_l, UNSAID_M), axis=0)
+    return Compared(
+        fix_type,
+        np.asarray(rows["time_ns"], np.int64),
+        np.asarray(rows["value"], np.float64),
+        antenna_e - rows["value"],
+        poses.q_e_from_b,
+        poses.velocity_e,
+        arm_b,
+        np.median(rows["sigma"], axis=0),
+        own,
+    )
+
+
+def _apart(of: Compared) -> Apart:
+    apart_l = of.in_l(of.apart_e)
+    blocks = of.blocks(apart_l)
+    median = np.median(apart_l, axis=0)
+    scatter = MAD * np.median(np.abs(apart_l - median), axis=0)
+    usual = MAD * np.median(np.abs(blocks - np.median(blocks, axis=0)), axis=0)
+    noise = usual if len(blocks) >= FEWEST_BLOCKS else scatter
+    horizontal, vertical = LASTING_M[of.fix_type]
+    lasting = np.maximum(of.sigma_l, (horizontal, horizontal, vertical))
+    noise = np.minimum(noise, NOISIEST * lasting)  # what scatters more is the trajectory's fault, and no excuse of it
+    fix_sigma = np.hypot(lasting, MEDIAN * noise / np.sqrt(len(blocks)))
+    size = np.maximum(np.abs(median), np.median(np.abs(blocks), axis=0))
+    return Apart(median, scatter, size, fix_sigma, np.hypot(fix_sigma, of.own_sigma_l), of)
+
+
+def time_that_explains(apart: Apart) -> float | None:
+    """Return the seconds by which the trajectory would be late if time alone were wrong; None where it is not that.
+
+    The antenna's way by the trajectory is moved in time, by whole steps and then along its velocity, until it fits.
+    """
+    of = apart.of
+    step = max(1, len(of.time_ns) // MOST_FITTED)
+    time_s = (of.time_ns[::step] - of.time_ns[0]) / SECOND_NS
+    fix_l, way_l = of.in_l(of.fix_e - of.fix_e[0])[::step], of.in_l(of.fix_e + of.apart_e - of.fix_e[0])[::step]
+    speed = np.median(np.linalg.norm(np.diff(way_l, axis=0), axis=1) / np.diff(time_s)) if len(time_s) > 1 else 0.0
+    best, late_s, left = np.inf, 0.0, np.inf
+    for tried_s in np.arange(-LONGEST_S, LONGEST_S + 0.5 * TRIED_S, TRIED_S):
+        there = (time_s + tried_s >= 0.0) & (time_s + tried_s <= time_s[-1])
+        if there.sum() < FEWEST_FIXES or not speed > 1.0:
+            continue
+        rest = _way_at(way_l, time_s, time_s[there] + tried_s) - fix_l[there]
+        usual = float(np.median(np.linalg.norm(rest, axis=1)))
+        if usual < best:
+            moved = _way_at(way_l, time_s, time_s[there] + tried_s + TRIED_S) - fix_l[there] - rest
+            share = float((rest * moved).sum() / max((moved**2).sum(), 1e-9))
+            best, late_s = usual, float(tried_s) - share * TRIED_S
+            left = float(np.median(np.linalg.norm(rest - share * moved, axis=1)))
+    return late_s if left < max(3.0 * float(apart.fix_sigma_l.max()), 0.05 * apart.metres) else None
+
+
+def _way_at(way_l: FloatArray, time_s: FloatArray, at_s: FloatArray) -> FloatArray:
+    return np.stack([np.interp(at_s, time_s, column) for column in way_l.T], axis=1)
+
+
+def _q_e_from_l(position_e: FloatArray) -> FloatArray:
+    lat, lon, _ = geodetic_from_e(position_e)
+    return product(about(2, lon), about(1, -lat - np.pi / 2))
+
+
+# ---------------------------------------------------------------------- how it turns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """How a trajectory turns against the turn rates that an IMU felt, at the same times.
+
+    Attributes:
+        correlation: over three axes, −1 … 1.
+        by_axis: (3,) forward, right, down; nan where nothing turns.
+        convention: words for what the attitude would have to be for its turn rates to be those; empty: as it is.
+        converted: correlation then.
+        is_other: the two are surely no record of one motion.
+    """
+
+    correlation: float
+    by_axis: FloatArray
+    convention: str
+    converted: float
+    is_other: bool
+
+
+def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: FloatArray) -> Motion | None:
+    """Compare turn rates axis by axis, and with the attitude read in other conventions.
+
+    Args:
+        trajectory: with attitude.
+        imu_time_ns: (m,) GPS time of inertial samples, rising.
+        imu_rate_b: (m, 3) their angular rates in b, rad/s.
+
+    Returns:
+        None where they have less than eight seconds in common.
+    """
+    pair = _turned(trajectory, imu_time_ns, imu_rate_b)
+    if pair is None:
+        return None
+    told, felt, ends = pair
+    as_it_is = _power(felt - told)
+    best, words, rates = as_it_is.sum(), "", told
+    for name, other in _conventions(told, ends):
+        power = _power(felt - other)
+        if power.sum() < best and _is_better(as_it_is, power):
+            best, words, rates = power.sum(), name, other
+    correlation = _correlation(told, felt)
+    other_motion = not words and all(_is_other(_coarser(told, n), _coarser(felt, n)) for n in (1, SLOW_STEPS))
+    by_axis = np.array([_correlation(told[:, [k]], felt[:, [k]]) for k in range(3)])
+    return Motion(correlation, by_axis, words, _correlation(rates, felt), other_motion)
+
+
+def _turned(
+    trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return rates told and felt (m, 3) over steps known to both, and the angles (m, 2, 3) at the steps' ends."""
+    if len(trajectory) < 2 or len(imu_time_ns) < 2:
+        return None
+    first = max(-(-int(imu_time_ns[0]) // STEP_NS), -(-trajectory.span[0] // STEP_NS))
+    last = min(int(imu_time_ns[-1]) // STEP_NS, trajectory.span[1] // STEP_NS)
+    if last - first < SHORTEST_STEPS:
+        return None
+    gap_ns = 2 * int(np.median(np.diff(imu_time_ns))) + STEP_NS
+    felt = turning(imu_time_ns, imu_rate_b[1:], gap_ns, (first, last))
+    told = turning(trajectory.time_ns, trajectory.turn_rates_b("l"), trajectory.max_gap_ns, (first, last))
+    known = _known(told) & _known(felt)
+    if known.sum() < SHORTEST_STEPS:
+        return None
+    since_s = (trajectory.time_ns - first * STEP_NS) / SECOND_NS
+    at_s = np.arange(last - first + 1) * (STEP_NS / SECOND_NS)
+    angles = np.stack([np.interp(at_s, since_s, np.unwrap(angle)) for angle in trajectory.attitude()], axis=1)
+    ends = np.stack([angles[:-1], angles[1:]], axis=1)[known]
+    return _centred(told.rate_b[known]), _centred(felt.rate_b[known]), ends
+
+
+def _known(turned: Turning) -> NDArray[np.bool_]:
+    return turned.known > 0.0
+
+
+def _centred(rates: FloatArray) -> FloatArray:
+    centred: FloatArray = rates - rates.mean(axis=0)
+    return centred
+
+
+def _conventions(told: FloatArray, ends: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Yield words for other readings of the attitude, and the rates (m, 3) that it would have turned with."""
+    names = ("roll", "pitch", "heading")
+    for swapped in (False, True):
+        for signs in combinations((1.0, -1.0), repeat=3):
+            if not swapped and signs == (1.0, 1.0, 1.0):
+                continue
+            angles = ends[:, :, [1, 0, 2]] if swapped else ends
+            negated = [name for name, sign in zip(names, signs, strict=True) if sign < 0.0]
+            parts = ["roll and pitch are exchanged"] if swapped else []
+            if negated:
+                parts.append(f"{' and '.join(negated)} {'has' if len(negated) == 1 else 'have'} the other sign")
+            extra = " (axes forward, left, up against east, north, up)" if negated == ["pitch", "heading"] else ""
+            yield " and ".join(parts) + extra, _centred(_rates_of(angles * np.array(signs)))
+    for quarter, words in ((1, "right"), (2, "back"), (3, "left")):
+        cos, sin = np.round(np.cos(quarter * np.pi / 2)), np.round(np.sin(quarter * np.pi / 2))
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        yield f"its x axis points {words}", told @ turn.T
+
+
+def _rates_of(ends: FloatArray) -> FloatArray:
+    """Return turn rates in b (m, 3) of roll, pitch, heading (m, 2, 3) at the ends of steps (FORMULAS 1.4)."""
+    middle = ends.mean(axis=1)
+    roll_rate, pitch_rate, heading_rate = ((ends[:, 1] - ends[:, 0]) / (STEP_NS / SECOND_NS)).T
+    sin_roll, cos_roll = np.sin(middle[:, 0]), np.cos(middle[:, 0])
+    sin_pitch, cos_pitch = np.sin(middle[:, 1]), np.cos(middle[:, 1])
+    rates: FloatArray = np.stack(
+        [
+            roll_rate - heading_rate * sin_pitch,
+            pitch_rate * cos_roll + heading_rate * sin_roll * cos_pitch,
+            heading_rate * cos_roll * cos_pitch - pitch_rate * sin_roll,
+        ],
+        axis=1,
+    )
+    return rates
+
+
+def _power(residual: FloatArray) -> FloatArray:
+    """Return the sum of squares of (m, 3) in each second."""
+    squares = (residual**2).sum(axis=1)
+    whole = len(squares) // SECOND_STEPS * SECOND_STEPS
+    sums: FloatArray = squares[:whole].reshape(-1, SECOND_STEPS).sum(axis=1)
+    return sums
+
+
+def _is_better(before: FloatArray, after: FloatArray) -> bool:
+    """Return whether residuals by seconds (k,) fall much, and in so many of them that chance does not do it."""
+    gain = before - after
+    sigma = np.std(gain, ddof=1) * np.sqrt(len(gain))
+    return bool(after.sum() < MUCH_BETTER * before.sum() and gain.sum() > SURE * sigma)
+
+
+def _correlation(one: FloatArray, other: FloatArray) -> float:
+    scale = float(np.sqrt((one**2).sum() * (other**2).sum()))
+    return float((one * other).sum() / scale) if scale > 0.0 else float("nan")
+
+
+def _coarser(rates: FloatArray, steps: int) -> FloatArray:
+    whole = len(rates) // steps * steps
+    means: FloatArray = rates[:whole].reshape(-1, steps, 3).mean(axis=1)
+    return means
+
+
+def _is_other(told: FloatArray, felt: FloatArray) -> bool:
+    """Return whether neither is, in part, the other with noise: by the share of each that stands in the other.
+
+    Noise of one alone leaves the share of the other at 1. Sigmas are by leaving out tenths of the time (jackknife).
+    """
+    for one, other in ((told, felt), (felt, told)):
+        product_of, square = (one * other).sum(axis=1), (one**2).sum(axis=1)
+        parts = np.array_split(np.arange(len(one)), min(20, len(one)))
+        whole = square.sum()
+        if whole <= 0.0:
+            return False
+        share = product_of.sum() / whole
+        left_out = [
+            (product_of.sum() - product_of[part].sum()) / max(whole - square[part].sum(), 1e-30) for part in parts
+        ]
+        sigma = float(np.sqrt((len(parts) - 1) / len(parts) * ((np.array(left_out) - share) ** 2).sum()))
+        if share + SURE * sigma >= LIKE:
+            return False
+    return True
+
+
+# ---------------------------------------------------------------------- what its heading counts from
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingOffset:
+    """What a trajectory's heading is too large by, rad, and its sigma."""
+
+    offset_rad: float
+    sigma_rad: float
+
+
+def heading_offset(trajectory: Trajectory, imu_time_ns: Int64Array, imu_force_b: FloatArray) -> HeadingOffset | None:
+    """Compare the accelerations of the way flown with those that the IMU felt: their directions tell a heading's error.
+
+    Biases of the accelerometers are estimated beside. Only turns and changes of speed tell anything.
+
+    Args:
+        trajectory: of the body's origin, with attitude.
+        imu_time_ns: (m,) GPS time of inertial samples, rising.
+        imu_force_b: (m, 3) specific forces in b, m/s².
+
+    Returns:
+        None where less than ten seconds have a horizontal acceleration of 0.5 m/s².
+    """
+    seconds = _whole_seconds(trajectory, imu_time_ns)
+    if len(seconds) < 2 or not np.isfinite(trajectory.velocity_e).all():
+        return None
+    flown = trajectory.with_velocities()
+    number = np.searchsorted(seconds, imu_time_ns, side="right") - 1
+    inside = (number >= 0) & (number < len(seconds))
+    inside[inside] = (imu_time_ns[inside] - seconds[number[inside]]) < SECOND_NS
+    times, number = imu_time_ns[inside], number[inside]
+    step = max(1, round(len(times) / len(seconds) / 50))
+    times, number, force_b = times[::step], number[::step], imu_force_b[inside][::step]
+    count = np.bincount(number, minlength=len(seconds)).astype(np.float64)
+    poses = flown.poses(times)
+    felt_e = np.stack([np.bincount(number, column, len(seconds)) for column in rotated(poses.q_e_from_b, force_b).T], 1)
+    full = count >= 0.8 * np.median(count)
+    middle = flown.poses(seconds + SECOND_NS // 2)
+    q_l_from_e = conjugate(_q_e_from_l(middle.position_e))
+    felt_l = rotated(q_l_from_e, felt_e / np.maximum(count, 1.0)[:, np.newaxis])
+    flown_l = _force_flown(flown, seconds, q_l_from_e, middle.position_e, middle.velocity_e)
+    heavy = full & (np.hypot(flown_l[:, 0], flown_l[:, 1]) > ACCELERATES)
+    if heavy.sum() < FEWEST_TURNS:
+        return None
+    q_l_from_b = product(q_l_from_e, middle.q_e_from_b)
+    return _fitted(felt_l[full], flown_l[full], q_l_from_b[full])
+
+
+def _whole_seconds(trajectory: Trajectory, imu_time_ns: Int64Array) -> Int64Array:
+    """Return the begins of seconds that both cover."""
+    first = max(int(imu_time_ns[0]), trajectory.span[0]) + 1
+    last = min(int(imu_time_ns[-1]), trajectory.span[1]) - 1
+    begins = np.arange(first, last - SECOND_NS, SECOND_NS, dtype=np.int64)
+    if not len(begins):
+        return begins
+    good = np.ones(len(begins), bool)
+    for start, end in trajectory.gaps().tolist():
+        good &= (begins + SECOND_NS < start) | (begins > end)
+    return begins[good]
+
+
+def _force_flown(
+    flown: Trajectory, seconds: Int64Array, q_l_from_e: FloatArray, position_e: FloatArray, velocity_e: FloatArray
+) -> FloatArray:
+    """Return the specific force (k, 3) in l that the way flown needs: acceleration, Coriolis, less gravity."""
+    change_e = flown.poses(seconds + SECOND_NS).velocity_e - flown.poses(seconds).velocity_e
+    earth = np.array([0.0, 0.0, EARTH_RATE_RADPS])
+    inertial_l = rotated(q_l_from_e, change_e + 2.0 * np.cross(earth, velocity_e))
+    force_l: FloatArray = inertial_l - rotated(q_l_from_e, gravity_e(position_e))
+    return force_l
+
+
+def _fitted(felt_l: FloatArray, flown_l: FloatArray, q_l_from_b: FloatArray) -> HeadingOffset:
+    """Fit a turn about the vertical and biases in b, with sigmas by leaving out tenths (jackknife)."""
+    rest = felt_l - flown_l
+    columns = np.zeros((len(rest), 3, 4))
+    columns[:, 0, 0], columns[:, 1, 0] = -flown_l[:, 1], flown_l[:, 0]
+    for axis in range(3):
+        unit = np.zeros(3)
+        unit[axis] = 1.0
+        columns[:, :, 1 + axis] = rotated(q_l_from_b, np.broadcast_to(unit, (len(rest), 3)))
+
+    def solved(rows: NDArray[np.int64]) -> float:
+        return float(np.linalg.lstsq(columns[rows].reshape(-1, 4), rest[rows].reshape(-1), rcond=None)[0][0])
+
+    everything = np.arange(len(rest))
+    parts = np.array_split(everything, 10)
+    whole = solved(everything)
+    left_out = np.array([solved(np.setdiff1d(everything, part)) for part in parts])
+    sigma = float(np.sqrt(0.9 * ((left_out - left_out.mean()) ** 2).sum()))
+    return HeadingOffset(whole, sigma)

@@ -1,0 +1,253 @@
+"""A trajectory from a file is held against the log's own fixes and IMU, and what is wrong with it is named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from daemon.processing.feed import LogClocks, read_clocks
+from daemon.processing.given_trajectory import Belonging, Given, judge_given, points_of
+from daemon.processing.setup import Options, Setup
+from georef.earth import geodetic_from_e
+from georef.trajectory import Trajectory
+from tests.daemon.short_flight import Flown, fly_short
+
+PLAN = """
+[flight]
+name = "given"
+origin_deg = [47.48, 11.4]
+speed_mps = 50.0
+lead_s = 3.0
+
+[[line]]
+name = "there"
+from_m = [-600.0, 0.0]
+to_m = [600.0, 0.0]
+height_m = 800.0
+
+[[line]]
+name = "back"
+from_m = [600.0, 200.0]
+to_m = [-600.0, 200.0]
+height_m = 800.0
+
+[pps.main]
+
+[imu.main]
+
+[gnss.rover]
+lever_arm_m = [0.4, -0.25, -1.2]
+{gnss}
+
+[scanner.left]
+prf_hz = 1000
+"""
+UNDULATION_M = 48.0  # of the virtual receiver
+Angles = tuple[Any, Any, Any]
+
+
+@dataclass
+class Log:
+    """A log, what it says, and the truth."""
+
+    flown: Flown
+    setup: Setup
+    clocks: LogClocks
+    truth: Trajectory
+
+    def judged(self, trajectory: Trajectory, at: str = "body", *, datum_is_said: bool = False) -> Belonging:
+        """What is said of a trajectory, given as one of a point."""
+        points = points_of(self.setup)
+        moved = trajectory if at == "body" else trajectory.at_body(points[at])
+        given = Given("x.out", moved, points[at], points, datum_is_said)
+        return judge_given(given, self.setup, self.clocks, self.flown.log)
+
+    def refused(self, trajectory: Trajectory, at: str = "body") -> str:
+        """The one line by which it is refused."""
+        (line,) = self.judged(trajectory, at).refused
+        assert "\n" not in line
+        assert line.startswith("x.out: ")
+        return line
+
+
+def read(flown: Flown) -> Log:
+    setup = Setup.of_log(flown.session().attachments(), Options(uncertainty=False))
+    clocks = read_clocks(flown.session(), setup, positions=True)
+    truth = flown.truth()
+    assert len(clocks.imu_force_b) == len(clocks.imu_rate_b) > 0
+    return Log(flown, setup, clocks, replace(truth, name="x.out"))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """An RTK receiver; two lines and the turn between them."""
+    return read(fly_short(tmp_path_factory.mktemp("rtk"), PLAN.format(gnss='grade = "rtk"')))
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """A receiver alone that says no sigmas, by NMEA."""
+    return read(fly_short(tmp_path_factory.mktemp("spp"), PLAN.format(gnss='grade = "spp"\nprotocol = "nmea"')))
+
+
+def raised(trajectory: Trajectory, change: Any) -> Trajectory:
+    """With another latitude, longitude and height."""
+    return placed(trajectory, *change(*trajectory.geodetic()))
+
+
+def placed(trajectory: Trajectory, lat: Any, lon: Any, height: Any, angles: Angles | None = None) -> Trajectory:
+    return Trajectory.from_geodetic(
+        trajectory.time_ns, lat, lon, height, trajectory.velocity_l(), *(angles or trajectory.attitude()), name="x.out"
+    )
+
+
+def turned(trajectory: Trajectory, change: Any) -> Trajectory:
+    """With other angles."""
+    return placed(trajectory, *trajectory.geodetic(), angles=change(*trajectory.attitude()))
+
+
+def test_the_right_trajectory_is_taken_without_a_word(log: Log, single: Log) -> None:
+    for one in (log, single):
+        found = one.judged(one.truth)
+        assert found.refused == []
+        assert found.warnings == []
+
+
+def test_metres_that_single_fixes_are_wrong_by_are_no_reason_to_refuse(single: Log) -> None:
+    found = single.judged(raised(single.truth, lambda lat, lon, height: (lat + 1.5 / 6.4e6, lon, height - 4.0)))
+    assert found.refused == []
+
+
+def test_a_trajectory_48_m_low_is_above_the_geoid(log: Log, single: Log) -> None:
+    for one in (log, single):
+        line = one.refused(raised(one.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
+        assert "its heights are above the geoid, which lies +48.0 m from the ellipsoid there" in line
+    assert "up -48.0" in log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height - UNDULATION_M)))
+
+
+def test_a_trajectory_7_km_east_is_of_another_place(log: Log) -> None:
+    line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height)))
+    assert "lies 7.5 km off the fixes of gnss/rover" in line
+    assert "of another place" in line
+    assert "latitude and longitude are exchanged" in log.refused(
+        raised(log.truth, lambda lat, lon, height: (lon, lat, height))
+    )
+
+
+def test_heights_in_feet_are_named(log: Log) -> None:
+    line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height / 0.3048)))
+    assert "its heights are in feet" in line
+    line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, (height - UNDULATION_M) / 0.3048)))
+    assert "its heights are in feet" in line
+
+
+@pytest.mark.parametrize(("code", "words"), [("EPSG:4230", "ED50"), ("EPSG:4312", "MGI")])
+def test_another_datum_is_named(log: Log, code: str, words: str) -> None:
+    """Tens of metres to hundreds: an old national datum. PROJ's transformation makes the case, at another place."""
+    there = Transformer.from_crs("EPSG:4979", code, always_xy=True)
+
+    def moved(lat: Any, lon: Any, height: Any) -> Any:
+        east_deg, north_deg = there.transform(np.degrees(lon), np.degrees(lat))
+        return np.radians(north_deg), np.radians(east_deg), height
+
+    line = log.refused(raised(log.truth, lambda lat, lon, height: moved(lat, lon, height)))
+    assert "its datum is another" in line
+    assert words in line
+
+
+def test_the_frame_of_a_continent_is_told_from_that_of_the_world(log: Log) -> None:
+    """ETRS89 lies 0.8 m from ITRF there: more than 20 sigmas of an RTK fix and of the trajectory."""
+    there = Transformer.from_crs("EPSG:7789", "EPSG:4936", always_xy=True)
+    epoch = np.full(len(log.truth), 2026.5)
+    x, y, z = log.truth.position_e.T
+    moved = np.stack(there.transform(x, y, z, epoch)[:3], axis=1)
+    apart_m = float(np.linalg.norm(moved - log.truth.position_e, axis=1).mean())
+    assert 0.6 < apart_m < 1.0
+    sure = replace(log.truth, position_e=moved, position_sigma_l=np.full((len(moved), 3), 0.01))
+    line = log.refused(sure)
+    assert "its datum is another" in line
+    assert "ETRS89" in line or "ETRF" in line
+    found = log.judged(sure, datum_is_said=True)  # the receiver's may be the other one then
+    assert not found.refused
+    assert "its datum is another" in found.warnings[0]
+
+
+def test_another_point_than_said_is_named(log: Log) -> None:
+    sure = replace(log.truth, position_sigma_l=np.full((len(log.truth), 3), 0.01))
+    of_antenna = sure.at_body([-0.4, 0.25, 1.2])
+    assert "want --trajectory-at antenna" in log.refused(of_antenna)
+    assert log.judged(of_antenna, "antenna").refused == []
+    assert "want --trajectory-at body" in log.refused(sure, "antenna")
+    mirrored = sure.at_body([-0.8, 0.5, 2.4])
+    assert "lever arm has another sign" in log.refused(mirrored)
+
+
+def test_time_that_is_off_is_named_by_the_way_flown(log: Log) -> None:
+    line = log.refused(replace(log.truth, time_ns=log.truth.time_ns - 2_000_000_000))
+    assert "as if its time were 2.00 s early" in line
+    found = log.judged(replace(log.truth, time_ns=log.truth.time_ns - 18_000_000_000))
+    assert "18.00 s early; it is in UTC, not GPS time" in found.refused[-1]
+
+
+FLIPS = {
+    "pitch has the other sign": lambda roll, pitch, heading: (roll, -pitch, heading),
+    "roll has the other sign": lambda roll, pitch, heading: (-roll, pitch, heading),
+    "heading has the other sign": lambda roll, pitch, heading: (roll, pitch, -heading),
+    "pitch and heading have the other sign (axes forward, left, up": lambda roll, pitch, heading: (
+        roll,
+        -pitch,
+        np.pi / 2 - heading,
+    ),
+    "roll and pitch are exchanged": lambda roll, pitch, heading: (pitch, roll, heading),
+}
+
+
+@pytest.mark.parametrize("words", list(FLIPS))
+def test_angles_of_another_convention_are_seen_and_named(log: Log, words: str) -> None:
+    found = log.judged(turned(log.truth, FLIPS[words]))
+    assert words in found.refused[0]
+    assert "turns as the IMU" in found.refused[0]
+
+
+@pytest.mark.parametrize("words", list(FLIPS)[:3])
+def test_one_straight_line_of_20_seconds_is_enough_for_that(log: Log, words: str) -> None:
+    begin = log.truth.time_ns[0] + 4_000_000_000
+    line = turned(log.truth.between(int(begin), int(begin) + 20_000_000_000), FLIPS[words])
+    assert words in log.judged(line).refused[0]
+
+
+def test_headings_from_grid_north_are_named(log: Log) -> None:
+    """Convergence of UTM zone 32 there: (11.4° − 9°) sin 47.48° = 1.77°."""
+    grid_rad = np.radians(2.4 * np.sin(np.radians(47.48)))
+    line = log.refused(turned(log.truth, lambda roll, pitch, heading: (roll, pitch, heading - grid_rad)))
+    assert "counts from grid north, which lies +1.7" in line
+    off = log.judged(turned(log.truth, lambda roll, pitch, heading: (roll, pitch, heading + np.radians(3.0))))
+    assert "heading is +3.0" in off.refused[0]
+
+
+def test_a_trajectory_of_another_flight_is_refused_by_how_it_turns(log: Log) -> None:
+    """It lies where it should: the same way with another motion about it."""
+    random = np.random.default_rng(5)
+    count = len(log.truth)
+    since_s = (log.truth.time_ns - log.truth.time_ns[0]) / 1e9
+    waves = np.sin(2 * np.pi * np.outer(since_s, random.uniform(0.1, 0.5, 6)) + random.uniform(0, 6, 6))
+    wobble = 0.01 * np.stack([waves[:, :2].sum(1), waves[:, 2:4].sum(1), waves[:, 4:].sum(1)])
+    assert wobble.shape == (3, count)
+    other = turned(log.truth, lambda roll, pitch, heading: tuple(wobble + np.array([[0.0], [0.0], [1.0]])))
+    line = log.judged(other).refused[0]
+    assert "does not turn as the IMU" in line
+    assert "want the trajectory of this flight" in line
+
+
+def test_height_of_the_truth_is_the_ellipsoids(log: Log) -> None:
+    """The fixes that all is held against are the receiver's, brought to the ellipsoid by its undulation."""
+    fixes = [fix for fix in log.clocks.fixes["gnss/rover"] if fix.height_m is not None]
+    height = float(np.median(geodetic_from_e(log.truth.position_e)[2]))
+    assert np.median([fix.height_m for fix in fixes]) == pytest.approx(height + 1.2, abs=0.3)
+    assert all(fix.undulation_m == pytest.approx(UNDULATION_M) for fix in fixes)
+    assert Path(log.flown.log).exists()
