@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, ForceCrs, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import ForceCrs, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -68,7 +68,7 @@ def command(
     limit_m: Annotated[float, typer.Option("--limit-m", help="The range offset likewise.", min=0.0)] = 10.0,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
-    accept_verdict: AcceptVerdict = False,
+    force_trajectory: ForceTrajectory = False,
     as_json: Annotated[bool, typer.Option("--json", help="The outcome to stdout, for scripts.")] = False,
 ) -> None:
     """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
@@ -95,7 +95,7 @@ def command(
         logs=Wish(
             logs=logs,
             output=output,
-            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, accept=accept_verdict),
+            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
             options=Options(
                 crs=crs,
                 force_crs=force_crs,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, ForceCrs, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import ForceCrs, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -48,7 +48,7 @@ def command(
         typer.Option("--write-dropped", help="Also returns left out: beyond the range gate flagged, others listed."),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
-    accept_verdict: AcceptVerdict = False,
+    force_trajectory: ForceTrajectory = False,
     as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
 ) -> None:
     """Georeference logs: one LAZ file a strip, the trajectory, and a JSON file that says what they are made of.
@@ -68,7 +68,7 @@ def command(
     wish = Wish(
         logs=logs,
         output=output,
-        trajectory=TrajectoryWish(trajectory, week, at, accept=accept_verdict),
+        trajectory=TrajectoryWish(trajectory, week, at, force=force_trajectory),
         options=Options(
             crs=crs,
             force_crs=force_crs,

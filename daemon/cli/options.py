@@ -13,9 +13,8 @@ TrajectoryWeek = Annotated[int | None, typer.Option(help="GPS week of a trajecto
 TrajectoryDatum = Annotated[
     str | None, typer.Option("--trajectory-datum", metavar="CRS", help='Realisation of its positions, or "same".')
 ]
-AcceptVerdict = Annotated[
-    bool,
-    typer.Option("--accept-verdict", help="Take a trajectory or calibration that is judged not to be used."),
+ForceTrajectory = Annotated[
+    bool, typer.Option("--force-trajectory", help="Take a trajectory that does not agree with the log's fixes and IMU.")
 ]
 ForceCrs = Annotated[
     bool, typer.Option("--force-crs", help="Take a CRS outside its area of use, or 0.5 % off in scale.")

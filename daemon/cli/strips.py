@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -58,7 +58,7 @@ def command(
     ] = "auto",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an adjustment left there.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
-    accept_verdict: AcceptVerdict = False,
+    force_trajectory: ForceTrajectory = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Compare strips: point to plane and gridded, what the differences look like, and what specifications say.
@@ -80,7 +80,7 @@ def command(
     logs = Wish(
         logs=paths,
         output=output or Path(),
-        trajectory=TrajectoryWish(trajectory, week, at, navigate=True, accept=accept_verdict),
+        trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
         options=Options(
             datum=datum, calibrations=calibrations_given(calibration or []), uncertainty=False, force_crs=True
         ),

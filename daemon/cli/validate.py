@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -51,7 +51,7 @@ def command(
         typer.Option(metavar="DIR|FILE", help="The calibration's record, which -o shall have with this validation."),
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
-    accept_verdict: AcceptVerdict = False,
+    force_trajectory: ForceTrajectory = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Validate a calibration by ISO/TS 19159-2, 6.8: six methods, each with numbers, a test and a sentence.
@@ -80,7 +80,7 @@ def command(
         logs=Wish(
             logs=logs or [],
             output=output or Path(),
-            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, accept=accept_verdict),
+            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
             options=Options(datum=datum, calibrations=given, uncertainty=False, force_crs=True),
             config=None if config is None else load_config(config),
             strips=strips,

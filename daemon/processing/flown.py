@@ -36,14 +36,14 @@ class TrajectoryWish:
         at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
         navigate: without a file IMU and GNSS are navigated and smoothed where the log has both, whatever the device's
             own INS said.
-        accept: a file that does not belong to the log is taken all the same, and warned of.
+        force: a file that does not belong to the log is taken all the same, and warned of.
     """
 
     file: Path | None = None
     week: int | None = None
     at: str = "body"
     navigate: bool = False
-    accept: bool = False
+    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +118,8 @@ def _belonging(
     offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
     given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
     found = judge_given(given, setup, clocks, log)
-    if found.refused and not wish.accept:
-        raise UserError("\n".join(f"{line}; --accept-verdict takes it as it is" for line in found.refused))
+    if found.refused and not wish.force:
+        raise UserError("\n".join(f"{line}; --force-trajectory takes it as it is" for line in found.refused))
     return [*found.refused, *found.warnings]
 
 
