@@ -9,7 +9,7 @@ import contextlib
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from daemon.events import Events, Severity
 from daemon.host_clock import ClockDiscipline
@@ -34,6 +34,7 @@ class _TimeSource:
     message_ns: int | None = None
     longest_ns: int = 0  # between two messages
     told: bool = False
+    remarks: list[str] = field(default_factory=list)  # told so far
 
     def note_message(self, host_ns: int) -> int | None:
         """A time message came; how long there was none, where that had been told."""
@@ -89,6 +90,7 @@ class TimeKeeper:
             time_source.units_ns = int(log_time_ns[-1])
             with self._defects_told(source):
                 self._take(time_source, time_source.parser.feed_batch(ChunkBatch(source, log_time_ns, block.units)))
+                self._tell_remarks(time_source)
 
         return feed
 
@@ -119,6 +121,13 @@ class TimeKeeper:
                     time_source.source, replace(message, host_time_ns=raw_ns, names_edge=names)
                 )
             self._drain(time_source.source, time_source.clock)
+
+    def _tell_remarks(self, time_source: _TimeSource) -> None:
+        """Tell once what the parser takes otherwise than the receiver says it, or refuses."""
+        for remark in time_source.parser.remarks():
+            if remark not in time_source.remarks:
+                time_source.remarks.append(remark)
+                self._events.post(Severity.WARNING, time_source.source, "date_doubtful", remark)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:
         """What a PPS receiver thread calls with an edge's host time and sequence number."""

@@ -88,10 +88,22 @@ class GnssConfig(Section):
     )
     lever_arm_m: Vector = Field(default_factory=_zero_vector, description="antenna's phase centre x_a^b")
     secondary_lever_arm_m: Vector | None = Field(None, description="second antenna, for dual-antenna heading")
-    leap_seconds: int = Field(18, ge=0, le=60, description="GPS − UTC, only used until the receiver says, for NMEA")
+    leap_seconds: int | None = Field(
+        None,
+        ge=0,
+        le=60,
+        description="GPS − UTC, only used until the receiver says, for NMEA; absent: the built-in table by the date",
+    )
     date_floor: dt.date | None = Field(
         None,
         description="oldest date believed, for week numbers of ten bits; absent: 2009-01-01",
+    )
+    add_weeks: int = Field(
+        0,
+        ge=0,
+        le=3072,
+        multiple_of=1024,
+        description="added to its dates: 1024 a roll-over that its firmware is behind",
     )
     datum: str | None = Field(
         None,

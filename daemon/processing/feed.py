@@ -303,6 +303,7 @@ class LogClocks:
         counts: records by source.
         imu_force_b: (n, 3) m/s², axes of b, and fixes: of receivers, by source. To check that a trajectory is of this
             flight; empty unless asked for.
+        remarks: lines for the user, of parsers.
     """
 
     clocks: FrozenClocks
@@ -313,6 +314,7 @@ class LogClocks:
     counts: dict[str, Counter[str]] = field(default_factory=dict)
     imu_force_b: np.ndarray[Any, np.dtype[np.float64]] = field(default_factory=lambda: np.empty((0, 3)))
     fixes: dict[str, list[GnssFix]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
 
 
 class _ClockReader:
@@ -326,6 +328,7 @@ class _ClockReader:
         self.imu: list[StructArray] = []
         self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.gimbal_sources}
         self.counts: dict[str, Counter[str]] = {}
+        self.remarks: list[str] = []
         self._setup = setup
         self._parsers = setup.parsers(("gnss", "imu"), whole=positions)
         self._runs: dict[str, _Run] = {}
@@ -357,6 +360,7 @@ class _ClockReader:
             run.flush()
         for name, parser in self._parsers.items():
             self.take_records(name, parser.close())
+            self.remarks += parser.remarks()
         self.host.update()
 
     def angles(self) -> dict[str, AngleSeries]:
@@ -410,4 +414,6 @@ def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> L
         if positions:
             force_b = setup.in_b(imu["specific_force_b"][known])
     host = FrozenClocks(reader.host)
-    return LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)
+    found = LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)
+    found.remarks = reader.remarks
+    return found

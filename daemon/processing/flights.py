@@ -206,7 +206,8 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
         raise UserError(f"{log}: no scanner's data in the log")
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
-    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]), setup.config)
+    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]), setup.config, clocks.remarks)
+    flight.troubles += [f"{log}: {remark}" for remark in clocks.remarks]
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)
     return flight

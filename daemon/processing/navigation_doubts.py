@@ -58,9 +58,11 @@ def no_time(found: NavigationLog, sources: NavigationSources, log: Path) -> str:
             f"either, so no sample of {sources.imu_source} has GPS time; want [gnss.NAME] with its time messages, a "
             "host that chrony keeps, or an IMU that says GPS time itself"
         )
+    remedy = f"want PPS edges, or at least time messages of {sources.gnss_source}"
+    why = "; ".join([*([status.leap_doubt] if status.leap_doubt else []), *found.remarks]) or remedy
     return (
         f"{log}: {sources.clock}: the host's clock is {status.state.value}, so no sample of {sources.imu_source} has "
-        f"GPS time; want PPS edges, or at least time messages of {sources.gnss_source}"
+        f"GPS time; {why}"
     )
 
 
@@ -98,7 +100,7 @@ def refuse_elsewhere(
 def input_doubts(
     found: NavigationLog, sources: NavigationSources, times: ImuTimes, parts: Mapping[str, Observed], log: Path
 ) -> list[str]:
-    lines: list[str] = []
+    lines = [f"{log}: {remark}" for remark in found.remarks]
     if times.by == "arrival":
         lines.append(
             f"{log}: {sources.imu_source} says no time of its own: its samples are placed by their arrival, to about "

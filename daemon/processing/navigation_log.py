@@ -49,6 +49,7 @@ class NavigationLog:
         heard: bytes, those of them that belong to no message, and messages by name, by source.
         lost: units that the recorder lost, by source.
         doubts: what the sources' messages leave uncertain, a line each.
+        remarks: lines of parsers for the user.
     """
 
     session: Session
@@ -63,6 +64,7 @@ class NavigationLog:
     heard: dict[str, tuple[int, int, Counter[str]]] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
 
 class _Reader:
@@ -104,6 +106,7 @@ class _Reader:
         for name, parser in self._parsers.items():
             self._take_records(name, parser.close())
             found.refused[name] = refused_by(parser)
+            found.remarks += parser.remarks()
             counters = parser.counters
             found.heard[name] = counters.bytes, counters.bytes_skipped, counters.messages
             if isinstance(parser, PacketParser):

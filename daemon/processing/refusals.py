@@ -172,8 +172,17 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
     )
 
 
-def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None, config: Config) -> None:
+def refuse_no_time(
+    log: Path, clock: str | None, status: ClockStatus | None, config: Config, remarks: Sequence[str] = ()
+) -> None:
     """The log's own clock must be known well enough to say which second a pulse belongs to.
+
+    Args:
+        log: stands for the session.
+        clock: the source that shows the time.
+        status: of that clock at the end.
+        config: of the session.
+        remarks: what the receivers' parsers have to say.
 
     Raises:
         UserError: it is not, and why.
@@ -192,6 +201,10 @@ def refuse_no_time(log: Path, clock: str | None, status: ClockStatus | None, con
             f"{log}: {clock}: no receiver says which second its edges are ({heard or 'no gnss.….pps is set'}); "
             "want the receiver that gives the pulse there, with --config"
         )
+    if status.leap_doubt:
+        raise UserError(f"{log}: {clock}: UTC cannot be brought to GPS time: {status.leap_doubt}")
+    if status.state is TimeState.NO_TIME and remarks:
+        raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
     if status.state is TimeState.NO_TIME:
         raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
 

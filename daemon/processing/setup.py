@@ -227,7 +227,9 @@ class Setup:
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
         """The clocks of a session."""
         config = self.config
-        leap_of = {gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps}
+        said = {
+            gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
+        }
         devices: dict[str, DevicePlan] = {}
         for name in self.scanners:
             clock = self._clock_of(config.scanner[name].pps)
@@ -236,7 +238,7 @@ class Setup:
                 devices[f"scanner/{name}"] = DevicePlan(clock, past_hour)
         return ClockPlan(
             host_minus_monotonic_ns=info.realtime_ns - info.monotonic_ns,
-            pps={f"pps/{name}": PpsPlan(leap_of.get(name), pps.delay_ns) for name, pps in config.pps.items()},
+            pps={f"pps/{name}": PpsPlan(said.get(name), pps.delay_ns) for name, pps in config.pps.items()},
             gnss={
                 f"gnss/{name}": GnssPlan(
                     f"pps/{gnss.pps}" if gnss.pps else None,

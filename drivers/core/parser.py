@@ -84,6 +84,10 @@ class Parser(ABC):
         """Release the tail at the end of a stream."""
         return []
 
+    def remarks(self) -> list[str]:
+        """Return lines for the user, with the source: what was taken otherwise than said or refused, and the remedy."""
+        return []
+
 
 def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
     """Batches of units of one length as one."""

@@ -1,7 +1,10 @@
-"""The oldest date believed: a receiver whose firmware is one roll-over of the 10-bit week behind says 1024 weeks less.
+"""What a receiver's dates may mean: roll-overs of the 10-bit week, the oldest date believed, leap counts they imply.
 
-The default catches this for all days until 2028-08-16 (2009-01-01 plus 1024 weeks); later the setting ``date_floor``
-of the device moves it. It is not the build date, so that older recordings can be read.
+A receiver whose firmware is one roll-over behind says 1024 weeks less. Such a date is taken 1024 weeks later where the
+setting ``add_weeks`` says so, or where the host's clock, which stamped the bytes, shows that day to within one: no
+other mistake of either is exactly so large. Any other date before the floor is refused. The default floor catches it
+for all days until 2028-08-16 (2009-01-01 plus 1024 weeks); later the setting ``date_floor`` moves it. It is not the
+build date, so that older recordings can be read.
 """
 
 from __future__ import annotations
@@ -12,10 +15,17 @@ from drivers.core.parser import DeviceSettings, DriverSettingsError
 
 DEFAULT_DATE_FLOOR = dt.date(2009, 1, 1)
 GPS_EPOCH = dt.date(1980, 1, 6)
+UNIX_EPOCH = dt.date(1970, 1, 1)
+ROLLOVER_WEEKS = 1024
+ROLLOVER_DAYS = 7 * ROLLOVER_WEEKS
+HOST_DAY_TOLERANCE = 1  # a host's clock may keep local time
+DAY_NS = 86_400_000_000_000
+WEEK_MS = 604_800_000
+GREATEST_LEAP_S = 60  # GPS − UTC that a message's own two times may imply; more is another mistake
 
 
 def read_date_floor(settings: DeviceSettings) -> dt.date:
-    """The setting ``date_floor``, a date or its text.
+    """Return the setting ``date_floor``, a date or its text.
 
     Raises:
         DriverSettingsError: it is no date.
@@ -34,3 +44,112 @@ def read_date_floor(settings: DeviceSettings) -> dt.date:
 def week_of(date: dt.date) -> int:
     """Full GPS week a date lies in."""
     return (date - GPS_EPOCH).days // 7
+
+
+class ReceiverDates:
+    """Moves a receiver's dates and weeks by the roll-overs it is behind, and remembers what it refused.
+
+    Attributes:
+        floor: the oldest date believed, after the move.
+        floor_week: its GPS week.
+    """
+
+    def __init__(self, settings: DeviceSettings) -> None:
+        """Read ``date_floor`` and ``add_weeks``.
+
+        Raises:
+            DriverSettingsError: one is none.
+        """
+        self.floor = read_date_floor(settings)
+        self.floor_week = week_of(self.floor)
+        self._name = settings.source.partition("/")[2] or "NAME"
+        self._source = settings.source
+        weeks = settings.config.get("add_weeks") or 0
+        if not isinstance(weeks, int) or weeks % ROLLOVER_WEEKS or weeks < 0:
+            raise DriverSettingsError(f"add_weeks: got {weeks!r}, want a multiple of {ROLLOVER_WEEKS}, as 1024")
+        self._add_weeks = weeks
+        self._moved: tuple[dt.date, dt.date] | None = None  # the first, as said and as taken
+        self._refused: tuple[dt.date, dt.date] | None = None  # the first, as said, and the host's date
+        self._latest: tuple[dt.date | int, int, dt.date | int] | None = None  # as said, host's day, as taken
+
+    def date(self, said: dt.date, host_time_ns: int) -> dt.date:
+        """Return the date that a receiver means; compare it with `floor`."""
+        latest = self._latest
+        if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
+            latest = self._latest = said, host_time_ns // DAY_NS, self._date(said, host_time_ns)
+        assert isinstance(latest[2], dt.date)
+        return latest[2]
+
+    def week(self, said: int, host_time_ns: int) -> int:
+        """Return the GPS week that a receiver means; compare it with `floor_week`."""
+        latest = self._latest
+        if latest is None or latest[0] != said or latest[1] != host_time_ns // DAY_NS:
+            latest = self._latest = said, host_time_ns // DAY_NS, self._week(said, host_time_ns)
+        assert isinstance(latest[2], int)
+        return latest[2]
+
+    def _date(self, said: dt.date, host_time_ns: int) -> dt.date:
+        host = UNIX_EPOCH + dt.timedelta(days=min(max(host_time_ns // DAY_NS, 0), 100_000))
+        days = 7 * self._add_weeks
+        if not days:
+            behind = round((host - said).days / ROLLOVER_DAYS)
+            if behind > 0 and abs((host - said).days - behind * ROLLOVER_DAYS) <= HOST_DAY_TOLERANCE:
+                days = behind * ROLLOVER_DAYS
+        if days and said.toordinal() + days <= dt.date.max.toordinal():
+            taken = said + dt.timedelta(days=days)
+            self._moved = self._moved or (said, taken)
+            return taken
+        if said < self.floor and self._refused is None:
+            self._refused = said, host
+        return said
+
+    def _week(self, said: int, host_time_ns: int) -> int:
+        if said <= 0 or said > week_of(dt.date.max) - 1:
+            return said
+        middle = GPS_EPOCH + dt.timedelta(days=7 * said + 3)  # the host's day may be any of the week
+        host = UNIX_EPOCH + dt.timedelta(days=min(max(host_time_ns // DAY_NS, 0), 100_000))
+        weeks = self._add_weeks
+        if not weeks:
+            behind = round((week_of(host) - said) / ROLLOVER_WEEKS)
+            apart = (host - middle).days - behind * ROLLOVER_DAYS
+            if behind > 0 and abs(apart) <= 3 + HOST_DAY_TOLERANCE:
+                weeks = behind * ROLLOVER_WEEKS
+        first = GPS_EPOCH + dt.timedelta(days=7 * said)
+        if weeks:
+            self._moved = self._moved or (first, GPS_EPOCH + dt.timedelta(days=7 * (said + weeks)))
+            return said + weeks
+        if said < self.floor_week and self._refused is None:
+            self._refused = first, host
+        return said
+
+    def remarks(self) -> list[str]:
+        """Return what the user should know of the dates: that they were moved, and why, or refused, and the remedy."""
+        lines = []
+        if self._moved is not None:
+            said, taken = self._moved
+            weeks = (taken - said).days // 7
+            why = "gnss.….add_weeks says so" if self._add_weeks else "the host's clock shows that day"
+            lines.append(
+                f"{self._source}: says {said}, {weeks // ROLLOVER_WEEKS} roll-over of {ROLLOVER_WEEKS} weeks behind: "
+                f"taken as {taken}, for {why}"
+            )
+        if self._refused is not None:
+            said, host = self._refused
+            later = said + dt.timedelta(days=ROLLOVER_DAYS)
+            lines.append(
+                f"{self._source}: says {said}, before {self.floor} (gnss.{self._name}.date_floor): probably one "
+                f"roll-over of {ROLLOVER_WEEKS} weeks behind, which makes {later}, and the host's clock says {host}; "
+                f"want gnss.{self._name}.add_weeks = {ROLLOVER_WEEKS} if that is right, or an older date_floor"
+            )
+        return lines
+
+
+def leap_seconds_of(date: dt.date, of_day_ms: int, itow_ms: int) -> int | None:
+    """Return GPS − UTC in s as the UTC and the GPS time of week of one message imply it.
+
+    None where they are not whole seconds apart to 1 ms, or by more than `GREATEST_LEAP_S`.
+    """
+    week_ms = ((date - GPS_EPOCH).days % 7) * 86_400_000 + of_day_ms
+    ahead_ms = (itow_ms - week_ms + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2
+    leap = round(ahead_ms / 1000)
+    return leap if abs(ahead_ms - leap * 1000) <= 1 and abs(leap) <= GREATEST_LEAP_S else None

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Driver, StreamParser
-from drivers.gnss.date_floor import read_date_floor
+from drivers.gnss.date_floor import ReceiverDates
 from drivers.gnss.epochs import EpochGatherer
 from drivers.gnss.nmea_sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
 from georef.records import (
@@ -89,13 +89,13 @@ class NmeaParser(StreamParser):
     """Sentences to records; UBX and RTCM3 on the same port are framed and counted.
 
     Args:
-        settings: ``date_floor`` is the oldest date believed.
+        settings: ``date_floor`` is the oldest date believed, ``add_weeks`` is added to all.
         time_only: time messages only, the same ones.
     """
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
         super().__init__()
-        self._floor = read_date_floor(settings)
+        self._dates = ReceiverDates(settings)
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
         self._time_only = time_only
@@ -116,6 +116,10 @@ class NmeaParser(StreamParser):
         """Release the tail and the last epoch."""
         records = self._decode(self._framer.close())
         return records + self._fixes(self._epochs.end())
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's dates."""
+        return self._dates.remarks()
 
     def _decode(self, frames: list[Frame]) -> list[Record]:
         records: list[Record] = []
@@ -150,7 +154,7 @@ class NmeaParser(StreamParser):
         return self._add("GGA", part)
 
     def _rmc(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
-        time_ns, date = sentence.time_ns(), sentence.date_ddmmyy()
+        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ddmmyy(), host_time_ns)
         position, speed = sentence.position_rad(), sentence.number("spd_over_grnd")
         velocity = velocity_from_course(None if speed is None else speed * MPS_PER_KNOT, sentence.number("true_course"))
         fix_type = FIX_TYPE_BY_MODE.get(sentence.text("mode_indicator"), FixType.NONE)
@@ -162,7 +166,7 @@ class NmeaParser(StreamParser):
         return records + self._add("RMC", part)
 
     def _zda(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
-        time_ns, date = sentence.time_ns(), sentence.date_ymd()
+        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ymd(), host_time_ns)
         records = self._time_message(host_time_ns, time_ns, date, self._has_fix is not False, "ZDA")
         return records + self._add("ZDA", Part(host_time_ns, time_ns, date=self._believed(date)))
 
@@ -192,14 +196,17 @@ class NmeaParser(StreamParser):
         """The previous edge's second; a date before the floor is a week rolled over, and counted."""
         if time_ns is None:
             return []
-        if date is not None and date < self._floor:
+        if date is not None and date < self._dates.floor:
             self.counters.errors["date_before_floor"] += 1
         tag = TimeTag(TimeScale.UTC, time_ns, date=date)
         valid = vouched and self._believed(date) is not None
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
 
     def _believed(self, date: dt.date | None) -> dt.date | None:
-        return date if date is not None and date >= self._floor else None
+        return date if date is not None and date >= self._dates.floor else None
+
+    def _meant(self, date: dt.date | None, host_time_ns: int) -> dt.date | None:
+        return None if date is None else self._dates.date(date, host_time_ns)
 
     def _add(self, name: str, part: Part) -> list[Record]:
         if part.time_ns is None or self._time_only:

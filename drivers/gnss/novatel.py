@@ -24,7 +24,7 @@ from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
-from drivers.gnss.date_floor import read_date_floor, week_of
+from drivers.gnss.date_floor import ReceiverDates
 from drivers.gnss.novatel_records import DECODERS, Header, State
 from drivers.gnss.novatel_startup import startup_messages
 from drivers.gnss.rows import Row, join_rows
@@ -93,7 +93,7 @@ class NovatelParser(StreamParser):
         self._framer = Framer(FRAME_KINDS, self.counters)
         self._wanted = wanted
         self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
-        self._state = State(self.counters, week_of(read_date_floor(settings)), imu_scale(settings))
+        self._state = State(self.counters, ReceiverDates(settings), imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
         self._has_solutions = False  # that name seconds: raw measurements come later and need not
 
@@ -104,6 +104,10 @@ class NovatelParser(StreamParser):
     def close(self) -> list[Record]:
         """Release what was held back."""
         return self._decode_all(self._framer.close())
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's weeks."""
+        return self._state.dates.remarks()
 
     def _decode_all(self, frames: list[Frame]) -> list[Record]:
         logs = (frame for frame in frames if frame.kind.startswith("novatel"))
@@ -117,7 +121,7 @@ class NovatelParser(StreamParser):
         layout = nov.LAYOUTS.get(number)
         if layout is None or layout.body not in self._bodies:
             return []
-        header, body = _split(frame, layout.name, self._state.floor_week)
+        header, body = _split(frame, layout.name, self._state.dates)
         if header is None:
             return []
         if len(body) < layout.wire.size:
@@ -155,18 +159,20 @@ class NovatelParser(StreamParser):
         return [TimeMessage(header.host_time_ns, header.tag(), NamesEdge.PREVIOUS, message=name)]
 
 
-def _split(frame: Frame, name: str, floor_week: int) -> tuple[Header | None, bytes]:
+def _split(frame: Frame, name: str, dates: ReceiverDates) -> tuple[Header | None, bytes]:
     """Header and body of a frame; None for answers to commands and for other formats."""
     data = frame.data
     if data[:3] == nov.SYNC_SHORT:
         short = nov.ShortHeader._make(nov.SHORT_HEADER.unpack_from(data))
-        header = Header(name, frame.host_time_ns, short.week, short.milliseconds, None, 0, floor_week)
+        week = dates.week(short.week, frame.host_time_ns)
+        header = Header(name, frame.host_time_ns, week, short.milliseconds, None, 0, dates.floor_week)
         return header, data[nov.SHORT_HEADER.size : -nov.CRC_BYTES]
     long = nov.LongHeader._make(nov.LONG_HEADER.unpack_from(data))
     if long.message_type & (nov.RESPONSE_BIT | nov.FORMAT_BITS):
         return None, b""
     source = long.message_type & nov.SOURCE_BITS
-    header = Header(name, frame.host_time_ns, long.week, long.milliseconds, long.time_status, source, floor_week)
+    week = dates.week(long.week, frame.host_time_ns)
+    header = Header(name, frame.host_time_ns, week, long.milliseconds, long.time_status, source, dates.floor_week)
     return header, data[long.header_bytes : -nov.CRC_BYTES]
 
 

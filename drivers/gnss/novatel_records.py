@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import cos, isfinite, nan, radians, sin
@@ -12,6 +13,7 @@ import numpy as np
 from drivers.core.parser import ParserCounters
 from drivers.gnss import novatel_layouts as nov
 from drivers.gnss import novatel_tables as tables
+from drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
 from drivers.gnss.rows import Row
 from georef.records import (
     DeviceStatus,
@@ -70,15 +72,20 @@ class State:
 
     Attributes:
         counters: the parser's.
-        floor_week: the oldest believed.
+        dates: moves weeks by roll-overs, and knows the oldest believed.
         configured_scale: of the setting ``imu_type``.
         announced_scale: of the last INSCONFIG.
     """
 
     counters: ParserCounters
-    floor_week: int = 0
+    dates: ReceiverDates
     configured_scale: tables.ImuScale | None = None
     announced_scale: tables.ImuScale | None = None
+
+    @property
+    def floor_week(self) -> int:
+        """The oldest week believed."""
+        return self.dates.floor_week
 
     def has_week(self, week: int) -> bool:
         """Whether a solution can be placed in time; counted where not."""
@@ -100,6 +107,10 @@ def time_message(state: State, header: Header, time: nov.Time) -> list[Record | 
         return []
     says_leap = time.utc_status == tables.UTC_VALID and abs(time.utc_offset_s) < GREATEST_LEAP_S
     leap = round(-time.utc_offset_s) if says_leap else None
+    implied = _leap_of_fields(header, time)
+    if leap is not None and implied not in (None, leap):
+        state.counters.errors["utc_contradicts_gps"] += 1
+        leap = None
     steered = time.clock_status == tables.CLOCK_VALID and abs(time.clock_offset_s) < GREATEST_PPS_ERROR_S
     return [
         TimeMessage(
@@ -112,6 +123,16 @@ def time_message(state: State, header: Header, time: nov.Time) -> list[Record | 
             message=header.name,
         )
     ]
+
+
+def _leap_of_fields(header: Header, time: nov.Time) -> int | None:
+    """Return GPS − UTC as header and calendar fields of a TIME imply it; None: they do not say."""
+    try:
+        date = dt.date(time.utc_year, time.utc_month, time.utc_day)
+    except ValueError:
+        return None
+    of_day_ms = (time.utc_hour * 60 + time.utc_minute) * 60_000 + time.utc_ms
+    return leap_seconds_of(date, of_day_ms, header.milliseconds)
 
 
 def position_fix(state: State, header: Header, position: nov.BestPos) -> list[Record | Row]:
@@ -224,6 +245,7 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
     if scale is None:
         state.counters.errors["imu_scale_unknown"] += 1
         return []
+    week = state.dates.week(imu.week, header.host_time_ns)
     force, rate = scale.mps_per_count * scale.rate_hz, scale.rad_per_count * scale.rate_hz
     values = (
         header.host_time_ns,
@@ -233,7 +255,7 @@ def raw_imu(state: State, header: Header, imu: nov.RawImu | nov.RawImux) -> list
         (imu.gyro_x * rate, -imu.gyro_minus_y * rate, imu.gyro_z * rate),
         nan,
         imu.imu_status,
-        imu.week if is_week(imu.week, state.floor_week) else -1,
+        week if is_week(week, state.floor_week) else -1,
     )
     return [Row(ImuSamples, values)]
 
@@ -262,10 +284,11 @@ def event_mark(state: State, header: Header, mark: nov.MarkTime) -> list[Record 
 
     It is of the pulse's leading edge, which is the falling one unless MARKCONTROL was told otherwise; no log says it.
     """
+    week = state.dates.week(mark.week, header.host_time_ns)
     return [
         EventMark(
             host_time_ns=header.host_time_ns,
-            time=gps_tag(mark.week, _nanoseconds(mark.seconds) - _nanoseconds(mark.clock_offset_s), state.floor_week),
+            time=gps_tag(week, _nanoseconds(mark.seconds) - _nanoseconds(mark.clock_offset_s), state.floor_week),
             channel=nov.MARK_CHANNELS[header.name],
             rising=None,
             sigma_s=mark.clock_offset_sigma_s,

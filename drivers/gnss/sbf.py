@@ -15,6 +15,7 @@ complete at EndOfPVT at the latest. So do AttEuler and AttCovEuler one `GnssHead
 
 from __future__ import annotations
 
+import datetime as dt
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
@@ -25,7 +26,7 @@ from drivers.core.parser import DeviceSettings, Driver, StreamParser
 from drivers.gnss import sbf_blocks as sbf
 from drivers.gnss import sbf_frame as wire
 from drivers.gnss import sbf_records as records
-from drivers.gnss.date_floor import read_date_floor, week_of
+from drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
 from drivers.gnss.epochs import EpochGatherer
 from drivers.gnss.rows import Row, join_rows
 from drivers.gnss.sbf_records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
@@ -74,14 +75,14 @@ class SbfParser(StreamParser):
     """Decodes the blocks listed above; everything else is framed and counted.
 
     Args:
-        settings: ``date_floor`` is the oldest week believed.
+        settings: ``date_floor`` is the oldest week believed, ``add_weeks`` is added to all.
         wanted: the record types to give; None: all.
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
         super().__init__()
         self._framer = Framer(FRAME_KINDS, self.counters)
-        self._floor_week = week_of(read_date_floor(settings))
+        self._dates = ReceiverDates(settings)
         self._wanted = wanted
         self._gathers_fixes = wanted is None or GnssFix in wanted
         self._clock = ReceiverClock(self.counters)
@@ -122,6 +123,10 @@ class SbfParser(StreamParser):
         items = self._decode(self._framer.close())
         return self._join(items + self._give_fixes(self._fixes.end()) + self._give_headings(self._headings.end()))
 
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's weeks."""
+        return self._dates.remarks()
+
     def _join(self, items: Items) -> list[Record]:
         if self._wanted is not None:
             items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
@@ -150,7 +155,8 @@ class SbfParser(StreamParser):
         week = header.week
         if (header.tow_ms or 0) >= records.WEEK_MS or (week or 0) > GREATEST_WEEK:
             raise wire.BlockError("bad_time_stamp")
-        if week is not None and week < self._floor_week:
+        week = None if week is None else self._dates.week(week, host_time_ns)
+        if week is not None and week < self._dates.floor_week:
             self.counters.errors["date_before_floor"] += 1
             week = None
         return Stamp(wire.name_of(frame), host_time_ns, header.tow_ms, week)
@@ -164,6 +170,9 @@ class SbfParser(StreamParser):
         if tag is None:
             return []
         leap = block.leap_seconds if block.leap_seconds != sbf.I1_UNSET else None
+        if leap is not None and _leap_of_fields(block, stamp) not in (None, leap):
+            self.counters.errors["utc_contradicts_gps"] += 1
+            leap = None
         tag = replace(tag, leap_seconds=leap)
         valid = self._synchronised and tag.week is not None
         return [TimeMessage(stamp.host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=stamp.name)]
@@ -294,6 +303,16 @@ class SbfParser(StreamParser):
 
 def _computed(block: sbf.PvtGeodetic | sbf.PvtCartesian) -> bool:
     return block.error == 0 and block.mode & sbf.MODE_TYPE_BITS != 0
+
+
+def _leap_of_fields(block: sbf.ReceiverTime, stamp: Stamp) -> int | None:
+    """Return GPS − UTC as the calendar fields and the time stamp of a ReceiverTime imply it; None: they do not say."""
+    try:
+        date = dt.date(2000 + block.year, block.month, block.day)
+    except ValueError:
+        return None
+    of_day_ms = ((block.hour * 60 + block.minute) * 60 + block.second) * 1000
+    return None if stamp.tow_ms is None else leap_seconds_of(date, of_day_ms, stamp.tow_ms)
 
 
 def make_time_parser(settings: DeviceSettings) -> SbfParser:

@@ -1,17 +1,19 @@
-"""u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
+"""u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
 
 RXM-RAWX gives its time where no other message of the stream gives one: a log of raw measurements for post-processing.
 Everything else, RTCM3 and NMEA on the same port included, is framed, checked and counted.
 
 Time: NAV-TIMEGPS and NAV-SOL carry GPS week and time of week in one message, NAV-PVT the UTC date; they name the
-previous PPS edge. TIM-TP names the next and is bound to it; its quantisation is the edge's own error, edge = true
-second − qErr (u-blox states no sign; a counter started by a reference and stopped by an F9T's pulse needed + qErr,
-anderswallin.net 2019/10). The epoch is a whole millisecond of iTOW by definition: a time message's tag is rounded to
-it, a fix's is not.
+previous PPS edge, and so does NAV-TIMEUTC. TIM-TP names the next and is bound to it; its quantisation is the edge's own
+error, edge = true second − qErr (u-blox states no sign; a counter started by a reference and stopped by an F9T's pulse
+needed + qErr, anderswallin.net 2019/10). The epoch is a whole millisecond of iTOW by definition: a time message's tag
+is rounded to it, a fix's is not.
 
 An iTOW is joined with a week of the same message or of the same iTOW only, so that a week's roll-over cannot put a
-fix of the new week into the old. NAV-PVT carries no leap seconds: they come from NAV-TIMELS or NAV-TIMEGPS whose valid
-bit is set, and only while they agree with the difference of its own iTOW and UTC.
+fix of the new week into the old. NAV-PVT and NAV-TIMEUTC carry UTC and iTOW: their difference is the leap count that
+the receiver's UTC goes by, right or stale, and the second is iTOW's. Where NAV-TIMELS or NAV-TIMEGPS, valid bit set,
+vouch for another count, UTC is set right by theirs (``utc_contradicts_leap``). A UTC that is no whole number of
+seconds, up to 60, off its iTOW is not valid (``utc_contradicts_itow``).
 
 Fix: the NAV messages of one iTOW make one `GnssFix` (`drivers.gnss.epochs`), complete at NAV-EOE at the latest:
 NAV-PVT, refined by NAV-HPPOSLLH, with the covariances of NAV-COV or else of the accuracies, and NAV-TIMEGPS's week.
@@ -28,7 +30,7 @@ from drivers.core.frame_kinds import GNSS_KINDS
 from drivers.core.framing import Frame, Framer
 from drivers.core.parser import DeviceSettings, Driver, StreamParser
 from drivers.gnss import ubx_messages as ubx
-from drivers.gnss.date_floor import GPS_EPOCH, read_date_floor, week_of
+from drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
 from drivers.gnss.epochs import EpochGatherer
 from drivers.gnss.ubx_fix import NavMessage, merge_epoch
 from drivers.gnss.ubx_startup import startup_messages
@@ -45,6 +47,7 @@ from georef.records import (
 
 MS_NS = 1_000_000
 DAY_NS = 86_400_000_000_000
+DAY_MS = 86_400_000
 WEEK_MS = 604_800_000
 
 
@@ -65,13 +68,13 @@ class UbxParser(StreamParser):
     """Frames to records.
 
     Args:
-        settings: ``date_floor`` is the oldest date (or week) believed.
+        settings: ``date_floor`` is the oldest date (or week) believed, ``add_weeks`` is added to all.
         time_only: time messages only, the same ones.
     """
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
         super().__init__()
-        self._floor = read_date_floor(settings)
+        self._dates = ReceiverDates(settings)
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[tuple[int, NavMessage]] = EpochGatherer(self.counters)
         self._gathers = not time_only
@@ -80,6 +83,7 @@ class UbxParser(StreamParser):
         self._decoders: dict[bytes, Callable[[int, bytes], list[Record]]] = {
             ubx.NAV_PVT.key: self._nav_pvt,
             ubx.NAV_TIMEGPS.key: self._nav_timegps,
+            ubx.NAV_TIMEUTC.key: self._nav_timeutc,
             ubx.NAV_TIMELS.key: self._nav_timels,
             ubx.NAV_SOL.key: self._nav_sol,
             ubx.TIM_TP.key: self._tim_tp,
@@ -101,6 +105,10 @@ class UbxParser(StreamParser):
         """Release the tail and the last epoch."""
         records = self._decode(self._framer.close())
         return records + self._fixes(self._epochs.end())
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's dates."""
+        return self._dates.remarks()
 
     def _decode(self, frames: list[Frame]) -> list[Record]:
         records: list[Record] = []
@@ -125,14 +133,32 @@ class UbxParser(StreamParser):
         records: list[Record] = []
         self._vouched = has_date and has_time and message.valid & ubx.PVT_FULLY_RESOLVED != 0
         if has_time:
-            tag = self._utc_tag(message, has_date)
-            believed = tag.date is not None and self._date_believed(tag.date)
-            valid = self._vouched and believed
-            records.append(TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-PVT"))
+            records += self._utc_message(host_time_ns, message, has_date, self._vouched, "NAV-PVT")
         return records + self._add(host_time_ns, "NAV-PVT", message)
 
-    def _utc_tag(self, message: ubx.NavPvt, has_date: bool) -> TimeTag:
-        """UTC of a NAV-PVT, to the millisecond; with the leap seconds in use where its iTOW bears them out."""
+    def _nav_timeutc(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_TIMEUTC.decode(frame))
+        vouched = message.valid & ubx.TIMEUTC_ALL == ubx.TIMEUTC_ALL
+        has_date = message.valid & ubx.TIMEUTC_UTC != 0
+        return self._utc_message(host_time_ns, message, has_date, vouched, "NAV-TIMEUTC") if has_date else []
+
+    def _utc_message(
+        self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool, vouched: bool, name: str
+    ) -> list[Record]:
+        """The previous edge's second in UTC, if it agrees with the message's own iTOW."""
+        tag = self._utc_tag(host_time_ns, message, has_date)
+        agrees = tag.date is None or tag.leap_seconds is not None
+        if not agrees:
+            self.counters.errors["utc_contradicts_itow"] += 1
+        believed = tag.date is not None and self._date_believed(tag.date)
+        valid = vouched and believed and agrees
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
+
+    def _utc_tag(self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool) -> TimeTag:
+        """Return UTC of a message to the millisecond, with the leap seconds that its own iTOW implies.
+
+        Where the receiver vouches for another count than its UTC goes by, UTC is set right by it: the second is iTOW's.
+        """
         if message.hour > 23 or message.minute > 59 or message.second > 60 or abs(message.nano_ns) > 1_000_000_000:
             raise MessageError("time of day")
         second = message.hour * 3600 + message.minute * 60 + message.second
@@ -143,16 +169,20 @@ class UbxParser(StreamParser):
             date = dt.date(message.year, message.month, message.day)
         except ValueError:
             raise MessageError("date") from None
-        week_ms = ((date - GPS_EPOCH).days % 7) * 86_400_000 + milliseconds
-        ahead_ms = (message.itow_ms - week_ms + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2
-        leap = self._leap_seconds
+        leap, said = leap_seconds_of(date, milliseconds, message.itow_ms), self._leap_seconds
+        date = self._dates.date(date, host_time_ns)
+        if leap is not None and said is not None and said != leap:
+            self.counters.errors["utc_contradicts_leap"] += 1
+            milliseconds, leap = milliseconds + (leap - said) * 1000, said
         if milliseconds < 0 and date > dt.date.min:
-            date, milliseconds = date - dt.timedelta(days=1), milliseconds + 86_400_000
-        agrees = leap is not None and abs(ahead_ms - leap * 1000) <= 1
-        return TimeTag(TimeScale.UTC, milliseconds * MS_NS, date=date, leap_seconds=leap if agrees else None)
+            date, milliseconds = date - dt.timedelta(days=1), milliseconds + DAY_MS
+        elif milliseconds >= DAY_MS + 1000 and date < dt.date.max:
+            date, milliseconds = date + dt.timedelta(days=1), milliseconds - DAY_MS
+        return TimeTag(TimeScale.UTC, milliseconds * MS_NS, date=date, leap_seconds=leap)
 
     def _nav_timegps(self, host_time_ns: int, frame: bytes) -> list[Record]:
         message = _checked(ubx.NAV_TIMEGPS.decode(frame))
+        message = message._replace(week=self._dates.week(message.week, host_time_ns))
         has_leap = message.valid & ubx.TIMEGPS_LEAP != 0
         has_week = message.valid & ubx.TIMEGPS_WEEK != 0
         vouched = has_week and message.valid & ubx.TIMEGPS_TOW != 0
@@ -164,6 +194,7 @@ class UbxParser(StreamParser):
 
     def _nav_sol(self, host_time_ns: int, frame: bytes) -> list[Record]:
         message = _checked(ubx.NAV_SOL.decode(frame))
+        message = message._replace(week=self._dates.week(message.week, host_time_ns))
         has_week = message.flags & ubx.SOL_WEEK != 0
         vouched = has_week and message.flags & ubx.SOL_TOW != 0
         return self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-SOL")
@@ -231,6 +262,7 @@ class UbxParser(StreamParser):
         gps = message.reference & ubx.TP_REFERENCE_MASK == ubx.TP_REFERENCE_GPS
         if not utc and not gps:
             self.counters.errors["tim_tp_time_base"] += 1  # GLONASS, BeiDou, Galileo time: another second or week
+        week = self._dates.week(message.week, host_time_ns)
         time_ns = message.tow_ms * MS_NS + round(message.tow_sub_ms * MS_NS / 2**32)
         known = message.flags & ubx.TP_UTC_AVAILABLE != 0 if utc else gps
         locked = not message.flags & ubx.TP_NOT_LOCKED and self._vouched is not False
@@ -238,10 +270,10 @@ class UbxParser(StreamParser):
         return [
             TimeMessage(
                 host_time_ns,
-                self._week_tag(message.week, time_ns, utc),
+                self._week_tag(week, time_ns, utc),
                 NamesEdge.NEXT,
                 bound=True,
-                valid=known and locked and self._week_believed(message.week),
+                valid=known and locked and self._week_believed(week),
                 quantisation_ns=-message.quantisation_ps / 1000.0 if quantised else 0.0,
                 message="TIM-TP",
             )
@@ -261,6 +293,7 @@ class UbxParser(StreamParser):
                 continue
             if tow_ms >= WEEK_MS:
                 raise MessageError("time of week")
+            week = self._dates.week(week, host_time_ns)
             records.append(
                 EventMark(
                     host_time_ns,
@@ -286,13 +319,13 @@ class UbxParser(StreamParser):
     # --- belief and epochs ---
 
     def _week_believed(self, week: int) -> bool:
-        if week < week_of(self._floor):
+        if week < self._dates.floor_week:
             self.counters.errors["date_before_floor"] += 1
             return False
         return True
 
     def _date_believed(self, date: dt.date) -> bool:
-        if date < self._floor:
+        if date < self._dates.floor:
             self.counters.errors["date_before_floor"] += 1
             return False
         return True
@@ -301,8 +334,8 @@ class UbxParser(StreamParser):
         return self._fixes(self._epochs.add(message.itow_ms, name, (host_time_ns, message))) if self._gathers else []
 
     def _fixes(self, epochs: list[dict[str, tuple[int, NavMessage]]]) -> list[Record]:
-        floor = week_of(self._floor)
-        return [fix for parts in epochs if (fix := merge_epoch(parts, floor)) is not None]
+        floor_week = self._dates.floor_week
+        return [fix for parts in epochs if (fix := merge_epoch(parts, floor_week)) is not None]
 
 
 def _present(message: _AnyT | None) -> _AnyT:

@@ -122,6 +122,24 @@ class NavTimegps(NamedTuple):
 TIMEGPS_TOW, TIMEGPS_WEEK, TIMEGPS_LEAP = 1, 2, 4
 
 
+class NavTimeutc(NamedTuple):
+    """NAV-TIMEUTC, 3.15.31: UTC and time of week in one message."""
+
+    itow_ms: int
+    time_accuracy_ns: int
+    nano_ns: int  # fraction of second, may be negative
+    year: int
+    month: int
+    day: int
+    hour: int
+    minute: int
+    second: int  # 60 in a leap second
+    valid: int  # TIMEUTC_*
+
+
+TIMEUTC_UTC, TIMEUTC_ALL = 4, 7  # UTC; with time of week and week number
+
+
 class NavTimels(NamedTuple):
     """NAV-TIMELS, 3.15.29: leap seconds in use and announced."""
 
@@ -230,6 +248,7 @@ TM2_BASE_RECEIVER, TM2_BASE_UTC = 0, 2
 NAV_PVT = Layout(b"\x01\x07", "IHBBBBBBIiBBBBiiiiIIiiiiiIIHH", NavPvt, 92, min_length=84)
 NAV_HPPOSLLH = Layout(b"\x01\x14", "B2xBIiiiibbbbII", NavHpposllh, 36)
 NAV_TIMEGPS = Layout(b"\x01\x20", "IihbBI", NavTimegps, 16)
+NAV_TIMEUTC = Layout(b"\x01\x21", "IIiHBBBBBB", NavTimeutc, 20)
 NAV_TIMELS = Layout(b"\x01\x26", "IB3xBbBbiHH3xB", NavTimels, 24)
 NAV_COV = Layout(b"\x01\x36", "IBBB9x12f", NavCov, 64)
 NAV_SOL = Layout(b"\x01\x06", "IihBB", NavSol, 52)
@@ -252,6 +271,11 @@ def encode_nav_hpposllh(message: NavHpposllh) -> bytes:
 def encode_nav_timegps(message: NavTimegps) -> bytes:
     """The frame of a NAV-TIMEGPS."""
     return NAV_TIMEGPS.encode(message)
+
+
+def encode_nav_timeutc(message: NavTimeutc) -> bytes:
+    """The frame of a NAV-TIMEUTC."""
+    return NAV_TIMEUTC.encode(message)
 
 
 def encode_nav_timels(message: NavTimels) -> bytes:

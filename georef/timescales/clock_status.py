@@ -47,7 +47,7 @@ class ClockStatus:
         source: who names the seconds ("gnss/rover RMC"), "wall_clock", or empty.
         ambiguous: why the second is not certain; empty where it is.
         leap_seconds, leap_origin: GPS − UTC in use, and who said so (receiver, second_60, configured, table, guess);
-            None: not needed yet.
+            None: not needed yet. leap_doubt: why that is a guess, and the remedy; empty where it is none.
         edges_used: edges in the line. edges_refused, messages_refused: counts by reason.
     """
 
@@ -60,6 +60,7 @@ class ClockStatus:
     ambiguous: str = ""
     leap_seconds: int | None = None
     leap_origin: str = ""
+    leap_doubt: str = ""
     edges_used: int = 0
     edges_refused: dict[str, int] = field(default_factory=dict)
     messages_refused: dict[str, int] = field(default_factory=dict)

@@ -51,7 +51,7 @@ class LabelKeeper:
             self._events.add_once(
                 host_ns,
                 "leap_unknown",
-                "UTC only, and nothing to be believed says the leap seconds",
+                f"UTC only, and GPS − UTC is a guess: {self._leaps.guess_text() or 'nobody says it'}",
             )
             return
         if labeller.label is None:
@@ -106,11 +106,17 @@ class LabelKeeper:
         self._events.add(host_ns, Severity.ERROR, "relabelled", text)
 
     def leap_said(self, trains: list[EdgeTrain], host_ns: int, change: LeapChange) -> None:
-        """A receiver says the leap count that was assumed so far: votes and labels that rest on it move together."""
+        """A receiver says the leap count that was assumed so far: votes and labels that rest on it move together.
+
+        A count that cannot be that of the date moves what its own messages named, and nothing else.
+        """
         seconds = change.now - change.before
+        source = change.source if change.stale else None
         for train in trains:
-            train.labeller.shift(seconds)
+            train.labeller.shift(seconds, source)
             basis = train.labeller.basis
+            if source is not None and (basis.key is None or basis.key.source != source):
+                continue
             if train.labeller.label is not None and basis.leap is not LeapTrust.SAID:
                 self._relabel(train, host_ns, seconds, "for the leap seconds the receiver says")
                 train.labeller.basis = basis.with_leap_said(seconds)

@@ -166,12 +166,12 @@ class Labeller:
             if len(self._late_votes) > VOTES:
                 del self._late_votes[min(self._late_votes, key=self._late_votes.__getitem__)]
 
-    def shift(self, seconds: int) -> None:
-        """Move all votes that rest on a leap count no receiver had said: now one has."""
+    def shift(self, seconds: int, source: str | None = None) -> None:
+        """Move all votes that rest on a leap count no receiver had said: now one has. source: only its own votes."""
         for key, voter in self.voters.items():
-            if key.utc:
+            if key.utc and source in (None, key.source):
                 voter.shift(seconds)
-        if self.voters and all(key.utc for key in self.voters):
+        if self.voters and all(key.utc and source in (None, key.source) for key in self.voters):
             self._late_votes = {offset + seconds: index for offset, index in self._late_votes.items()}
 
     def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:

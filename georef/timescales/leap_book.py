@@ -7,15 +7,29 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from georef.records import TimeScale, TimeTag
-from georef.timescales.gps_time import DAY_NS, gps_ns_from_week, table_leap_seconds, utc_from_gps
+from georef.timescales.gps_time import (
+    DAY_NS,
+    LEAP_TABLE_VALID_UNTIL,
+    gps_ns_from_week,
+    table_leap_seconds,
+    utc_from_gps,
+)
 from georef.timescales.labelling import LeapTrust
+
+GUESS_SIGMA_S = 1.0  # of a count beyond the table, in its first years: leap seconds came every two years on average
+YEARS_A_LEAP_SECOND = 2
+DAYS_A_YEAR = 365.25
 
 
 class LeapSeconds(NamedTuple):
-    """A leap count and where it comes from: receiver, second_60, configured, table or guess."""
+    """A leap count, where it comes from (receiver, second_60, configured, table or guess) and how wrong a guess may be.
+
+    sigma_s: one sigma of a guess; 0 of what is known.
+    """
 
     seconds: int
     origin: str
+    sigma_s: float = 0.0
 
     @property
     def trust(self) -> LeapTrust:
@@ -27,12 +41,28 @@ class LeapSeconds(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeapChange:
-    """A receiver said another count than the one in use (before). said_before: a receiver had said that one, too."""
+    """A receiver said another count than the one in use (before). said_before: a receiver had said that one, too.
+
+    stale: no count of that date, by the table: an old one of its firmware, which holds for its own messages alone.
+    """
 
     source: str
     before: int
     now: int
     said_before: bool
+    stale: bool = False
+
+
+def is_stale(seconds: int, date: dt.date) -> bool:
+    """Return True if a count cannot be right on a UTC date (or the days beside it), as far as the table tells."""
+    count, known = table_leap_seconds(date)
+    if not known:
+        return abs(seconds - count) > 1 + _years_beyond_table(date) // YEARS_A_LEAP_SECOND
+    return seconds not in {table_leap_seconds(date + dt.timedelta(days=days))[0] for days in (-1, 0, 1)}
+
+
+def _years_beyond_table(date: dt.date) -> int:
+    return max(0, int((date - LEAP_TABLE_VALID_UNTIL).days / DAYS_A_YEAR))
 
 
 class LeapBook:
@@ -54,14 +84,34 @@ class LeapBook:
         return self._without_insertion(source, date)
 
     def _without_insertion(self, source: str, date: dt.date) -> LeapSeconds:
-        said = self._said.get(source, next(iter(self._said.values()), None))
+        said = self._said.get(source)
+        if said is None:
+            said = next((count for count in self._said.values() if not is_stale(count, date)), None)
         if said is not None:
             return LeapSeconds(said, "receiver")
         seconds, known = table_leap_seconds(date)
-        if self.assumed is not None:
-            plausible = self.assumed == seconds if known else self.assumed >= seconds
-            return LeapSeconds(self.assumed, "configured" if plausible else "guess")
-        return LeapSeconds(seconds, "table" if known else "guess")
+        beyond_s = 0.0 if known else GUESS_SIGMA_S + _years_beyond_table(date) // YEARS_A_LEAP_SECOND
+        if self.assumed is None:
+            return LeapSeconds(seconds, "table" if known else "guess", beyond_s)
+        if self.assumed == seconds if known else self.assumed >= seconds:
+            return LeapSeconds(self.assumed, "configured")
+        return LeapSeconds(self.assumed, "guess", max(beyond_s, float(abs(self.assumed - seconds))))
+
+    def guess_text(self) -> str:
+        """Return why the count in use is no more than a guess, and the remedy; empty: it is none."""
+        if self._date is None:
+            return ""
+        leap = self.on("", self._date)
+        if leap.origin != "guess":
+            return ""
+        seconds, known = table_leap_seconds(self._date)
+        if known:
+            return (
+                f"leap_seconds = {leap.seconds} is configured, and GPS − UTC was {seconds} s on {self._date}: "
+                "leave gnss.….leap_seconds out"
+            )
+        remedy = f"set gnss.….leap_seconds (IERS Bulletin C), or let the receiver say it; {leap.seconds} s is a guess"
+        return f"the built-in leap seconds end at {LEAP_TABLE_VALID_UNTIL}, and this is {self._date}: {remedy}"
 
     def hear(self, source: str, tag: TimeTag) -> LeapChange | None:
         """Note what a tag says about leap seconds; the change, where it differs from what was in use."""
@@ -80,7 +130,8 @@ class LeapBook:
             return None
         if before.seconds == said:
             return None
-        return LeapChange(source, before.seconds, said, said_before)
+        stale = self._date is not None and is_stale(said, self._date)
+        return LeapChange(source, before.seconds, said, said_before, stale)
 
     def _note_date(self, tag: TimeTag) -> None:
         """A leap count is often said without a date (NAV-TIMELS), also in a recording of years ago."""

@@ -28,7 +28,7 @@ from georef.timescales.gps_time import (
 from georef.timescales.history import gps_of_trains
 from georef.timescales.label_keeper import LabelKeeper, outranks
 from georef.timescales.labelling import LeapTrust, Said, Verdict, Vote, VoterKey
-from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds
+from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds, is_stale
 
 WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
 HOLDOVER_AFTER_NS = 5_500_000_000
@@ -239,7 +239,7 @@ class PpsClock:
         leap = self.leaps.on(source, date)
         if tag.leap_seconds is not None:
             leap = LeapSeconds(tag.leap_seconds, "receiver")
-        self._leap = leap
+        self._leap = self.leaps.on("", date) if is_stale(leap.seconds, date) and leap.origin == "receiver" else leap
         gps = whole_gps_ns(tag, leap.seconds)
         if gps is None and near is not None:
             gps = nearest_gps_ns(tag, near, leap.seconds)
@@ -283,16 +283,23 @@ class PpsClock:
     def _leap_changed(self, host_ns: int, change: LeapChange) -> None:
         """A receiver says another leap count: what rested on the assumed one moves, in one logged step."""
         text = f"{change.source} says GPS − UTC is {change.now} s, in use was {change.before} s"
+        if change.stale:
+            text += "; no count of this date: it holds for this receiver's own messages alone"
         self._events.add(host_ns, Severity.WARNING, "leap_seconds_changed", text)
         if change.said_before:
             return
         seconds = change.now - change.before
         said = LeapTrust.SAID
-        self._messages = deque(
-            (m if m.leap is said else Said(m.host_ns, m.key, m.second + seconds, said) for m in self._messages),
-            maxlen=RECENT_MESSAGES,
-        )
-        if not self._coarse_is_gps():
+        source = change.source if change.stale else None
+
+        def moved(message: Said) -> Said:
+            if message.leap is said or source not in (None, message.key.source):
+                return message
+            return Said(message.host_ns, message.key, message.second + seconds, said)
+
+        of_others = source is not None and any(message.key.source != source for message in self._messages)
+        self._messages = deque(map(moved, self._messages), maxlen=RECENT_MESSAGES)
+        if not self._coarse_is_gps() and not of_others:
             self._coarse.shift(seconds)
         trains = [train for train in (*self._former, self._train, self._candidate) if train is not None]
         self._labels.leap_said(trains, host_ns, change)
@@ -323,6 +330,7 @@ class PpsClock:
             ambiguous=train.labeller.conflict if train is not None else "",
             leap_seconds=self._leap.seconds if self._leap is not None else None,
             leap_origin=self._leap.origin if self._leap is not None else "",
+            leap_doubt=self.leaps.guess_text() if self._leap is not None and self._leap.origin == "guess" else "",
             edges_used=self._edges_used,
             edges_refused=dict(self.edges_refused),
             messages_refused=dict(self.messages_refused),
@@ -344,6 +352,8 @@ class PpsClock:
     def _coarse_state(self, host_ns: int) -> tuple[TimeState, int | None, float]:
         ambiguous = self._train is not None and self._train.doubtful
         sigma = AMBIGUOUS_SIGMA_NS if ambiguous else COARSE_SIGMA_NS
+        if self._leap is not None and not self._coarse_is_gps():
+            sigma = max(sigma, self._leap.sigma_s * SECOND_NS)
         wall = self._wall.utc_offset_ns(host_ns)
         last = self._coarse.last_host_ns
         offset = self._coarse.offset_ns() if self._coarse.settled() else None
@@ -352,7 +362,8 @@ class PpsClock:
         if wall is not None and not self._coarse.runs_at_another_rate():
             leap = self.leaps.on("", utc_from_gps(gps_ns_from_unix(host_ns + wall, 0), 0)[0])
             self._leap = self._leap or leap
-            return TimeState.COARSE, gps_ns_from_unix(wall, leap.seconds), max(self._wall.sigma_ns, sigma)
+            sigma = max(sigma, self._wall.sigma_ns, leap.sigma_s * SECOND_NS)
+            return TimeState.COARSE, gps_ns_from_unix(wall, leap.seconds), sigma
         if last is None or offset is None:
             return TimeState.NO_TIME, None, math.inf
         return TimeState.LOST, offset, sigma + 1e-4 * (host_ns - last)

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pyubx2 import ERR_IGNORE, UBX_PROTOCOL, UBXReader
+from pyubx2 import ERR_IGNORE, GET, UBX_PROTOCOL, UBXMessage, UBXReader
 
 from drivers.core.parser import DeviceSettings
 from drivers.gnss import ubx_messages as ubx
 from drivers.gnss.ubx import DRIVERS, UbxParser
 from georef.records import Chunk, EventMark, FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
+from georef.timescales import gps_ns_from_week, whole_gps_ns
 from tests.drivers.harness import (
     canonical,
     check_bytewise,
@@ -320,7 +321,7 @@ def test_time_of_nav_pvt_is_utc_to_the_millisecond() -> None:
     (message,) = times(parse(pvt(NOON_MS, nano_ns=-277_753))[0])
     assert (message.time.scale, message.time.date, message.valid) == (TimeScale.UTC, dt.date(2026, 11, 21), True)
     assert message.time.time_ns == (12 * 3600 - 18) * 1_000_000_000
-    assert (message.names_edge, message.bound, message.time.leap_seconds) == (NamesEdge.PREVIOUS, False, None)
+    assert (message.names_edge, message.bound, message.time.leap_seconds) == (NamesEdge.PREVIOUS, False, 18)
     (message,) = times(parse(pvt(NOON_MS + 100))[0])
     assert message.time.time_ns % 1_000_000_000 == 100 * MS  # off the second: does not vote
 
@@ -331,12 +332,12 @@ def test_time_of_nav_pvt_needs_all_validity_bits(missing: int) -> None:
     assert not any(message.valid for message in messages)
 
 
-def test_leap_seconds_come_from_valid_messages_only() -> None:
+def test_leap_seconds_come_from_valid_messages_only_and_of_nav_pvt_from_its_own_itow() -> None:
     unknown = timegps(NOON_MS, valid=ubx.TIMEGPS_TOW | ubx.TIMEGPS_WEEK)
     timels = ubx.NavTimels(NOON_MS, 0, 2, 18, 0, 0, 0, 0, 0, ubx.TIMELS_CURRENT)
     invalid = timels._replace(valid=0)
     records, _ = parse(unknown, ubx.encode_nav_timels(invalid), pvt(NOON_MS))
-    assert [message.time.leap_seconds for message in times(records)] == [None, None]
+    assert [message.time.leap_seconds for message in times(records)] == [None, 18]
     records, _ = parse(ubx.encode_nav_timels(timels), pvt(NOON_MS))
     assert [(message.message, message.time.leap_seconds) for message in times(records)] == [
         ("NAV-TIMELS", 18),
@@ -351,12 +352,68 @@ def test_a_count_of_leap_seconds_that_holds_vouches_for_no_time() -> None:
     assert [message.valid for message in times(records)] == [True, False, False, True, True]
 
 
-def test_leap_seconds_that_itow_and_utc_do_not_bear_out_are_not_passed_on() -> None:
-    """The first NAV-PVT after an insertion comes before the first message with the new count."""
+def test_the_second_is_itows_whatever_leap_count_utc_goes_by() -> None:
+    """The first NAV-PVT after an insertion comes before the first message with the new count; the second is right."""
     late = pvt(NOON_MS + 1000, itow_ms=NOON_MS + 2000)  # UTC one second behind what 18 s would give
     records, _ = parse(timegps(NOON_MS), pvt(NOON_MS), late, timegps(NOON_MS + 2000, leap=19), late)
-    said = [message.time.leap_seconds for message in times(records) if message.message == "NAV-PVT"]
-    assert said == [18, None, 19]
+    said = [message.time for message in times(records) if message.message == "NAV-PVT"]
+    assert [tag.leap_seconds for tag in said] == [18, 18, 19]
+    itows = (NOON_MS, NOON_MS + 2000, NOON_MS + 2000)
+    assert [whole_gps_ns(tag, None) for tag in said] == [gps_ns_from_week(WEEK, at * MS) for at in itows]
+
+
+@pytest.mark.parametrize("leap", [13, 16, 17, 38, -2])
+@pytest.mark.parametrize("name", ["NAV-PVT", "NAV-TIMEUTC"])
+def test_utc_by_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str, leap: int) -> None:
+    """A receiver whose firmware counts `leap` leap seconds where there are 18, fully resolved all the same."""
+    utc = dt.datetime(2026, 11, 21, 12, tzinfo=dt.UTC) - dt.timedelta(seconds=leap)
+    calendar = (utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second)
+    frame = (
+        pvt(
+            NOON_MS, **dict(zip(("year", "month", "day", "hour", "minute", "second"), calendar, strict=True)), nano_ns=0
+        )
+        if name == "NAV-PVT"
+        else ubx.encode_nav_timeutc(ubx.NavTimeutc(NOON_MS, 20, 0, *calendar, ubx.TIMEUTC_ALL))
+    )
+    (message,) = times(parse(frame)[0])
+    assert (message.message, message.valid, message.time.leap_seconds) == (name, True, leap)
+    assert whole_gps_ns(message.time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
+    messages = times(parse(timegps(NOON_MS), frame)[0])  # a count that the receiver vouches for sets UTC right
+    assert [item.time.leap_seconds for item in messages] == [18, 18]
+    assert whole_gps_ns(messages[1].time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
+
+
+def test_utc_that_is_minutes_off_its_itow_is_not_valid() -> None:
+    records, parser = parse(pvt(NOON_MS, itow_ms=NOON_MS - 300_000), pvt(NOON_MS, itow_ms=NOON_MS + 300))
+    assert [message.valid for message in times(records)] == [False, False]
+    assert parser.counters.errors["utc_contradicts_itow"] == 2
+
+
+def test_nav_timeutc_is_read_as_pyubx2_writes_it() -> None:
+    fields = {"iTOW": NOON_MS, "nano": -277_753, "year": 2026, "month": 11, "day": 21, "hour": 11, "min": 59, "sec": 42}
+    frame = UBXMessage("NAV", "NAV-TIMEUTC", GET, **fields, validTOW=1, validWKN=1, validUTC=1).serialize()
+    (message,) = times(parse(frame)[0])
+    assert (message.message, message.valid, message.time.leap_seconds) == ("NAV-TIMEUTC", True, 18)
+    assert whole_gps_ns(message.time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
+
+
+@pytest.mark.parametrize(("said", "host"), [(1024, "set"), (0, "2026-11-21"), (0, "2026-11-22"), (0, "1970-01-01")])
+def test_weeks_one_roll_over_behind_are_moved_on_request_or_by_the_hosts_day(said: int, host: str) -> None:
+    parser = UbxParser(DeviceSettings("gnss/rover", {"add_weeks": said}))
+    day = 0 if host == "set" else (dt.date.fromisoformat(host) - dt.date(1970, 1, 1)).days
+    frames = timegps(NOON_MS, week=WEEK - 1024) + pvt(NOON_MS, year=2007, month=4, day=7)
+    (gps, utc) = times(parser.feed(Chunk("gnss/rover", day * 86_400_000 * MS + 1, frames)))
+    (line,) = parser.remarks()
+    if host == "1970-01-01":
+        assert not gps.valid
+        assert not utc.valid
+        assert "2007-04-01, before 2009-01-01" in line
+        assert "1024 weeks behind, which makes 2026-11-15" in line
+        assert "want gnss.rover.add_weeks = 1024" in line
+        return
+    assert [whole_gps_ns(item.time, None) for item in (gps, utc)] == [gps_ns_from_week(WEEK, NOON_MS * MS)] * 2
+    assert (gps.valid, utc.valid) == (True, True)
+    assert "1 roll-over of 1024 weeks behind: taken as 2026-11-15" in line
 
 
 def test_second_60_is_a_second() -> None:

@@ -94,3 +94,67 @@ def test_a_leap_count_said_without_a_date_is_compared_with_that_of_the_recording
             assert status.offset_ns is not None
             assert abs(HOST_0 + status.offset_ns - start_ns) < 1_000_000
     assert [event.code for event in clock.drain_events()] == ["second_known"]
+
+
+def labelled(
+    clock: PpsClock, date: dt.date, errors: dict[str, int], leap: int, said: dict[str, int]
+) -> tuple[int, int]:
+    """Feed 60 s of RMC by source (UTC off by `errors` s; `said` leap counts); return error and sigma at the end, ns."""
+    start_ns = gps_ns_from_utc(date, 12 * HOUR_NS, leap)
+    for second in range(60):
+        edge_ns = HOST_0 + second * SECOND_NS
+        clock.add_edge(edge_ns)
+        for number, (source, error_s) in enumerate(errors.items()):
+            of_day_ns = 12 * HOUR_NS + (second + error_s) * SECOND_NS
+            tag = TimeTag(TimeScale.UTC, of_day_ns, date=date, leap_seconds=said.get(source))
+            arrival_ns = edge_ns + 150_000_000 + number * 10_000_000
+            clock.add_message(source, TimeMessage(arrival_ns, tag, NamesEdge.PREVIOUS, message="RMC"))
+    status = clock.status(HOST_0 + 59 * SECOND_NS + SECOND_NS // 2)
+    assert status.offset_ns is not None
+    return HOST_0 + status.offset_ns - start_ns, round(status.sigma_ns)
+
+
+@pytest.mark.parametrize("stale", [13, 16, 17])
+def test_a_stale_count_holds_for_its_own_messages_and_moves_nobody_elses(stale: int) -> None:
+    """One receiver's UTC goes by a count of years ago, which it says; the other says none and is right."""
+    clock = PpsClock()
+    errors = {"gnss/base": 0, "gnss/rover": 18 - stale}
+    error_ns, sigma_ns = labelled(clock, dt.date(2026, 3, 10), errors, 18, {"gnss/rover": stale})
+    assert clock.status(HOST_0 + 60 * SECOND_NS).state is TimeState.LOCKED
+    assert abs(error_ns) < 1_000_000
+    assert sigma_ns < 1_000_000
+    assert clock.leap_seconds_at(gps_ns_from_utc(dt.date(2026, 3, 10), 0, 18)) == 18
+    assert clock.status(HOST_0 + 60 * SECOND_NS).leap_seconds == 18
+    (event,) = [event for event in clock.drain_events() if event.code == "leap_seconds_changed"]
+    assert "holds for this receiver's own messages alone" in event.text
+
+
+@pytest.mark.parametrize(("year", "leap"), [(2010, 15), (2014, 16), (2016, 17), (2018, 18)])
+def test_without_a_configured_count_the_table_of_the_date_is_taken(year: int, leap: int) -> None:
+    clock = PpsClock()
+    error_ns, _ = labelled(clock, dt.date(year, 5, 1), {"gnss/rover": 0}, leap, {})
+    status = clock.status(HOST_0 + 60 * SECOND_NS)
+    assert (status.state, status.leap_origin, status.leap_doubt) == (TimeState.LOCKED, "table", "")
+    assert abs(error_ns) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("assumed", "date", "truth", "doubt"),
+    [
+        (18, dt.date(2014, 5, 1), 16, "leap_seconds = 18 is configured, and GPS − UTC was 16 s on 2014-05-01"),
+        (None, dt.date(2027, 5, 1), 19, "the built-in leap seconds end at 2026-06-28, and this is 2027-05-01"),
+        (None, dt.date(2033, 5, 1), 20, "the built-in leap seconds end at 2026-06-28, and this is 2033-05-01"),
+    ],
+)
+def test_a_guessed_count_is_never_locked_and_its_sigma_holds_the_error(
+    assumed: int | None, date: dt.date, truth: int, doubt: str
+) -> None:
+    clock = PpsClock(assumed)
+    error_ns, sigma_ns = labelled(clock, date, {"gnss/rover": 0}, truth, {})
+    status = clock.status(HOST_0 + 60 * SECOND_NS)
+    assert (status.state, status.leap_origin) == (TimeState.COARSE, "guess")
+    assert abs(error_ns) <= 1.3 * sigma_ns
+    assert sigma_ns >= 1e9
+    assert status.leap_doubt.startswith(doubt)
+    (event,) = [event for event in clock.drain_events() if event.code == "leap_unknown"]
+    assert doubt in event.text
