@@ -152,6 +152,15 @@ class HostClocks:
         """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
 
+    def settle(self) -> list[str]:
+        """Take the seconds that most messages of the whole log name, after all has been fed; lines for the user."""
+        return [line for clock in dict.fromkeys(self.by_source.values()) for line in clock.settle()]
+
+    def tag_error_ns(self, source: str, host_ns: Int64Array, *, utc: bool) -> Int64Array:
+        """Return by how much (n,) a receiver's tags of one scale were ahead that arrived at host times (n,)."""
+        error_s = self.by_source[source].tag_error_s(source, self.timeline.raw_from_host(host_ns), utc=utc)
+        return error_s * 1_000_000_000
+
     def status(self, source: str, host_ns: int) -> ClockStatus:
         """Of the clock that a source shows, at a host time."""
         return self.by_source[source].status(self.timeline.raw_at(host_ns))

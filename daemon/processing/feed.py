@@ -362,6 +362,7 @@ class _ClockReader:
             self.take_records(name, parser.close())
             self.remarks += parser.remarks()
         self.host.update()
+        self.remarks += self.host.settle()
 
     def angles(self) -> dict[str, AngleSeries]:
         """Of gimbals, from the sources that told some."""

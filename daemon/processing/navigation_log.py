@@ -112,6 +112,7 @@ class _Reader:
             if isinstance(parser, PacketParser):
                 found.doubts += [f"{name}: {doubt}" for doubt in parser.doubts]
         found.host.update()
+        found.remarks += found.host.settle()
         if self._imu:
             found.imu = np.concatenate(self._imu)
         if self._ins:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from georef.earth import e_from_geodetic
 from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from georef.records import FixType, GnssFix, GnssHeading, Int64Array, StructArray, TimeTag
+from georef.records import FixType, GnssFix, GnssHeading, Int64Array, StructArray, TimeScale, TimeTag
 from georef.stream_clocks import HostClocks
 from georef.timescales import complete_time
 
@@ -75,13 +75,17 @@ def gps_times(
         return [None] * len(tags)
     clock = host.by_source[source]
     near, sigma = host.gps_from_host(source, np.array(host_ns, np.int64))
+    arrived = np.array(host_ns, np.int64)
+    ahead = {scale: host.tag_error_ns(source, arrived, utc=scale is TimeScale.UTC).tolist() for scale in TimeScale}
     placed: list[int | None] = []
-    for tag, near_ns, known in zip(tags, near.tolist(), np.isfinite(sigma).tolist(), strict=True):
+    for at, (tag, near_ns, known) in enumerate(zip(tags, near.tolist(), np.isfinite(sigma).tolist(), strict=True)):
         if tag is None:
             placed.append(None)
             continue
         leap = clock.leap_seconds_at(near_ns) if known else None
-        placed.append(complete_time(tag, near_ns if known else None, leap))
+        error_ns = ahead[tag.scale][at]
+        told = complete_time(tag, near_ns + error_ns if known else None, leap)
+        placed.append(None if told is None else told - error_ns)
     return placed
 
 

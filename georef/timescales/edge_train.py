@@ -82,7 +82,7 @@ class EdgeTrain:
     def __init__(self, chain: Sequence[tuple[int, int]], edges: Sequence[int], *, keep_history: bool) -> None:
         """chain: (index, host ns) of its first edges, as `find_chain` gives them; edges: all seen of late."""
         self.anchor_ns = chain[0][1]
-        self.labeller = Labeller()
+        self.labeller = Labeller(keep_votes=keep_history)
         self.refused_in_a_row = 0
         self.used = 0
         self.last_host_ns = chain[0][1]
@@ -148,6 +148,11 @@ class EdgeTrain:
         """Mark every knot as doubtful, from the first on."""
         self.doubtful = True
         self._doubt = array("b", bytes([True]) * len(self._doubt))
+
+    def believe(self) -> None:
+        """Take every doubt off: the seconds of all knots are known."""
+        self.doubtful = False
+        self._doubt = array("b", bytes(len(self._doubt)))
 
     def _remember(self) -> None:
         knot = self.bank.knot

@@ -70,10 +70,30 @@ class LabelKeeper:
             self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, f"by {verdict.text}")
             labeller.basis = verdict
             self._clear_conflict(train, host_ns)
+        elif not verdict.ambiguous and (counted := self._given_up_by_its_source(train, verdict)):
+            self._relabel(train, host_ns, (verdict.offset or 0) - labeller.label, counted)
+            labeller.basis = verdict
+            self._clear_conflict(train, host_ns)
         else:
             difference = 0 if verdict.offset is None else verdict.offset - labeller.label
             text = verdict.ambiguous or f"{verdict.text} is {difference:+d} s against the second held"
             self.set_conflict(train, host_ns, text)
+
+    @staticmethod
+    def _given_up_by_its_source(train: EdgeTrain, verdict: Verdict) -> str:
+        """Return by how many messages the source of the label has named another second for longer; empty: it has not.
+
+        All who are sure agree on the other second, or the verdict would be ambiguous.
+        """
+        labeller, basis = train.labeller, train.labeller.basis
+        if basis.key is None or verdict.offset is None or BASIS_RANK[verdict.basis] < BASIS_RANK[basis.basis]:
+            return ""
+        source, bound = basis.key.source, basis.basis == "bound"
+        supported = labeller.named_by(source, labeller.label or 0, bound=bound)
+        contradicted = labeller.named_by(source, verdict.offset, bound=bound)
+        if contradicted <= supported:
+            return ""
+        return f"{contradicted} messages of {source} name it, {supported} named the one before"
 
     def _confirm(self, train: EdgeTrain, host_ns: int, verdict: Verdict) -> None:
         self._clear_conflict(train, host_ns)

@@ -6,7 +6,7 @@ make it name the next edge, so the age of the messages is watched, and voters ar
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
@@ -57,6 +57,14 @@ class Vote(NamedTuple):
     offset: int
     age_s: float
     leap: LeapTrust
+
+
+class PastVote(NamedTuple):
+    """A vote of the log: when its message came, and who gave it."""
+
+    host_ns: int
+    key: VoterKey
+    vote: Vote
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,19 +155,27 @@ def _surely_aged(ages: list[float]) -> bool:
 class Labeller:
     """The voters of one edge train and the label they gave it."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, keep_votes: bool = False) -> None:
+        """keep_votes: all votes are remembered, for `georef.timescales.settling`."""
         self.voters: dict[VoterKey, Voter] = {}
+        self.history: list[PastVote] = []
+        self._keep_votes = keep_votes
+        self._counts: dict[VoterKey, Counter[tuple[int, bool]]] = {}  # votes by offset and whether a leap count is said
         self.label: int | None = None  # GPS second of edge 0
         self.verdict = Verdict()
         self.basis = Verdict()  # the verdict that gave the label
         self.conflict = ""
         self._late_votes: dict[int, int] = {}  # offset: the last edge a message named just before the next one
 
-    def vote(self, key: VoterKey, index: int, vote: Vote) -> None:
-        """Take one vote for edge `index`."""
+    def vote(self, key: VoterKey, index: int, vote: Vote, host_ns: int) -> None:
+        """Take one vote for edge `index` of a message that came at a host time."""
         voter = self.voters.get(key)
         if voter is None:
             voter = self.voters[key] = Voter(key)
+        if index != voter.last_index:
+            self._counts.setdefault(key, Counter())[vote.offset, vote.leap is LeapTrust.SAID] += 1
+            if self._keep_votes:
+                self.history.append(PastVote(host_ns, key, vote))
         voter.add(index, vote)
         if vote.age_s > LATE_AGE_S and not key.bound:
             self._late_votes[vote.offset] = index
@@ -168,11 +184,25 @@ class Labeller:
 
     def shift(self, seconds: int, source: str | None = None) -> None:
         """Move all votes that rest on a leap count no receiver had said: now one has. source: only its own votes."""
-        for key, voter in self.voters.items():
-            if key.utc and source in (None, key.source):
-                voter.shift(seconds)
-        if self.voters and all(key.utc and source in (None, key.source) for key in self.voters):
+        moves = {key for key in self.voters if key.utc and source in (None, key.source)}
+        for key in moves:
+            self.voters[key].shift(seconds)
+            counts = self._counts[key]
+            self._counts[key] = Counter()
+            for (offset, said), count in counts.items():
+                self._counts[key][offset if said else offset + seconds, True] += count
+        self.history = [_moved(past, seconds) if past.key in moves else past for past in self.history]
+        if self.voters and len(moves) == len(self.voters):
             self._late_votes = {offset + seconds: index for offset, index in self._late_votes.items()}
+
+    def named_by(self, source: str, offset: int, *, bound: bool) -> int:
+        """Return how many votes of a source, since these edges began, were for an offset; bound: of bound messages."""
+        return sum(
+            counts[offset, said]
+            for key, counts in self._counts.items()
+            if key.source == source and key.bound >= bound
+            for said in (False, True)
+        )
 
     def decide(self, index: int, wall_offset: int | None, wall_leap: LeapTrust) -> Verdict:
         """The verdict as of edge `index`; wall_offset: what a disciplined wall clock says."""
@@ -234,6 +264,13 @@ class Labeller:
         if not bound and all(v.late for v in sure):
             return f"{_name(first)} comes steadily more than {LATE_AGE_S} s after its edge"
         return ""
+
+
+def _moved(past: PastVote, seconds: int) -> PastVote:
+    vote = past.vote
+    if vote.leap is LeapTrust.SAID:
+        return past
+    return past._replace(vote=Vote(vote.offset + seconds, vote.age_s, LeapTrust.SAID))
 
 
 def _leap_error_s(voters: list[Voter], wall_offset: int | None) -> int:

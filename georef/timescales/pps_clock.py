@@ -29,6 +29,7 @@ from georef.timescales.history import gps_of_trains
 from georef.timescales.label_keeper import LabelKeeper, outranks
 from georef.timescales.labelling import LeapTrust, Said, Verdict, Vote, VoterKey
 from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds, is_stale
+from georef.timescales.settling import Settlement, settle
 
 WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
 HOLDOVER_AFTER_NS = 5_500_000_000
@@ -78,6 +79,7 @@ class PpsClock:
         self._quantisation: tuple[int, int, float] | None = None  # host ns, second, ns
         self._events = EventLog()
         self._labels = LabelKeeper(self.leaps, self._wall, self._events)
+        self._settlement = Settlement()
         self._edges_used = 0
         self.edges_refused: dict[str, int] = {}
         self.messages_refused: dict[str, int] = {}
@@ -277,7 +279,7 @@ class PpsClock:
         if index < 0:
             return False
         named = index + 1 if said.key.names_next else index
-        train.labeller.vote(said.key, index, Vote(said.second - named, place - index, said.leap))
+        train.labeller.vote(said.key, index, Vote(said.second - named, place - index, said.leap), said.host_ns)
         return True
 
     def _leap_changed(self, host_ns: int, change: LeapChange) -> None:
@@ -306,6 +308,21 @@ class PpsClock:
 
     def _coarse_is_gps(self) -> bool:
         return any(not said.key.utc for said in self._messages)
+
+    def settle(self) -> list[str]:
+        """Take the second that most messages of the whole log name; lines for the user where others were named.
+
+        For clocks with ``keep_history``, after everything has been fed.
+        """
+        self._settlement = settle(self._trains())
+        if self._settlement.conflict and self._train is not None:
+            self._train.labeller.conflict = self._settlement.conflict
+        return self._settlement.lines
+
+    def tag_error_s(self, source: str, host_ns: Int64Array, *, utc: bool) -> Int64Array:
+        """By how many seconds (n,) tags of a source that arrived at host times (n,) are ahead, as `settle` found."""
+        errors = self._settlement.errors.get((source, utc))
+        return np.zeros(len(host_ns), np.int64) if errors is None else errors.at(host_ns)
 
     # ---- wall clock
 

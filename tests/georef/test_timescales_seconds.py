@@ -336,13 +336,18 @@ def test_a_disciplined_wall_clock_unmasks_a_default_leap_count(seconds_ahead: in
     assert f"{seconds_ahead:+d} s against the disciplined wall clock: its leap seconds?" in outcome.events[0][2]
 
 
-def test_a_default_leap_count_nobody_contradicts_is_believed_until_it_changes() -> None:
-    """What no software can see (docs/time.md); once it changes, never LOCKED again on seconds that may be wrong."""
+def test_a_default_leap_count_nobody_contradicts_is_believed_until_it_has_changed_for_longer() -> None:
+    """What no software can see (docs/time.md); once it changes, COARSE until the new one has lasted longer, aloud."""
     outcome = default_leap_count(2, None)
     assert outcome.counts(30, 700) == {LOCKED: 670}
-    assert outcome.counts(730) == {COARSE: len(outcome.states) - 730}
-    assert outcome.codes == ["second_known", "second_ambiguous"]
+    assert outcome.codes == ["second_known", "second_ambiguous", "relabelled", "second_confirmed"]
     assert "-2 s against the second held" in outcome.events[1][2]
+    moved_s = outcome.events[2][0]
+    assert 1350 < moved_s < 1450
+    assert outcome.counts(730, moved_s) == {COARSE: moved_s - 730}
+    assert outcome.counts(moved_s + 2) == {LOCKED: len(outcome.states) - moved_s - 2}
+    late = np.array(outcome.seconds) > moved_s
+    assert np.abs(np.array(outcome.errors_ns)[late]).max() < 1e5
 
 
 def test_a_wall_clock_of_another_hour_shakes_nothing() -> None:
