@@ -29,7 +29,7 @@ from drivers.session import Session
 from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from drivers.transports.can_link import interface_bitrate
 from drivers.transports.uri import TransportSpec, open_transport, parse_pps
-from georef.records import ChunkBatch
+from georef.records import ChunkBatch, TimeMessage
 
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
@@ -132,6 +132,7 @@ class Reading:
         if self.report.bytes:
             self.report.time = describe_time(self.entry, self.heard)
             self.report.problems += _answer_problems(self)
+            self.report.notes += lock_notes(self.entry, self.heard)
 
 
 class Wire:
@@ -316,6 +317,21 @@ def _answer_problems(reading: Reading) -> list[str]:
     if bad > DAMAGED_SHARE * good:
         found.append(f"{bad} of {bad + good} messages damaged")
     return found + _time_problems(entry, heard)
+
+
+def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
+    """Say where nothing tells whether a scanner is locked to its PPS, and so whether its stamps can be used."""
+    if entry.kind != "scanner" or heard.sees_pps is not None or not heard.counts["DeviceClockSamples"]:
+        return []
+    clock = entry.settings.config.get("clock", "auto")
+    if clock != "auto":
+        return [f'nothing tells whether it is locked; its stamps are taken as configured (clock = "{clock}")']
+    taken = "its stamps will be used only if they are found to be UTC or TAI by their arrival, or clock says so"
+    if TimeMessage not in find_driver(entry.kind, entry.protocol).yields:
+        return [f"nothing tells whether its clock is set by PTP or a pulse; {taken}"]
+    port = "none came at auxiliary" if entry.auxiliary is not None else "want auxiliary"
+    ports = "Velodyne port 8308, Hesai 10110"
+    return [f"no position packet ({ports}) tells whether it is locked to its PPS: {port}; without, {taken}"]
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:

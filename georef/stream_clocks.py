@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from georef.compiled import kept
 from georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
-from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline, PpsClock
+from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline, PpsClock, Stamps, StampScale
 
 CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
 MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
@@ -62,10 +62,14 @@ class GnssPlan:
 
 @dataclass(frozen=True, slots=True)
 class DevicePlan:
-    """A device with a clock of its own: the source that shows the host's time (``pps/main``), how its stamps count."""
+    """A device with a clock of its own: the source that shows the host's time (``pps/main``), how its stamps count.
+
+    stamps: what they are configured to count from; AUTO: found where the device does not say; None: not looked for.
+    """
 
     clock: str
     past_utc_hour: bool = False
+    stamps: StampScale | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +152,11 @@ class HostClocks:
             for clock in self._told:
                 clock.set_wall_clock(raw_ns, realtime_ns, disciplined=math.isfinite(max_error_s), sigma_s=max_error_s)
 
+    def add_coarse(self, source: str, host_ns: Int64Array, gps_ns: Int64Array) -> None:
+        """Tell the clock of a source that nothing else sets what GPS time it was at host times (n,), to some 0.1 s."""
+        for raw_ns, at_ns in zip(self.timeline.raw_from_host(host_ns).tolist(), gps_ns.tolist(), strict=True):
+            self.by_source[source].add_coarse(raw_ns, at_ns)
+
     def gps_from_host(self, source: str, host_ns: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
         """GPS ns (n,) and sigma ns (n,; inf without time) of host times (n,), by the clock that a source shows."""
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
@@ -171,13 +180,23 @@ class HostClocks:
 
 
 class StreamClocks:
-    """The host's clocks and the devices' own; with ``frozen`` the host's are complete and take nothing more."""
+    """The host's clocks and the devices' own; with ``frozen`` the host's are complete and take nothing more.
 
-    def __init__(self, host: HostClocks, *, frozen: bool = False) -> None:
+    stamps: what devices' stamps count from, where that was found beforehand.
+    """
+
+    def __init__(self, host: HostClocks, *, frozen: bool = False, stamps: Mapping[str, Stamps] | None = None) -> None:
         self.host = host
         self.frozen = frozen
+        known = stamps or {}
         self._devices = {
-            source: DeviceClock(host.by_source[device.clock], past_utc_hour=device.past_utc_hour, keep_history=frozen)
+            source: DeviceClock(
+                host.by_source[device.clock],
+                past_utc_hour=device.past_utc_hour,
+                keep_history=frozen,
+                wanted=None if frozen and source not in known else device.stamps,
+                stamps=known.get(source),
+            )
             for source, device in host.plan.devices.items()
         }
         self._samples: dict[str, list[StructArray]] = {source: [] for source in self._devices}
@@ -256,6 +275,10 @@ class StreamClocks:
         _place(device_ns, first, gps_ns, rate, placed)
         return placed
 
+    def stamps(self, source: str) -> Stamps | None:
+        """Return what a device's stamps were found to count from; None: nothing was found or looked for."""
+        return self._devices[source].stamps
+
     def refused(self, source: str) -> dict[str, int]:
         """What a device's clock refused, by reason."""
         return self._devices[source].status().refused
@@ -267,10 +290,15 @@ class FrozenClocks:
 
     Pickles. A device's clock lies in the same packets as its returns, so it is not complete before those are read; a
     stream that reads a piece of a log is given the packets around the piece too.
+
+    Attributes:
+        host: the host's.
+        stamps: what devices' stamps count from, by source, as the whole log shows it.
     """
 
     host: HostClocks
+    stamps: Mapping[str, Stamps] = field(default_factory=dict)
 
     def for_stream(self) -> StreamClocks:
         """Clocks for one stream over any piece of the log."""
-        return StreamClocks(self.host, frozen=True)
+        return StreamClocks(self.host, frozen=True, stamps=self.stamps)

@@ -258,6 +258,11 @@ class ScannerConfig(Section):
     auxiliary: Text | None = Field(None, description="the same head's position, IMU or GPS packets")
     protocol: Text = Field(description="srep, velodyne-vlp16, … (`swath devices` lists them)")
     pps: Name | None = Field(None, description="name of the [pps.<name>] wired to this head")
+    clock: Literal["auto", "ptp-tai", "ptp-utc", "utc-hour", "free"] = Field(
+        "auto",
+        description="what its stamps count from, where it does not say: 1970 in TAI or UTC (PTP), the hour of UTC "
+        "(Velodyne, locked), its own start; auto: found by their arrival",
+    )
     model: str = Field("", description="maker's type; a calibration of another is refused")
     serial: str = Field("", description="serial number; a calibration of another is refused")
     mirror_factor: float | None = Field(

@@ -14,6 +14,7 @@ from daemon.log.reader import Session, open_logs
 from daemon.processing import refusals
 from daemon.processing.feed import LogClocks, read_clocks
 from daemon.processing.flown import TrajectoryWish, choose_trajectory
+from daemon.processing.head_clocks import find_stamps, stamp_lines
 from daemon.processing.log_index import Listening, LogIndex, index_log
 from daemon.processing.setup import Options, Setup
 from georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
@@ -204,10 +205,11 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     first, last = index.spans()
     if not len(first):
         raise UserError(f"{log}: no scanner's data in the log")
+    clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
     refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]), setup.config, clocks.remarks)
-    flight.troubles += [f"{log}: {remark}" for remark in clocks.remarks]
+    flight.troubles += [f"{log}: {remark}" for remark in [*clocks.remarks, *stamp_lines(clocks.clocks)]]
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)
     return flight

@@ -13,7 +13,7 @@ from pyproj import CRS
 
 from daemon.errors import ExitCode, UserError, one_line
 from georef.points import Fate
-from georef.timescales import TimeState
+from georef.timescales import StampScale, TimeState
 from georef.trajectory import gps_text
 from georef.trajectory_buffer import COLUMNS
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from daemon.processing.feed import LogClocks
     from daemon.processing.flights import Flight
     from daemon.processing.setup import Options
-    from georef.timescales import ClockStatus
+    from georef.timescales import ClockStatus, Stamps
     from georef.trajectory import Trajectory
 
 Span = tuple[int, int]
@@ -187,8 +187,14 @@ def refuse_no_time(
     Raises:
         UserError: it is not, and why.
     """
-    if status is None or clock is None:
-        raise UserError(f"{log}: no source of time in its configuration; want [pps.…] or [gnss.…]", ExitCode.USAGE)
+    if status is None or clock is None or (clock.startswith("scanner/") and status.state is TimeState.NO_TIME):
+        key = "" if clock is None else f"{clock.replace('/', '.')}.clock"
+        hint = (
+            f"; or the head's position packets (auxiliary), or {key} where its stamps are UTC or TAI" if clock else ""
+        )
+        raise UserError(
+            f"{log}: no source of time in its configuration; want [pps.…] or [gnss.…]{hint}", ExitCode.USAGE
+        )
     if status.ambiguous:
         raise UserError(
             f"{log}: {clock}: which second an edge is, is not certain: {status.ambiguous}; "
@@ -215,8 +221,18 @@ def time_troubles(
     fates: Mapping[str, int],
     refused: Mapping[str, int],
     status: ClockStatus | None,
+    stamps: Stamps | None = None,
 ) -> list[str]:
-    """Lines for returns that have no time good enough, and why; empty: few or none."""
+    """Lines for returns that have no time good enough, and why; empty: few or none.
+
+    Args:
+        log: stands for the session.
+        scanner: its name.
+        fates: of its returns.
+        refused: stamps that its clock did not believe, by reason.
+        status: of the host's clock.
+        stamps: what its stamps were found to count from; None: it says itself whether it is locked, or nobody knew.
+    """
     total = sum(fates.values())
     lost = fates.get(NO_TIME, 0)
     if not total or lost <= MUCH * total:
@@ -231,7 +247,15 @@ def time_troubles(
         return [f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"]
     if refused.get("spacing"):
         return [f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"]
-    return [f"{told}: its stamps run free; want a head that is locked to the PPS, or latches it"]
+    if refused.get("stamp_jump"):
+        return [
+            f"{told}: {refused['stamp_jump']:,} stamps lie more than a second from their arrival: its clock was set"
+        ]
+    found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
+    return [
+        f"{told}: its stamps run free{found}; want a head that is locked to the PPS, or latches it, or "
+        f"scanner.{scanner}.clock where its stamps are UTC or TAI all the same"
+    ]
 
 
 def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:

@@ -40,6 +40,7 @@ from georef.records import InsSolution, NamesEdge, StructArray
 from georef.rotations import attitude_of, rot_l_from_b
 from georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
 from georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
+from georef.timescales import StampScale
 from georef.trajectory import Trajectory
 from georef.trajectory_buffer import TrajectoryBuffer
 
@@ -192,6 +193,23 @@ class Setup:
                 raise ConfigError(f"{kind}.{name}: {error}") from error
         return made
 
+    def scanner_time_parsers(self) -> dict[str, Parser]:
+        """New parsers of what the scanners say of time, without returns, by source.
+
+        Raises:
+            ConfigError: a driver cannot work with its settings.
+        """
+        made: dict[str, Parser] = {}
+        for name in self.scanners:
+            table, source = self.config.scanner[name], f"scanner/{name}"
+            make = self._driver("scanner", name, table).make_time_parser
+            try:
+                if make is not None:
+                    made[source] = make(DeviceSettings(source, plain_table(table), self._files(name, table)))
+            except DriverSettingsError as error:
+                raise ConfigError(f"scanner.{name}: {error}") from error
+        return made
+
     def ins_parser(self) -> dict[str, Parser]:
         """Of an IMU that is the INS too, its parser; empty where a receiver's own stream tells the solutions."""
         source = self.ins_source or ""
@@ -231,11 +249,15 @@ class Setup:
             gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
         }
         devices: dict[str, DevicePlan] = {}
+        heads: dict[str, GnssPlan] = {}  # that say the time themselves, where nobody else does
         for name in self.scanners:
-            clock = self._clock_of(config.scanner[name].pps)
-            if clock is not None:
-                past_hour = find_driver("scanner", config.scanner[name].protocol).past_hour
-                devices[f"scanner/{name}"] = DevicePlan(clock, past_hour)
+            table, source = config.scanner[name], f"scanner/{name}"
+            driver = find_driver("scanner", table.protocol)
+            clock = self._clock_of(table.pps)
+            if clock is None:
+                heads[source] = GnssPlan()
+            wanted = StampScale(table.clock) if driver.past_hour or not driver.line_scanner else None
+            devices[source] = DevicePlan(clock or source, driver.past_hour, wanted)
         return ClockPlan(
             host_minus_monotonic_ns=info.realtime_ns - info.monotonic_ns,
             pps={f"pps/{name}": PpsPlan(said.get(name), pps.delay_ns) for name, pps in config.pps.items()},
@@ -246,7 +268,8 @@ class Setup:
                     gnss.leap_seconds,
                 )
                 for name, gnss in config.gnss.items()
-            },
+            }
+            | heads,
             devices=devices,
         )
 

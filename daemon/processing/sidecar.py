@@ -172,6 +172,10 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
             "last_gps_ns": last_ns,
             "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
         },
+        "stamps": {
+            source: {"scale": found.scale.value, "why": found.text, "sigma_ns": round(found.sigma_ns)}
+            for source, found in sorted(flight.clocks.clocks.stamps.items())
+        },
         "calibrations": {name: calibration_entry(value) for name, value in setup.calibrations.items()},
         "settings": settings_entry(setup),
         "atmosphere_at_edge": _edges(flight, results),

@@ -73,7 +73,8 @@ class PositionReader:
         for at, host_ns in enumerate(host_time_ns.tolist()):
             packet = units[at].tobytes()
             stamp_us, pps_status = _STATUS.unpack_from(packet, _STAMP_AT)
-            if pps_status > PPS_ERROR or stamp_us >= HOUR_US:
+            stamp_us %= HOUR_US  # a head whose pulse does not turn its hour counts on beyond it
+            if pps_status > PPS_ERROR:
                 keep[at] = False
                 continue
             self.locked = int(pps_status == PPS_LOCKED)

@@ -31,6 +31,7 @@ from georef.timescales.gps_time import (
 )
 from georef.timescales.host_timeline import HostTimeline
 from georef.timescales.pps_clock import PpsClock
+from georef.timescales.stamp_scale import Stamps, StampScale, judge
 
 __all__ = [
     "DAY_NS",
@@ -48,6 +49,8 @@ __all__ = [
     "HostTimeline",
     "PpsClock",
     "Severity",
+    "StampScale",
+    "Stamps",
     "TimeState",
     "complete_time",
     "full_week",
@@ -55,6 +58,7 @@ __all__ = [
     "gps_ns_from_utc",
     "gps_ns_from_week",
     "gps_ns_past_hour",
+    "judge",
     "las_adjusted_s",
     "nearest_gps_ns",
     "table_leap_seconds",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from georef.records import Int64Array, StructArray
 from georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hour
 from georef.timescales.pps_clock import PpsClock
+from georef.timescales.stamp_scale import Stamps, StampScale, judge
 
 MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: further from the edge than this it is refused
 MAX_DRIFT = 200e-6
@@ -37,6 +38,9 @@ BIN_NS = 10 * SECOND_NS
 ARRIVAL_LATENCY_NS = 2_000_000.0  # prior of the least latency of a datagram or frame nobody has calibrated
 HOUR_STAMP_SIGMA_NS = 20_000.0  # maker's figure for a head locked to PPS is some 10 µs to 50 µs
 LIVE_KNOTS = 1800
+COARSE_MAX_SIGMA_NS = 4e8  # a host's clock as good as this says the hour, and the second where the head vouches for it
+JUDGED_AFTER_S = 10  # of stamps, while they come: what they count from; again after as many
+JUDGED_SECONDS = 120  # as many are looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +168,27 @@ def _runs_free(rows: StructArray) -> NDArray[np.bool_]:
 class DeviceClock:
     """Maps a device's time to GPS time; fed by `DEVICE_CLOCK_DTYPE` rows beside the host's `PpsClock`."""
 
-    def __init__(self, clock: PpsClock, *, past_utc_hour: bool = False, keep_history: bool = False) -> None:
-        """past_utc_hour: device time counts from the UTC hour while `locked` is 1 (Velodyne), else from power-on."""
+    def __init__(
+        self,
+        clock: PpsClock,
+        *,
+        past_utc_hour: bool = False,
+        keep_history: bool = False,
+        wanted: StampScale | None = None,
+        stamps: Stamps | None = None,
+    ) -> None:
+        """past_utc_hour: device time counts from the UTC hour while `locked` is 1 (Velodyne), else from power-on.
+
+        wanted: what its stamps are configured to count from; AUTO: found while they come, where the device says nothing
+        of a lock; None: as the device itself says. stamps: what they count from, where that is known beforehand.
+        """
         self._clock = clock
         self._past_utc_hour = past_utc_hour
+        self._wanted = wanted
+        self.stamps = stamps
+        self._judges = stamps is None and wanted not in (None, StampScale.FREE)
+        self._quickest: dict[int, tuple[int, int]] = {}  # second of the host: host − device, host ns
+        self._judged_at = 0
         self._keep_history = keep_history
         self._segments: list[_Segment] = []
         self._lock_host = array("q")
@@ -182,6 +203,8 @@ class DeviceClock:
         host = np.asarray(rows["host_time_ns"] if host_ns is None else host_ns, dtype=np.int64)
         device = np.asarray(rows["device_time_ns"], dtype=np.int64)
         count = np.asarray(rows["pps_count"], dtype=np.int64)
+        if self._judges:
+            self._note_stamps(rows, device, host)
         self._note_locks(np.asarray(rows["locked"]), host)
         free = _runs_free(rows)
         begins = (np.diff(device) < -STEP_BACK_NS) | ((np.diff(count) < 0) & (count[1:] >= 0)) | np.diff(free)
@@ -199,6 +222,34 @@ class DeviceClock:
             segment.last_device_ns, segment.last_host_ns = int(device[stop - 1]), int(host[stop - 1])
             segment.last_count = int(count[stop - 1])
         self._trim()
+
+    def _note_stamps(self, rows: StructArray, device: Int64Array, host: Int64Array) -> None:
+        """Keep the least delayed stamp of each second; every so often judge what they count from."""
+        says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
+        if self._wanted is StampScale.AUTO and says.any():  # it says itself
+            self._judges, self.stamps = False, None
+            return
+        second, late = host // SECOND_NS, host - device
+        order = np.lexsort((late, second))
+        first = np.append(0, np.flatnonzero(np.diff(second[order])) + 1)
+        for place in order[first].tolist():
+            key, found = int(second[place]), (int(late[place]), int(host[place]))
+            self._quickest[key] = min(self._quickest.get(key, found), found)
+        for key in sorted(self._quickest)[:-JUDGED_SECONDS]:
+            del self._quickest[key]
+        newest = max(self._quickest)
+        if len(self._quickest) >= JUDGED_AFTER_S and newest - self._judged_at >= JUDGED_AFTER_S:
+            self._judged_at = newest
+            self.stamps = self._judge()
+
+    def _judge(self) -> Stamps | None:
+        rows = np.array(list(self._quickest.values()), dtype=np.int64)
+        gps, sigma = self._clock.gps_from_host(rows[:, 1])
+        leap = self._clock.leap_seconds_at(int(gps[-1]))
+        device = rows[:, 1] - rows[:, 0]
+        good = np.where(sigma <= COARSE_MAX_SIGMA_NS, sigma, math.inf)
+        wanted = self._wanted or StampScale.AUTO
+        return judge(device, gps, good, leap, past_hour=self._past_utc_hour, wanted=wanted)
 
     def _note_locks(self, locked: NDArray[np.int8], host: Int64Array) -> None:
         previous = self._lock_state[-1] if self._lock_state else None
@@ -288,8 +339,11 @@ class DeviceClock:
         for number in np.unique(which).tolist():
             inside = which == number
             gps[inside], sigma[inside] = self._in_segment(self._segments[number], device[inside])
-        if self._past_utc_hour and host is not None:
+        scale = StampScale.FREE if self.stamps is None else self.stamps.scale
+        if self._past_utc_hour and host is not None and self._wanted is not StampScale.FREE:
             self._place_past_hour(device, host, gps, sigma)
+        elif scale in (StampScale.TAI, StampScale.UTC) and host is not None:
+            self._place_absolute(device, host, gps, sigma)
         return gps, sigma
 
     def _in_segment(self, segment: _Segment, device: Int64Array) -> tuple[Int64Array, NDArray[np.float64]]:
@@ -356,13 +410,39 @@ class DeviceClock:
         near, near_sigma = self._clock.gps_from_host(host)
         leap = self._clock.leap_seconds_at(int(near[-1]))
         place = np.searchsorted(np.array(self._lock_host, dtype=np.int64), host, side="right") - 1
-        locked = (place >= 0) & (np.array(self._lock_state)[np.clip(place, 0, None)] == 1)
-        placed, believed = gps_ns_past_hour(device % HOUR_NS, near, leap)
-        good = locked & believed & (near_sigma <= LABEL_MAX_SIGMA_NS)
+        state = np.array(self._lock_state)[np.clip(place, 0, None)]
+        locked = (place >= 0) & (state == 1)
+        sigma_ns = HOUR_STAMP_SIGMA_NS
+        if self.stamps is not None and self.stamps.scale is StampScale.HOUR:
+            locked |= np.ones_like(locked) if self._wanted is StampScale.HOUR else state < 0
+            sigma_ns = self.stamps.sigma_ns
+        placed, believed = gps_ns_past_hour(device % HOUR_NS, near, leap, slack_ns=self._slack_ns(near_sigma))
+        good = locked & believed & (near_sigma <= COARSE_MAX_SIGMA_NS)
         refused = int(np.count_nonzero(locked & ~believed))
         if refused:
             self.refused["past_hour"] = self.refused.get("past_hour", 0) + refused
-        gps[good], sigma[good] = placed[good], HOUR_STAMP_SIGMA_NS
+        gps[good], sigma[good] = placed[good], sigma_ns
+
+    @staticmethod
+    def _slack_ns(near_sigma: NDArray[np.float64]) -> Int64Array:
+        """Return how much farther from its arrival (n,) a stamp may lie: nothing where the host knows the second."""
+        coarse = (near_sigma > LABEL_MAX_SIGMA_NS) & (near_sigma <= COARSE_MAX_SIGMA_NS)
+        return np.where(coarse, 3.0 * near_sigma, 0.0).astype(np.int64)
+
+    def _place_absolute(
+        self, device: Int64Array, host: Int64Array, gps: Int64Array, sigma: NDArray[np.float64]
+    ) -> None:
+        """Overwrite, in place, with stamps that count from 1970, as far as they lie where they arrived."""
+        assert self.stamps is not None
+        near, near_sigma = self._clock.gps_from_host(host)
+        placed = device + self.stamps.offset_ns
+        late, slack = near - placed, self._slack_ns(near_sigma)
+        believed = (late <= SECOND_NS + slack) & (late >= -SECOND_NS // 2 - slack)
+        good = believed & (near_sigma <= COARSE_MAX_SIGMA_NS)
+        refused = int(np.count_nonzero(~believed))
+        if refused:
+            self.refused["stamp_jump"] = self.refused.get("stamp_jump", 0) + refused
+        gps[good], sigma[good] = placed[good], self.stamps.sigma_ns
 
     def status(self) -> DeviceClockStatus:
         """Counts and drift."""

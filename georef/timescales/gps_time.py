@@ -151,15 +151,21 @@ def complete_time(
 
 
 def gps_ns_past_hour(
-    past_hour_ns: Int64Array, near_gps_ns: Int64Array, leap_seconds: int, *, max_age_ns: int = SECOND_NS
+    past_hour_ns: Int64Array,
+    near_gps_ns: Int64Array,
+    leap_seconds: int,
+    *,
+    max_age_ns: int = SECOND_NS,
+    slack_ns: Int64Array | int = 0,
 ) -> tuple[Int64Array, NDArray[np.bool_]]:
     """Place stamps that count from the UTC hour (Velodyne, locked): GPS ns (n,) and which of them may be believed.
 
     The hour is the one that comes nearest to the prediction, the GPS time of arrival (so within ± 30 min); a stamp is
     refused where it then lies more than max_age_ns before it (a stalled packet's does) or 0.5 s after it: a head that
-    is one second ahead comes out just less than that second ahead, by the packet's latency.
+    is one second ahead comes out just less than that second ahead, by the packet's latency. slack_ns: as much farther
+    on either side, for a prediction that is coarse.
     """
     near = np.asarray(near_gps_ns, dtype=np.int64)
     offset = np.asarray(past_hour_ns, dtype=np.int64) + leap_seconds * SECOND_NS
     residual = (offset - near + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
-    return near + residual, (residual >= -max_age_ns) & (residual <= MAX_AHEAD_NS)
+    return near + residual, (residual >= -max_age_ns - slack_ns) & (residual <= MAX_AHEAD_NS + slack_ns)

@@ -222,6 +222,10 @@ class PpsClock:
             if train is not None and self._vote(train, said) and train is self._train and not self._contradicted:
                 self._labels.decide(train, said.host_ns)
 
+    def add_coarse(self, host_ns: int, gps_ns: int) -> None:
+        """Take the GPS time of a host time as from the arrival of a message: good to some 0.1 s, and no vote."""
+        self._coarse.add(host_ns, gps_ns)
+
     def _refuse_message(self, reason: str) -> None:
         self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
 

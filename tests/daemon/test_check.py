@@ -131,6 +131,22 @@ class TestAllWell:
         assert reports["scanner/roof"].problems == []
         assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
 
+    def test_it_is_said_where_nothing_tells_whether_a_head_is_locked(self, tmp_path: Path) -> None:
+        """The same head with its data port alone: auxiliary is named; a configured clock is named instead."""
+        data = free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        packets = [unit.data for unit in recorded if len(unit.data) == 1206]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        with udp_sender(data, lambda n: packets[n % len(packets)]):
+            (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
+            (configured,) = check(text + 'clock = "utc-hour"\n', tmp_path, 0.5)["scanner/roof"].notes
+        assert "no position packet (Velodyne port 8308" in note
+        assert "want auxiliary" in note
+        assert 'clock = "utc-hour"' in configured
+
     def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
         """An OS0 and its own IMU, on two ports."""
         lidar, imu = free_udp_port(), free_udp_port()

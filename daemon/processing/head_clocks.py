@@ -1,0 +1,159 @@
+"""What scanners' own stamps count from, found before any return is placed: from pieces of the log all over it.
+
+A job reads its own piece of a log only; so the question is settled once, by all of the log, and the answer goes to
+every job. Heads that say the time themselves (Velodyne's position packets, Hesai's GPS packets) are the host's clock
+where no receiver is in the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daemon.log.reader import PartDamage
+from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from daemon.replay import source_of_topic
+from georef.records import (
+    DEVICE_CLOCK_DTYPE,
+    ChunkBatch,
+    DeviceClockSamples,
+    Record,
+    StructArray,
+    TimeMessage,
+)
+from georef.stream_clocks import DevicePlan, FrozenClocks, HostClocks
+from georef.timescales import (
+    SECOND_NS,
+    Stamps,
+    StampScale,
+    gps_ns_from_unix,
+    judge,
+    table_leap_seconds,
+    utc_from_gps,
+)
+from georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
+
+if TYPE_CHECKING:
+    from daemon.processing.setup import Setup
+
+LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
+PIECES = 12
+HOUR_NS = 3600 * SECOND_NS
+
+
+def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks:
+    """Return the host's clocks with what each scanner's stamps count from.
+
+    The clock of a head that is its own is fed here, with what the head says of the time; where it says nothing, and its
+    stamps are configured to be UTC or TAI, with these.
+    """
+    plans = {source: plan for source, plan in host.plan.devices.items() if plan.stamps is not None}
+    own = {source for source, plan in plans.items() if plan.clock == source}
+    if not plans or (not own and all(plan.stamps is StampScale.FREE for plan in plans.values())):
+        return FrozenClocks(host, {source: Stamps(StampScale.FREE, "configured so") for source in plans})
+    read = _Reader(setup, plans)
+    read.take(index, _pieces(index.scanner_chunks()))
+    for source in own:
+        for message in read.messages[source]:
+            host.add_message(source, message)
+    host.update()
+    stamps: dict[str, Stamps] = {}
+    for source, plan in plans.items():
+        rows = read.rows(source)
+        if source in own and len(rows):
+            _tell_by_stamps(source, plan, rows, host)
+        found = _judged(plan, rows, host)
+        if found is not None:
+            stamps[source] = found
+    return FrozenClocks(host, stamps)
+
+
+def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
+    """Return all chunks of a short log, else neighbours in places all over it, the first and the last included."""
+    if sum(chunk.length for chunk in chunks) <= LOOKED_AT_BYTES:
+        return list(chunks)
+    mean = sum(chunk.length for chunk in chunks) / len(chunks)
+    run = max(1, int(LOOKED_AT_BYTES / PIECES / mean))
+    starts = np.linspace(0, max(0, len(chunks) - run), PIECES).astype(int).tolist()
+    return [chunks[place] for place in sorted({start + step for start in starts for step in range(run)})]
+
+
+class _Reader:
+    """Collects what scanners say of time."""
+
+    def __init__(self, setup: Setup, plans: dict[str, DevicePlan]) -> None:
+        self.messages: dict[str, list[TimeMessage]] = {source: [] for source in plans}
+        self._rows: dict[str, list[StructArray]] = {source: [] for source in plans}
+        self._parsers = {source: parser for source, parser in setup.scanner_time_parsers().items() if source in plans}
+
+    def take(self, index: LogIndex, places: Sequence[ChunkPlace]) -> None:
+        """Read chunks; what is damaged is told when the returns are read."""
+        damage: list[PartDamage] = []
+        for batch in read_chunks(index, places, lambda topic: topic.startswith(SCANNER), damage):
+            source = (source_of_topic(batch.channel.topic) or "").removesuffix("/aux")
+            if source in self._parsers:
+                units = ChunkBatch(source, batch.log_time_ns, batch.units)
+                self._keep(source, self._parsers[source].feed_batch(units))
+        for source, parser in self._parsers.items():
+            self._keep(source, parser.close())
+
+    def _keep(self, source: str, records: list[Record]) -> None:
+        for record in records:
+            if isinstance(record, TimeMessage):
+                self.messages[source].append(record)
+            elif isinstance(record, DeviceClockSamples):
+                self._rows[source].append(record.rows)
+
+    def rows(self, source: str) -> StructArray:
+        """Return all clock samples of a scanner."""
+        return np.concatenate(self._rows[source] or [np.empty(0, DEVICE_CLOCK_DTYPE)])
+
+
+def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | None:
+    """Return what stamps count from; None where the head itself says whether it is locked, or nobody knows the time."""
+    assert plan.stamps is not None
+    if plan.stamps is StampScale.AUTO and ((rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)).any():
+        return None
+    gps_ns, sigma_ns = host.gps_from_host(plan.clock, rows["host_time_ns"])
+    sigma_ns = np.where(sigma_ns <= COARSE_MAX_SIGMA_NS, sigma_ns, np.inf)
+    leap = host.by_source[plan.clock].leap_seconds_at(int(gps_ns[-1])) if len(gps_ns) else 0
+    return judge(rows["device_time_ns"], gps_ns, sigma_ns, leap, past_hour=plan.past_utc_hour, wanted=plan.stamps)
+
+
+def _tell_by_stamps(source: str, plan: DevicePlan, rows: StructArray, host: HostClocks) -> None:
+    """Set a head's own clock by its stamps, where they are configured to be TAI or UTC and nothing else sets it.
+
+    Of stamps past the hour the wall clock of the log says which hour; so it must be good to half of one.
+    """
+    host_ns = rows["host_time_ns"]
+    _, sigma_ns = host.gps_from_host(source, host_ns[-1:])
+    if plan.stamps in (StampScale.AUTO, StampScale.FREE) or sigma_ns[0] <= COARSE_MAX_SIGMA_NS:
+        return
+    rows = rows[:: max(1, len(rows) // 200)]
+    device_ns, host_ns = rows["device_time_ns"], rows["host_time_ns"]
+    leap = _leap_at(int(host_ns[0]))
+    if plan.stamps is StampScale.TAI:
+        gps_ns = gps_ns_from_unix(0, 0) + device_ns - 19 * SECOND_NS
+    elif plan.stamps is StampScale.UTC:
+        gps_ns = gps_ns_from_unix(0, leap) + device_ns
+    else:
+        wall_ns = host_ns + gps_ns_from_unix(0, leap)
+        beside = (device_ns + leap * SECOND_NS - wall_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+        gps_ns = wall_ns + beside
+    host.add_coarse(source, host_ns, np.asarray(gps_ns, np.int64))
+
+
+def _leap_at(unix_ns: int) -> int:
+    date, _ = utc_from_gps(gps_ns_from_unix(unix_ns, 0), 0)
+    return table_leap_seconds(date)[0]
+
+
+def stamp_lines(clocks: FrozenClocks) -> list[str]:
+    """Return a line of each scanner whose stamps were found or configured, for the user: which scale, and why."""
+    return [
+        f"{source}: its stamps are taken as {found.scale.value}: {found.text}"
+        for source, found in sorted(clocks.stamps.items())
+        if found.scale is not StampScale.FREE
+    ]

@@ -1,0 +1,155 @@
+"""What a scanner's own stamps count from, where it says nothing of its lock: found by their arrival, or configured.
+
+A head that is set by PTP stamps nanoseconds since 1970 in TAI or UTC; a Velodyne that is locked stamps the time past
+the UTC hour, whether or not its position packets are recorded. Such stamps stand a constant from GPS time, that of
+their arrival less some milliseconds. A counter that runs from power-on stands within a tenth of a second of the UTC
+hour once in 36 000, and of TAI since 1970 never. Only the whole seconds are taken from the arrival; the fraction is the
+head's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.records import Int64Array
+from georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
+
+TAI_MINUS_GPS_S = 19  # since 1980, by definition
+ABSOLUTE_FROM_NS = 1_000_000_000 * SECOND_NS  # from 2001-09-09 on: counted from 1970; a counter takes 30 years there
+LEAST_SPAN_S = 5
+GREATEST_LATENCY_NS = 100_000_000  # of the quickest datagram of a second
+AHEAD_NS = 5_000_000  # a datagram cannot come before its pulse; the host's clock may be that wrong
+LOCKED_SIGMA_NS = 20_000.0  # makers say 10 µs to 50 µs of a head locked to PPS; PTP is better
+GREATEST_DRIFT_NS = 2_000_000.0  # over the log, of the head's stamps against GPS time: more is a head that runs free
+SIGMAS = 3.0
+
+
+class StampScale(StrEnum):
+    """What stamps count from."""
+
+    AUTO = "auto"  # configured: to be found
+    FREE = "free"
+    HOUR = "utc-hour"
+    TAI = "ptp-tai"
+    UTC = "ptp-utc"
+
+
+@dataclass(frozen=True, slots=True)
+class Stamps:
+    """What a head's stamps were found, or are configured, to be.
+
+    offset_ns: GPS time less stamp, of absolute stamps. sigma_ns: of one stamp. text: why, with the figures.
+    """
+
+    scale: StampScale
+    text: str
+    offset_ns: int = 0
+    sigma_ns: float = LOCKED_SIGMA_NS
+
+
+def judge(
+    device_ns: Int64Array,
+    near_gps_ns: Int64Array,
+    near_sigma_ns: NDArray[np.float64],
+    leap_seconds: int,
+    *,
+    past_hour: bool,
+    wanted: StampScale = StampScale.AUTO,
+) -> Stamps | None:
+    """Return what stamps count from; None: too few of them, or no time beside them.
+
+    Args:
+        device_ns: (n,) stamps.
+        near_gps_ns: (n,) GPS time of their arrival.
+        near_sigma_ns: (n,) its sigma.
+        leap_seconds: GPS − UTC there.
+        past_hour: the head stamps the time past the hour while locked.
+        wanted: what is configured; AUTO: to be found.
+    """
+    if wanted is StampScale.FREE:
+        return Stamps(StampScale.FREE, "configured so")
+    known = np.isfinite(near_sigma_ns)
+    device, near, sigma = device_ns[known], near_gps_ns[known], near_sigma_ns[known]
+    if not len(device) or int(near.max() - near.min()) < LEAST_SPAN_S * SECOND_NS:
+        return None
+    if not past_hour and int(device.min()) < ABSOLUTE_FROM_NS:
+        return Stamps(StampScale.FREE, "its stamps count from its own start")
+    if past_hour:
+        ahead = (device % HOUR_NS + leap_seconds * SECOND_NS - near + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+    else:
+        ahead = device - GPS_EPOCH_UNIX_S * SECOND_NS - near
+    at, quickest = _quickest(near, ahead)
+    slack_ns = SIGMAS * float(np.median(sigma))
+    if past_hour:
+        return _of_hour(at, quickest, slack_ns, wanted)
+    return _absolute(at, quickest, slack_ns, leap_seconds, wanted)
+
+
+def _quickest(near: Int64Array, ahead: Int64Array) -> tuple[Int64Array, Int64Array]:
+    """Return GPS time and stamp less arrival of the least delayed datagram of each second."""
+    second = near // SECOND_NS
+    order = np.lexsort((ahead, second))
+    last = np.append(np.flatnonzero(np.diff(second[order])), len(order) - 1)
+    return near[order][last], ahead[order][last]
+
+
+def _of_hour(at: Int64Array, quickest: Int64Array, slack_ns: float, wanted: StampScale) -> Stamps:
+    drift_ns, why = _drift(at, quickest, slack_ns)
+    least_ms, most_ms = -int(quickest.max()) / 1e6, -int(quickest.min()) / 1e6
+    within = (quickest >= -GREATEST_LATENCY_NS - slack_ns) & (quickest <= AHEAD_NS + slack_ns)
+    told = f"they stand {least_ms:.1f} to {most_ms:.1f} ms before their arrival past the hour of UTC, {why}"
+    if wanted is StampScale.HOUR:
+        return Stamps(StampScale.HOUR, f"configured so; {told}", 0, max(LOCKED_SIGMA_NS, drift_ns / 2))
+    if not within.all():
+        return Stamps(StampScale.FREE, f"{told}: not those of a head that is locked")
+    if drift_ns > GREATEST_DRIFT_NS:
+        return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that has lost its pulse")
+    return Stamps(StampScale.HOUR, told, 0, max(LOCKED_SIGMA_NS, drift_ns / 2))
+
+
+def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_seconds: int, wanted: StampScale) -> Stamps:
+    names = {TAI_MINUS_GPS_S: StampScale.TAI, -leap_seconds: StampScale.UTC}
+    latest_ns = int(np.median(quickest))
+    whole_s = -(-(latest_ns - AHEAD_NS) // SECOND_NS)  # the stamps' second; they come some ms before their arrival
+    nearest = min(names, key=lambda count: abs(count * SECOND_NS - latest_ns))
+    if abs(nearest * SECOND_NS - latest_ns) <= GREATEST_LATENCY_NS + slack_ns:
+        whole_s = nearest  # a coarse host clock does not say the second better than the scale does
+    beside = quickest - whole_s * SECOND_NS
+    drift_ns, why = _drift(at, quickest, slack_ns)
+    offset_ns = -(GPS_EPOCH_UNIX_S + whole_s) * SECOND_NS
+    sigma_ns = max(LOCKED_SIGMA_NS, drift_ns / 2)
+    least_ms, most_ms = -int(beside.max()) / 1e6, -int(beside.min()) / 1e6
+    scale = names.get(whole_s)
+    named = scale.value.removeprefix("ptp-").upper() if scale is not None else f"GPS {whole_s:+d} s"
+    told = f"they count from 1970 in {named}, {least_ms:.1f} to {most_ms:.1f} ms before their arrival, {why}"
+    if wanted in (StampScale.TAI, StampScale.UTC):
+        other = "" if scale is wanted else "; the whole seconds are those of the arrival"
+        return Stamps(wanted, f"configured so; {told}{other}", offset_ns, sigma_ns)
+    within = (beside >= -GREATEST_LATENCY_NS - slack_ns) & (beside <= AHEAD_NS + slack_ns)
+    if scale is None or not within.all():
+        return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, say so (clock)")
+    if drift_ns > GREATEST_DRIFT_NS:
+        return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that PTP has lost")
+    return Stamps(scale, told, offset_ns, sigma_ns)
+
+
+def _drift(at: Int64Array, quickest: Int64Array, slack_ns: float) -> tuple[float, str]:
+    """Return by how much stamps drift against GPS time over the log, ns, as far as it is no chance; and that in words.
+
+    A host that no edges keep drifts itself: then nothing is said of the head's.
+    """
+    span_s = float(at.max() - at.min()) / SECOND_NS
+    x = (at - at.min()).astype(np.float64) / SECOND_NS - span_s / 2
+    y = (quickest - quickest[0]).astype(np.float64)
+    if len(at) < LEAST_SPAN_S or slack_ns > SIGMAS * AHEAD_NS:
+        return 0.0, f"over {span_s:.0f} s"
+    x = x - x.mean()
+    slope = float(x @ (y - y.mean()) / (x @ x))
+    residual = y - y.mean() - slope * x
+    sigma = float(np.sqrt(residual @ residual / max(1, len(x) - 2) / (x @ x)))
+    drift_ns = max(0.0, abs(slope) - SIGMAS * sigma) * span_s
+    return drift_ns, f"steady to {(abs(slope) + sigma) * 1e-3:.1f} ppm over {span_s:.0f} s"
