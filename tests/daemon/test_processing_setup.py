@@ -18,6 +18,7 @@ from daemon.processing.setup import Options, Setup
 from georef.beams import LineGeometry, SpinningGeometry
 from georef.records import INS_DTYPE, NamesEdge
 from georef.stream_clocks import DevicePlan, GnssPlan, PpsPlan
+from georef.timescales import StampScale
 from tests.daemon.standin import AIRCRAFT, aircraft_config
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -75,7 +76,10 @@ def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
     assert plan.pps == {"pps/main": PpsPlan(18, 0)}
     assert plan.gnss == {"gnss/rover": GnssPlan("pps/main", None, 18)}
     # a head without a pulse of its own is on the host's clock; Velodyne's stamps count from the hour
-    assert plan.devices == {"scanner/left": DevicePlan("pps/main"), "scanner/top": DevicePlan("pps/main", True)}
+    assert plan.devices == {
+        "scanner/left": DevicePlan("pps/main"),
+        "scanner/top": DevicePlan("pps/main", True, StampScale.AUTO),
+    }
 
 
 def test_an_edge_named_by_hand_and_a_delay_reach_the_clocks(tmp_path: Path) -> None:

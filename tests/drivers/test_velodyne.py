@@ -440,12 +440,12 @@ def test_damaged_sentences_are_counted_once() -> None:
 
 def test_a_counter_that_goes_on_beyond_the_hour_is_taken_modulo_the_hour() -> None:
     """As the data packets' are: lock and sentence count, and the sentence is that of the second the clock stands in."""
-    parser, records = positions((3_600_000_000 + 1_000_200_000, 2, rmc("081640.00")))
+    parser, records = positions((3_600_000_000 + 500_200_000, 2, rmc("080820.00")))
     assert not parser.counters.errors
     (message,) = [r for r in records if isinstance(r, TimeMessage)]
     assert message.valid
     (clock,) = [r for r in records if isinstance(r, DeviceClockSamples)]
-    assert clock.rows["device_time_ns"].tolist() == [1_000_200_000 * 1000]
+    assert clock.rows["device_time_ns"].tolist() == [500_200_000 * 1000]
     assert clock.rows["locked"].tolist() == [1]
 
 

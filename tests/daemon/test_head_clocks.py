@@ -1,0 +1,207 @@
+"""Heads whose own time suffices: what a log's scanners' stamps count from, found before any return is placed."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Iterable
+from functools import reduce
+from operator import xor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.capture_routes import Routes
+from daemon.captures import ImportUnit
+from daemon.config import Config, parse_config
+from daemon.errors import UserError
+from daemon.importing import ImportLog
+from daemon.log.reader import open_logs
+from daemon.processing.feed import read_clocks
+from daemon.processing.head_clocks import find_stamps, stamp_lines
+from daemon.processing.log_index import index_log
+from daemon.processing.refusals import refuse_no_time
+from daemon.processing.setup import Setup
+from drivers.scanner.hesai import encode_point_packet
+from drivers.scanner.velodyne import encode_data_packet
+from drivers.scanner.velodyne_position import PPS_LOCKED, encode_position_packet
+from georef.records import DEVICE_CLOCK_DTYPE
+from georef.stream_clocks import FrozenClocks
+from georef.timescales import StampScale
+
+NS = 1_000_000_000
+START = dt.datetime(2026, 6, 15, 9, 59, 50, tzinfo=dt.UTC)  # the hour turns ten seconds later
+START_UNIX_NS = int(START.timestamp()) * NS
+UNIX_MINUS_GPS_S, LEAP = 315_964_800, 18
+SECONDS, LATENCY_NS = 20, 2_000_000
+CLOCK_WRONG_NS = 300_000_000  # of the recording computer, which nobody kept
+HEAD = 'transport = "udp:0.0.0.0:2368"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+RECEIVER = (
+    '[pps.main]\nsource = "/dev/pps0"\n[gnss.rover]\ntransport = "serial:/dev/ttyS0?baud=115200"\nprotocol = "nmea"\n'
+    'pps = "main"\n'
+)
+
+Units = list[tuple[str, int, bytes]]  # source, time of arrival, bytes
+
+
+def rmc(second: int, status: str = "A") -> bytes:
+    at = START + dt.timedelta(seconds=second)
+    body = f"GPRMC,{at:%H%M%S}.00,{status},4724.0,N,00830.0,E,0.0,0.0,{at:%d%m%y},,,A"
+    return f"${body}*{reduce(xor, body.encode()):02X}".encode()
+
+
+def receiver() -> Units:
+    """Edges at the second and RMC 0.2 s later."""
+    units: Units = []
+    for second in range(SECONDS):
+        edge_ns = START_UNIX_NS + second * NS
+        value = {"edge_time_ns": edge_ns + CLOCK_WRONG_NS, "sequence": second}
+        units.append(("pps/main", edge_ns + 1_000_000, json.dumps(value).encode()))
+        units.append(("gnss/rover", edge_ns + 200_000_000, rmc(second) + b"\r\n"))
+    return units
+
+
+def past_hour_us(unix_us: int, *, goes_on: bool) -> int:
+    """Time past the UTC hour; goes_on: past the one that the log began in."""
+    hour_us = 3_600_000_000
+    return unix_us - START_UNIX_NS // 1000 // hour_us * hour_us if goes_on else unix_us % hour_us
+
+
+def velodyne(off_us: int = 0, *, goes_on: bool = False) -> Units:
+    """A data packet every 50 ms, stamped past the hour of UTC; off_us: somewhere else."""
+    units: Units = []
+    for number in range(SECONDS * 20):
+        unix_us = START_UNIX_NS // 1000 + number * 50_000
+        stamp_us = past_hour_us(unix_us + off_us, goes_on=goes_on)
+        data = encode_data_packet(stamp_us, np.arange(12) * 40, np.zeros((12, 32)), 0)
+        units.append(("scanner/top", unix_us * 1000 + LATENCY_NS, data))
+    return units
+
+
+def positions(*, goes_on: bool = False) -> Units:
+    """Two position packets a second, locked, with the sentence of the second."""
+    units: Units = []
+    for half in range(1, 2 * SECONDS):
+        unix_us = START_UNIX_NS // 1000 + half * 500_000 + 250_000
+        stamp_us = past_hour_us(unix_us, goes_on=goes_on)
+        data = encode_position_packet(stamp_us, PPS_LOCKED, rmc((half * 500 + 250) // 1000).decode())
+        units.append(("scanner/top/aux", unix_us * 1000 + LATENCY_NS, data))
+    return units
+
+
+def hesai(scale_s: int) -> Units:
+    """A packet every 50 ms by PTP, its date and time on a scale so many seconds beside UTC."""
+    units: Units = []
+    for number in range(SECONDS * 20):
+        at = START + dt.timedelta(milliseconds=50 * number)
+        data = encode_point_packet(
+            at + dt.timedelta(seconds=scale_s), np.arange(8) * 18, np.zeros((8, 32)), 0, sequence=number
+        )
+        units.append(("scanner/top", START_UNIX_NS + number * NS // 20 + LATENCY_NS, data))
+    return units
+
+
+def found(folder: Path, text: str, units: Iterable[tuple[str, int, bytes]]) -> tuple[Setup, FrozenClocks]:
+    """A log of the units, and its clocks."""
+    config: Config = parse_config(f'[session]\nname = "heads"\ndirectory = "."\n{text}', folder / "swath.toml")
+    wires = Routes.of(config).ports
+    log: ImportLog | None = None
+    for source, at_ns, data in sorted(units, key=lambda unit: unit[1]):
+        stamped = ImportUnit(at_ns + CLOCK_WRONG_NS, wires[source], data)
+        log = log or ImportLog(config, folder / "logs", stamped.time_ns)
+        log.add(stamped)
+    assert log is not None
+    log.finish()
+    (session,) = open_logs([folder / "logs"])
+    setup = Setup.of_log(session.attachments())
+    return setup, find_stamps(index_log(session), setup, read_clocks(session, setup).clocks.host)
+
+
+def errors_ns(clocks: FrozenClocks, stamps_ns: list[int], locked: int) -> tuple[list[int], float]:
+    """Errors of stamps every 50 ms over the log, placed as a job places them, and the greatest sigma."""
+    times = START_UNIX_NS + np.arange(SECONDS * 20, dtype=np.int64) * NS // 20
+    rows = np.zeros(len(times), DEVICE_CLOCK_DTYPE)
+    rows["host_time_ns"], rows["device_time_ns"] = times + LATENCY_NS + CLOCK_WRONG_NS, stamps_ns
+    rows["pps_time_ns"] = rows["pps_count"] = -1
+    rows["locked"] = locked
+    stream = clocks.for_stream()
+    stream.add_samples("scanner/top", rows)
+    stream.update()
+    gps_ns, sigma_ns = stream.gps_from_device("scanner/top", rows["device_time_ns"], rows["host_time_ns"])
+    truth = times - (UNIX_MINUS_GPS_S - LEAP) * NS
+    return (gps_ns - truth).tolist(), float(sigma_ns.max())
+
+
+HOURS = [(START_UNIX_NS + number * NS // 20) % (3600 * NS) for number in range(SECONDS * 20)]
+VLP16 = f'[scanner.top]\n{HEAD}protocol = "velodyne-vlp16"\n'
+WITH_AUX = VLP16 + 'auxiliary = "udp:0.0.0.0:8308"\n'
+XT32 = f'[scanner.top]\n{HEAD}protocol = "hesai-xt32"\n'
+
+
+def test_a_locked_head_without_position_packets_is_found_by_its_stamps(tmp_path: Path) -> None:
+    _, clocks = found(tmp_path, RECEIVER + VLP16 + 'pps = "main"\n', [*receiver(), *velodyne()])
+    assert clocks.stamps["scanner/top"].scale is StampScale.HOUR
+    error, sigma_ns = errors_ns(clocks, HOURS, -1)
+    assert max(map(abs, error)) < 1_000
+    assert sigma_ns <= 1e5
+    (line,) = stamp_lines(clocks)
+    assert line.startswith("scanner/top: its stamps are taken as utc-hour: they stand 0.")
+
+
+@pytest.mark.parametrize("off_us", [1_000_000, 300_000, 1_234_567_890])
+def test_a_head_that_is_not_locked_runs_free(tmp_path: Path, off_us: int) -> None:
+    _, clocks = found(tmp_path, RECEIVER + VLP16 + 'pps = "main"\n', [*receiver(), *velodyne(off_us)])
+    assert clocks.stamps["scanner/top"].scale is StampScale.FREE
+    assert stamp_lines(clocks) == []
+    _, sigma_ns = errors_ns(clocks, HOURS, -1)
+    assert sigma_ns > 1e6
+
+
+def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path: Path) -> None:
+    """The recording computer is 0.3 s wrong: the head's own seconds count, not the computer's."""
+    setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions()])
+    plan = clocks.host.plan.devices["scanner/top"]
+    assert plan.clock == "scanner/top"
+    refuse_no_time(tmp_path, plan.clock, clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS), setup.config)
+    error, sigma_ns = errors_ns(clocks, HOURS, 1)
+    assert max(map(abs, error)) < 1_000
+    assert sigma_ns == 20_000.0
+
+
+def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
+    units = [*velodyne(goes_on=True), *positions(goes_on=True)]
+    _, clocks = found(tmp_path, WITH_AUX, units)
+    error, sigma_ns = errors_ns(clocks, HOURS, 1)
+    assert max(map(abs, error)) < 1_000
+    assert sigma_ns == 20_000.0
+
+
+def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path: Path) -> None:
+    _, clocks = found(tmp_path, VLP16 + 'clock = "utc-hour"\n', velodyne())
+    error, _ = errors_ns(clocks, HOURS, -1)
+    assert max(map(abs, error)) < 1_000
+
+
+def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(tmp_path: Path) -> None:
+    setup, clocks = found(tmp_path, VLP16, velodyne())
+    plan = clocks.host.plan.devices["scanner/top"]
+    status = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS)
+    with pytest.raises(UserError, match=r"no source of time .*position packets .*scanner\.top\.clock"):
+        refuse_no_time(tmp_path, plan.clock, status, setup.config)
+
+
+@pytest.mark.parametrize(("beside_utc_s", "scale"), [(0, StampScale.UTC), (37, StampScale.TAI)])
+@pytest.mark.parametrize("configured", [False, True])
+def test_ptp_stamps_keep_their_fraction_on_either_scale(
+    tmp_path: Path, beside_utc_s: int, scale: StampScale, configured: bool
+) -> None:
+    """Found by a receiver's time; configured they are complete without one."""
+    stamps = [START_UNIX_NS + number * NS // 20 + beside_utc_s * NS for number in range(SECONDS * 20)]
+    text = f'{XT32}clock = "{scale.value}"\n' if configured else RECEIVER + XT32
+    units = hesai(beside_utc_s) if configured else [*receiver(), *hesai(beside_utc_s)]
+    _, clocks = found(tmp_path, text, units)
+    assert clocks.stamps["scanner/top"].scale is scale
+    error, sigma_ns = errors_ns(clocks, stamps, -1)
+    assert max(map(abs, error)) < 1_000
+    assert sigma_ns <= 1e5
