@@ -59,7 +59,7 @@ def no_time(found: NavigationLog, sources: NavigationSources, log: Path) -> str:
             "host that chrony keeps, or an IMU that says GPS time itself"
         )
     remedy = f"want PPS edges, or at least time messages of {sources.gnss_source}"
-    why = "; ".join([*([status.leap_doubt] if status.leap_doubt else []), *found.remarks]) or remedy
+    why = "; ".join(filter(None, [status.ambiguous, status.leap_doubt, *found.remarks])) or remedy
     return (
         f"{log}: {sources.clock}: the host's clock is {status.state.value}, so no sample of {sources.imu_source} has "
         f"GPS time; {why}"
