@@ -26,8 +26,7 @@ from calib.plane_search import find_planes
 from calib.plane_settings import PlaneSettings
 from calib.solve import Settings
 from calib.trajectory_errors import Knots, TrajectoryPrior, apply, from_smoother, knots_of
-from daemon.processing.calibrate_run import KNOT_S
-from daemon.processing.calibration_flight import read_flight, replaced
+from daemon.processing.calibration_flight import KNOT_S, read_flight, replaced
 from daemon.processing.flights import Wish as Logs
 from daemon.processing.flown import TrajectoryWish
 from daemon.processing.setup import Options

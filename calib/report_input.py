@@ -56,7 +56,9 @@ class DifferenceMap:
     Attributes:
         west_m, south_m: of the first cell's corner, in t.
         cell_m: its side.
-        before_m, after_m: (rows, columns) from south and west; nan: not compared.
+        before_m, after_m: (rows, columns) from south and west; nan: not compared. Where several pairs of strips meet,
+            it is the largest difference.
+        before_words, after_words: how far the strips differ, of all pairs, by the measure that the report tells.
     """
 
     west_m: float
@@ -64,6 +66,8 @@ class DifferenceMap:
     cell_m: float
     before_m: FloatArray
     after_m: FloatArray
+    before_words: str = ""
+    after_words: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +102,8 @@ class ReportInput:
         settings: of the run, in words, among them software and versions.
         notes: for the reader, one sentence each.
         title: of the whole; empty: made of installation and scanners.
+        measure: what the height differences are, for people; empty: unsaid.
+        level: the quality level that strips keep, or why there is none; empty: not judged.
     """
 
     flight: Flight
@@ -113,6 +119,8 @@ class ReportInput:
     settings: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     title: str = ""
+    measure: str = ""
+    level: str = ""
 
     @property
     def heading(self) -> str:

@@ -28,7 +28,6 @@ from calib.report_canvas import (
     colour_of,
 )
 from calib.report_input import DifferenceMap, ReportInput
-from calib.report_words import number
 
 FloatArray = NDArray[np.float64]
 
@@ -76,17 +75,18 @@ def difference_picture(report: ReportInput) -> Picture | None:
     def draw(canvas: Canvas) -> None:
         form = canvas.form
         width = (form.width_in - 0.1) / form.columns - 0.7
-        for i, (words, values_m) in enumerate((("Before", grid.before_m), ("After", grid.after_m))):
+        panels = (("Before", grid.before_m, grid.before_words), ("After", grid.after_m, grid.after_words))
+        for i, (words, values_m, told) in enumerate(panels):
             row, column = divmod(i, form.columns)
             top = 0.75 + row * (height(form) + 0.75)
             axes = canvas.panel(0.62 + column * (width + 0.7), top, width, height(form))
             _differences(axes, grid, 100.0 * values_m)
-            axes.set_title(f"{words}: {_rms_words(values_m)}", loc="left", fontsize=8.5, color=INK, pad=4)
+            axes.set_title(f"{words}: {told}" if told else words, loc="left", fontsize=8.5, color=INK, pad=4)
             shown.frame(axes, width / height(form))
             _words(axes)
         canvas.legend(_difference_legend(), 3 if form.narrow else 9)
 
-    words = "Height differences of overlapping strips, cell by cell, first − second."
+    words = "Height differences of overlapping strips, first − second, of each cell the largest; RMSDz is of all pairs."
     return Picture("Difference maps", words, height_in, draw)
 
 
@@ -97,14 +97,6 @@ def _side_by_side(shown: _Shown) -> Callable[[Format], float]:
         return float(np.clip(width * size[1] / size[0], 0.3 * width, 1.3 * width))
 
     return height
-
-
-def _rms_words(values_m: FloatArray) -> str:
-    known = values_m[np.isfinite(values_m)]
-    if not len(known):
-        return "nothing compared"
-    rms_cm, mean_cm = 100.0 * float(np.sqrt(np.mean(known**2))), 100.0 * float(known.mean())
-    return f"RMS {number(rms_cm, '.1f')} cm, mean {number(mean_cm, '+.1f')} cm"
 
 
 def _differences(axes: Axes, grid: DifferenceMap, values_cm: FloatArray) -> None:

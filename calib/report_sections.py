@@ -100,7 +100,8 @@ def cards_of(report: ReportInput) -> list[tuple[str, str]]:
     cards += [(length(offset_m), "range offset, sigma")] if offset_m is not None else []
     if after_m is not None:
         was = f", before {length(before_m)}" if before_m is not None else ""
-        cards.append((length(after_m), f"RMSDz of strips{was}"))
+        level = f"; {report.level}" if report.level else ""
+        cards.append((length(after_m), f"RMSDz of strips{was}{level}"))
     cards.append((str(len(report.flight.swaths)), "strips"))
     cards += [(thousands(len(features.planes)), "planes")] if features.planes else []
     cards += [(thousands(len(features.ties)), "tie points")] if features.ties else []

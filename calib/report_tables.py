@@ -172,7 +172,8 @@ def strips_table(report: ReportInput) -> Table | None:
         told = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
         rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *told])
     heads = ("strips", "compared", "RMSDz before", "RMSDz after", "mean", "std", "largest")
-    return Table("", heads, rows, "Centimetres." + _more(len(pairs)))
+    measure = f" {report.measure}." if report.measure else ""
+    return Table("", heads, rows, f"Centimetres.{measure}{_more(len(pairs))}")
 
 
 def _more(count: int) -> str:

@@ -287,7 +287,7 @@ RULES: tuple[Rule, ...] = (
         _strips,
         0.08,
         0.5,
-        "strips differ by {value} (RMS of height differences) after the calibration",
+        "strips differ by {value} (RMSDz) after the calibration",
         "look below which pairs do: a strip of its own kind has a bad trajectory",
         length,
     ),
@@ -347,7 +347,7 @@ def accuracy_words(report: ReportInput) -> str:
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []
     rms_m = overall_rms_m(dict(report.after))
     told = ", ".join(words) or "nothing was estimated"
-    return told + (f"; strips agree to {length(rms_m)} (RMS of height differences)" if rms_m is not None else "")
+    return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
 
 
 def _sentence(level: Level, report: ReportInput, reasons: list[Reason]) -> str:

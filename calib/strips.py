@@ -132,8 +132,6 @@ class StripReport:
         refused: cells of pairs that were not compared, by reason.
         cell_m: side of the cells.
         checks: behind it.
-        repeatability_m: by strip, of single returns on its smoothest quarter of gentle ground, rough or not: what is
-            held against a specification's limit within strips. (Roughness leaves out what is rougher than is compared.)
     """
 
     names: tuple[str, ...]
@@ -143,7 +141,6 @@ class StripReport:
     refused: Counter[str]
     cell_m: float
     checks: Checks = field(repr=False)
-    repeatability_m: dict[str, float] = field(default_factory=dict)
 
 
 def differences(flight: Flight, rules: StripRules | None = None) -> StripReport:
@@ -167,25 +164,22 @@ def report_of(names: Sequence[str], gathered: Gathered, rules: StripRules, cell_
         for number, name in enumerate(names)
         if (good := (planes.strip == number) & (planes.reason == 0)).any()
     }
-    repeats = {
-        name: value for number, name in enumerate(names) if (value := _repeatability(planes, number)) is not None
-    }
-    return StripReport(tuple(names), tuple(pairs), _pair("", "", checks), rms, refused, cell_m, checks, repeats)
+    return StripReport(tuple(names), tuple(pairs), _pair("", "", checks), rms, refused, cell_m, checks)
 
 
-def _repeatability(planes: _Planes, strip: int) -> float | None:
-    """Sigma of single returns about a hard surface; None: there is no gentle ground.
+def single_return_sigma_m(variance_m2: FloatArray, count: FloatArray) -> float:
+    """Return the sigma of single returns about a hard surface, metres.
 
     By the lower quartile of the planes' variances, which what grows on the rest does not move. Quartile of χ²: Wilson
     and Hilferty (1931).
+
+    Args:
+        variance_m2: (n,) of returns about their planes, by their number less 3.
+        count: (n,) returns of each plane.
     """
-    gentle = planes.normal[:, 2] >= GENTLE
-    own = (planes.strip == strip) & gentle & ((planes.reason == 0) | (planes.reason == 1))
-    if not own.any():
-        return None
-    spread = 2.0 / (9.0 * np.maximum(planes.count[own] - 3, 1))
+    spread = 2.0 / (9.0 * np.maximum(count - 3, 1))
     quartile = (1.0 - spread - 0.67449 * np.sqrt(spread)) ** 3
-    return float(np.sqrt(np.quantile(planes.rms_m[own] ** 2 / quartile, 0.25)))
+    return float(np.sqrt(np.quantile(variance_m2 / quartile, 0.25)))
 
 
 def _pair(first: str, second: str, checks: Checks) -> PairReport:

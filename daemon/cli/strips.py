@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from daemon.processing.installed import require_installed
 if TYPE_CHECKING:
     from daemon.processing.flights import Wish
 
+SMALLEST_CELL_M = 0.05
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
 
 
@@ -35,6 +37,10 @@ def command(
     ] = None,
     level: Annotated[str | None, typer.Option(help="QL0, QL1, QL2 or QL3, which the strips must keep.")] = None,
     cells: Annotated[int, typer.Option(help="Of the overlap, that are looked into.", min=100)] = 20_000,
+    cell: Annotated[
+        float | None,
+        typer.Option("--cell", metavar="METRES", help="Side of a cell; default: by the thinnest strip's density."),
+    ] = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text or CSV; default: their IMU and GNSS."),
@@ -66,7 +72,8 @@ def command(
     With --adjust: correct the trajectory of each strip instead, into files for swath georef --trajectory.
 
     Exit code 1 when the differences show an error of the calibration that matters, when the level asked for is not
-    kept, or when nothing could be compared; 2 and 3 as ever.
+    kept, when strips are too far apart to tell why, when there are too few cells for a verdict, or when nothing could
+    be compared; 2 and 3 as ever.
     """
     require_installed("swath strips", *(["matplotlib"] if output else []))
     from daemon.cli.georef import calibrations_given
@@ -75,6 +82,8 @@ def command(
     from daemon.processing.flown import TrajectoryWish
     from daemon.processing.setup import Options
 
+    if cell is not None and not (math.isfinite(cell) and cell >= SMALLEST_CELL_M):
+        raise UserError(f"--cell: got {cell:g}, want metres, {SMALLEST_CELL_M:g} or more", ExitCode.USAGE)
     if level is not None and level not in LEVELS:
         raise UserError(f'--level: got "{level}", want one of {", ".join(LEVELS)}', ExitCode.USAGE)
     logs = Wish(
@@ -89,22 +98,28 @@ def command(
         workers=workers or os.cpu_count() or 1,
     )
     if adjust is not None:
-        _refuse_besides(("--before", before), ("--output", output), ("--level", level))
+        _refuse_besides(("--before", before), ("--output", output), ("--level", level), ("--cell", cell))
         _adjust(logs, adjust, control, strip_model, overwrite=overwrite, as_json=as_json)
         return
     if control or overwrite or strip_model != "auto":
         named = "--control" if control else "--overwrite" if overwrite else "--strip-model"
         raise UserError(f"{named}: is of an adjustment; want --adjust DIR too", ExitCode.USAGE)
-    _compare(logs, before or (), cells, output, level, as_json=as_json)
+    _compare(logs, before or (), (cells, cell), output, level, as_json=as_json)
 
 
 def _compare(
-    logs: Wish, before: Sequence[Path], cells: int, output: Path | None, level: str | None, *, as_json: bool
+    logs: Wish,
+    before: Sequence[Path],
+    cells: tuple[int, float | None],
+    output: Path | None,
+    level: str | None,
+    *,
+    as_json: bool,
 ) -> None:
     from daemon.processing.progress import progress_bar
-    from daemon.processing.strips_run import StripsWish, compare_strips, most_cells
+    from daemon.processing.strips_run import StripsWish, compare_strips, rules_of
 
-    wish = StripsWish(logs.logs, logs, before, most_cells(cells), output, level)
+    wish = StripsWish(logs.logs, logs, before, rules_of(*cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = compare_strips(wish, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))

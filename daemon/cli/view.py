@@ -20,7 +20,11 @@ def command(
         typer.Option("--output", "-o", metavar="DIR", help="Where to; else the folder `view` beside the files."),
     ] = None,
     cell: Annotated[
-        float | None, typer.Option(metavar="M", help="Side of a cell; else from the density of points.")
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Side of a cell; else from the density of points. Strips are compared in cells as large or larger.",
+        ),
     ] = None,
     profile: Annotated[
         str | None,

@@ -7,6 +7,7 @@ import hashlib
 import importlib.metadata
 import io
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,14 +19,15 @@ from calib.calibration_file import CalibrationFileError, Header, calibration_tex
 from calib.outcome import Adjusted
 from calib.profile_check import Check
 from calib.record_values import Plain
-from calib.report_input import DifferenceMap, ReportInput
+from calib.report_input import ReportInput
 from calib.report_verdict import Verdict, judge
-from calib.strips import Numbers, StripReport, differences
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
+from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
+from daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from daemon.processing.trajectory_files import write_whole
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -47,7 +49,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
         UserError: it cannot be written.
     """
     tell("strips before and after", 0, 1)
-    before, after = differences(done.kept.flight), differences(done.flight)
+    before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
     inputs = _inputs(wish, done)
     headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
     try:
@@ -125,8 +127,8 @@ def method_of(done: Calibrated) -> str:
 def _record(
     done: Calibrated,
     headers: Mapping[str, Header],
-    before: StripReport,
-    after: StripReport,
+    before: FlightStrips,
+    after: FlightStrips,
     inputs: list[tuple[str, str]],
 ) -> dict[str, Any]:
     """For scripts."""
@@ -167,12 +169,15 @@ def _record(
     }
 
 
-def strips_entry(report: StripReport) -> dict[str, Any]:
-    """Height differences of all pairs together, and pair by pair."""
-    return {
-        "all": _numbers(report.all.height),
-        "pairs": [{"first": pair.first, "second": pair.second, **_numbers(pair.height)} for pair in report.pairs],
-    }
+def strips_entry(strips: FlightStrips) -> dict[str, Any]:
+    """Height differences of all pairs together, and pair by pair, and the quality level by them."""
+    told = strips.agreement.numbers or {}
+    every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
+    pairs = [
+        {"first": first, "second": second, "n": one.count, "mean_m": one.mean_m, "std_m": one.std_m, "rms_m": one.rms_m}
+        for (first, second), one in strips.pairs().items()
+    ]
+    return {"all": every, "pairs": pairs, "quality": finite(strips.agreement.record())}
 
 
 def profiles_entry(check: Check) -> dict[str, Any]:
@@ -195,13 +200,6 @@ def profiles_entry(check: Check) -> dict[str, Any]:
     return {"comparisons": compared, "missing": missing, "profiles": profiles}
 
 
-def _numbers(height: Any) -> dict[str, Any]:
-    values = {"n": height.count, "mean_m": height.mean_m, "std_m": height.std_m, "rms_m": height.rms_m}
-    return {
-        key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in values.items()
-    }
-
-
 def _verdict_entry(verdict: Verdict) -> dict[str, Any]:
     reasons = [{"level": one.level.name.lower(), "what": one.what, "remedy": one.change} for one in verdict.reasons]
     return {"level": verdict.level.name.lower(), "sentence": verdict.sentence, "reasons": reasons}
@@ -211,8 +209,8 @@ def _report(
     wish: CalibrateWish,
     done: Calibrated,
     headers: Mapping[str, Header],
-    before: StripReport,
-    after: StripReport,
+    before: FlightStrips,
+    after: FlightStrips,
     inputs: list[tuple[str, str]],
 ) -> ReportInput:
     return ReportInput(
@@ -220,14 +218,30 @@ def _report(
         features=done.features,
         adjusted=done.adjusted,
         headers=headers,
-        before=_pairs(before),
-        after=_pairs(after),
-        differences=difference_map(before, after),
+        before=before.pairs(),
+        after=after.pairs(),
+        differences=difference_map(before, after, _middle_on_map(done), MAP_CELLS),
+        measure=after.agreement.measure,
+        level=level_words(after),
         check=done.check,
         inputs=inputs,
         settings=_settings(wish, done),
         notes=[note for note in done.notes if note not in done.adjusted.notes],  # which the report has anyway
     )
+
+
+def _middle_on_map(done: Calibrated) -> list[float]:
+    """East and north of the flight's middle, from which maps count."""
+    mapping, frame = done.kept.logged[0].setup.mapping, done.flight.frame
+    return [0.0, 0.0] if mapping is None else mapping.map_from_e(frame.origin_e[np.newaxis])[0, :2].tolist()
+
+
+def level_words(strips: FlightStrips) -> str:
+    """The quality level that strips keep, in words."""
+    agreement = strips.agreement
+    if not agreement.judged:
+        return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
+    return f"strips keep {agreement.best or 'no quality level'}"
 
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
@@ -256,29 +270,6 @@ def _npz(arrays: Mapping[str, Any]) -> bytes:
     return file.getvalue()
 
 
-def _pairs(report: StripReport) -> dict[tuple[str, str], Numbers]:
-    return {(pair.first, pair.second): pair.height for pair in report.pairs if pair.height.count}
-
-
-def difference_map(before: StripReport, after: StripReport) -> DifferenceMap | None:
-    """Height differences of all pairs on one grid in t, the largest of a cell; None: there are none."""
-    places = np.concatenate([report.checks.point[report.checks.gentle] for report in (before, after)])
-    if not len(places):
-        return None
-    cell_m = max(before.cell_m, after.cell_m, float(np.ptp(places[:, :2], axis=0).max()) / MAP_CELLS)
-    west_m, south_m = np.floor(places[:, :2].min(axis=0) / cell_m) * cell_m
-    columns, rows = (np.ceil((places[:, :2].max(axis=0) - (west_m, south_m)) / cell_m) + 1).astype(int)
-    grids = []
-    for report in (before, after):
-        checks = report.checks.take(report.checks.gentle)
-        order = np.argsort(np.abs(checks.height_m), kind="stable")
-        at = ((checks.point[order, :2] - (west_m, south_m)) / cell_m).astype(int)
-        grid = np.full((rows, columns), np.nan)
-        grid[at[:, 1], at[:, 0]] = checks.height_m[order]  # of a cell's the largest comes last
-        grids.append(grid)
-    return DifferenceMap(float(west_m), float(south_m), cell_m, *grids)
-
-
 def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
     air = done.kept.logged[0].setup.config.atmosphere
     return {
@@ -294,7 +285,7 @@ def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
 # ---------------------------------------------------------------------- for people
 
 
-def _lines(done: Calibrated, knots: Sequence[float], before: StripReport, after: StripReport) -> list[str]:
+def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after: FlightStrips) -> list[str]:
     adjusted = done.adjusted
     lines = [f"{'parameter':34}{'start':>14}{'found':>14}{'sigma':>12}"]
     lines += _parameter_lines(adjusted, knots)
@@ -307,8 +298,9 @@ def _lines(done: Calibrated, knots: Sequence[float], before: StripReport, after:
     used = f", {control} of {len(done.control)} control points" if done.control else ""
     fit = f"redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
     lines.append(f"{' and '.join(seen)}{used}, {fit}")
-    rms = [report.all.height.rms_m for report in (before, after)]
-    lines.append(f"strips differ by {rms[0]:.3f} m (RMS) before, {rms[1]:.3f} m after")
+    rms = [f"{strips.rms_m:.3f} m" if math.isfinite(strips.rms_m) else "nothing" for strips in (before, after)]
+    lines.append(f"strips differ by {rms[0]} (RMSDz) before, {rms[1]} after; {level_words(after)}")
+    lines.append(after.agreement.measure)
     lines += _profile_lines(done.check)
     return [*lines, *(f"note: {note}" for note in done.notes)]
 

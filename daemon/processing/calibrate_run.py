@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from calib.adjust import adjust
 from calib.control import ControlError, control_planes, in_t, read_control
@@ -35,10 +34,16 @@ from calib.plane_settings import PlaneError, PlaneSettings
 from calib.prealign import PrealignError, prealign
 from calib.profile_check import Check, check
 from calib.record_values import Plain
-from calib.trajectory_errors import TrajectoryPrior, from_smoother, gauss_markov, knots_of
+from calib.trajectory_errors import TrajectoryPrior, gauss_markov
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
-from daemon.processing.calibration_flight import KeptFlight, read_flight, refuse_without_noise, replaced
+from daemon.processing.calibration_flight import (
+    KeptFlight,
+    read_flight,
+    refuse_without_noise,
+    replaced,
+    smoothed_prior,
+)
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
@@ -47,11 +52,7 @@ from georef.mapping import MappingError
 from georef.strips import StripError
 from georef.trajectory import TrajectoryError
 
-if TYPE_CHECKING:
-    from georef.navigation.cross_covariance import ErrorChain
-
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
-KNOT_S = 0.4
 OUTCOME = "calibration.json"  # of a report
 # All returns of a patch share what the attitude does between two knots, some millimetres: the mean of 25 is as good as
 # that, and the mean of thousands would be taken for better than it is.
@@ -293,14 +294,7 @@ def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Seq
 
 def prior_of(kept: KeptFlight) -> TrajectoryPrior:
     """The trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
-    chains: list[ErrorChain] = []
-    knots = knots_of(kept.flight, KNOT_S)
-    for number, flight in enumerate(kept.logged):
-        legs = [] if flight.navigated is None else flight.navigated.legs
-        if len(legs) != 1:
-            return gauss_markov(kept.flight)
-        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.flown == number]))
-    return from_smoother(kept.flight, chains, KNOT_S)
+    return smoothed_prior(kept) or gauss_markov(kept.flight)
 
 
 # ---------------------------------------------------------------------- results

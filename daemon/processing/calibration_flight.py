@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.flight import Flight, Head, Swath, Tangent
+from calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
 from daemon.config.config import Config
 from daemon.config.tables import ScannerConfig
 from daemon.errors import UserError
@@ -35,6 +36,10 @@ from georef.strips import Segment, segments
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise
 
+if TYPE_CHECKING:
+    from georef.navigation.cross_covariance import ErrorChain
+
+KNOT_S = 0.4  # between knots of the trajectory's errors
 TRAJECTORY_MARGIN_NS = 2_000_000_000
 PLACED_ROWS = 1 << 18
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -84,6 +89,18 @@ def refuse_without_noise(kept: KeptFlight) -> None:
                 f"{kept.logged[0].log}: scanner.{head.name}: range_sigma_m, angle_sigma_deg and divergence_mrad are "
                 "all 0; want the scanner's own: an adjustment weighs returns by them"
             )
+
+
+def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
+    """Return the joint covariance of trajectories that were smoothed here; None: one was not, or in several legs."""
+    chains: list[ErrorChain] = []
+    knots = knots_of(kept.flight, KNOT_S)
+    for number, flight in enumerate(kept.logged):
+        legs = [] if flight.navigated is None else flight.navigated.legs
+        if len(legs) != 1:
+            return None
+        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.flown == number]))
+    return from_smoother(kept.flight, chains, KNOT_S)
 
 
 def read_flight(wish: Wish, folder: Path, tell: Steps) -> KeptFlight:

@@ -32,24 +32,13 @@ from daemon.processing.quicklook_read import (
     read_blocks,
     units_of,
 )
-from daemon.processing.quicklook_strips import MOST_STRIPS, Overlap, StripCells, compare
+from daemon.processing.quicklook_strips import FINEST_CELL_M, MOST_STRIPS, Overlap, StripCells, compare, strip_frame
+from daemon.processing.strip_agreement import Agreement
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
 RETURNS_A_CELL = 4  # of the pictures: two point spacings a side
-RETURNS_A_STRIP_CELL = 16  # of one strip: enough for a plane
-FINEST_STRIP_CELL_M, COARSEST_STRIP_CELL_M = 0.5, 20.0
 SAMPLED_FILES = 5
-
-# USGS Lidar Base Specification: level, pulses a m², RMSDz and largest difference of overlapping swaths in metres
-QUALITY_LEVELS = (
-    ("QL0", 8.0, 0.04, 0.08),
-    ("QL1", 8.0, 0.08, 0.16),
-    ("QL2", 2.0, 0.08, 0.16),
-    ("QL3", 0.5, 0.16, 0.32),
-)
-ASPRS_CLASSES_M = (0.01, 0.025, 0.05, 0.10, 0.15, 0.20, 0.333, 0.667, 1.0, 3.333)  # ASPRS 2014, table 7.2
-ASPRS_SWATH_FACTOR = 0.8  # of a class, its limit of RMSDz between swaths
 
 Told = Callable[[int, int], None]
 
@@ -106,7 +95,7 @@ class Look:
         sources, units: files, their unit.
         names, origins: of strips by number, and of which sessions' run and point source id they are.
         surface: cells of all strips together.
-        cells, overlap: strips apart, and against each other.
+        cells, overlap, agreement: strips apart, and against each other.
         strips: their facts by number.
         profile: None: no points for one.
         density: mean pulses per m² of wholly covered cells; area_m2: of all covered ones.
@@ -120,6 +109,7 @@ class Look:
     surface: Surface
     cells: StripCells
     overlap: Overlap
+    agreement: Agreement
     strips: list[StripFacts]
     profile: Profile | None
     density: float
@@ -134,6 +124,7 @@ def look_at(
     cell_m: float | None = None,
     ends: Sequence[float] | None = None,
     told: Told = lambda done, of: None,
+    strip_cell_m: float | None = None,
 ) -> Look:
     """Read files and folders.
 
@@ -142,6 +133,8 @@ def look_at(
         cell_m: side of the pictures' cells; None: from the density of points.
         ends: x1, y1, x2, y2 of the profile in the files' coordinates; None: chosen.
         told: called with points read and points there are.
+        strip_cell_m: side of the cells in which strips are compared; None: from the strips' density, beginning with
+            ``cell_m`` where that is given and not too fine.
 
     Raises:
         QuickLookError: there is nothing to look at, or not on one map.
@@ -152,15 +145,15 @@ def look_at(
     if total == 0:
         raise QuickLookError(f"{', '.join(str(source.path) for source in sources)}: no points")
     units = units_of(sources)
-    reading = _read(sources, units, cell_m, told)
+    reading = _read(sources, units, (cell_m, strip_cell_m), told)
     if reading.surface.points == 0:
         damage = next((f"{source.path}: {source.damage}" for source in sources if source.damage), "")
         raise QuickLookError(damage or f"{sources[0].path}: all points are noise or withheld")
     overlap = compare(reading.cells)
     strips = [_facts(reading, number) for number in range(len(reading.book.names))]
     profile = _profile(reading, overlap, strips, ends)
-    density, area_m2 = _density(reading.surface)
-    notes = _notes(reading, overlap, cell_m)
+    agreement = Agreement.of(reading.cells, overlap)
+    notes = _notes(reading, overlap, cell_m, strip_cell_m)
     return Look(
         sources,
         units,
@@ -168,10 +161,11 @@ def look_at(
         reading.surface,
         reading.cells,
         overlap,
+        agreement,
         strips,
         profile,
-        density,
-        area_m2,
+        agreement.pulses_m2,
+        agreement.area_m2,
         reading.skipped,
         notes,
         reading.book.origins,
@@ -188,18 +182,14 @@ def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, Float
     return corners[good, 0].min(axis=0), corners[good, 1].max(axis=0)
 
 
-def _sides(
-    sources: Sequence[Source], units: Units, corners: tuple[FloatArray, FloatArray], cell_m: float | None
-) -> tuple[float, float]:
-    """Sides of the cells of the pictures and of the comparison of strips."""
+def _picture_side_m(sources: Sequence[Source], units: Units, corners: tuple[FloatArray, FloatArray]) -> float:
+    """Side of the cells of the pictures, by some of the files' points."""
     full = [source for source in sources if source.point_count]
     sampled = full[:: -(-len(full) // SAMPLED_FILES)]
     size_m = np.maximum((corners[1] - corners[0])[:2], 1.0)
     density = float(np.median([density_near(source, units) for source in sampled]))
     density = density or sum(source.point_count for source in full) / float(size_m.prod())
-    strip_side_m = cell_for(density, RETURNS_A_STRIP_CELL)
-    side_m = cell_m or cell_for(density, RETURNS_A_CELL)
-    return side_m, float(np.clip(max(strip_side_m, cell_m or 0.0), FINEST_STRIP_CELL_M, COARSEST_STRIP_CELL_M))
+    return cell_for(density, RETURNS_A_CELL)
 
 
 class _Reading:
@@ -210,14 +200,17 @@ class _Reading:
         sources: Sequence[Source],
         units: Units,
         corners: tuple[FloatArray, FloatArray],
-        sides_m: tuple[float, float],
+        side_m: float,
+        strip_side_m: tuple[float | None, bool],
         told: Told,
     ) -> None:
         self.sources, self.units, self.told = sources, units, told
         self.total = sum(source.point_count for source in sources)
         low_m, high_m = corners
-        self.surface = Surface(frame_of(low_m, high_m, sides_m[0]))
-        self.cells = StripCells(frame_of(low_m, high_m, sides_m[1]), float(low_m[2] + high_m[2]) / 2)
+        self.surface = Surface(frame_of(low_m, high_m, side_m))
+        finest_m, fixed = strip_side_m
+        frame = strip_frame(low_m, high_m, finest_m)
+        self.cells = StripCells(frame, float(low_m[2] + high_m[2]) / 2, fixed=fixed)
         self.sums, self.book, self.skipped = StripSums(), StripBook(), 0
 
     def read(self) -> None:
@@ -235,15 +228,21 @@ class _Reading:
                 self.told(done, self.total)
 
 
-def _read(sources: Sequence[Source], units: Units, cell_m: float | None, told: Told) -> _Reading:
-    """All files; a second time where a header lies about its extent: the points themselves say it then."""
+def _read(sources: Sequence[Source], units: Units, given_m: tuple[float | None, float | None], told: Told) -> _Reading:
+    """All files; a second time where a header lies about its extent: the points themselves say it then.
+
+    ``given_m``: sides of the cells of the pictures and of the strips; None: to be found.
+    """
     corners = _corners(sources, units)
-    sides_m = _sides(sources, units, corners, cell_m)
-    reading = _Reading(sources, units, corners, sides_m, told)
+    cell_m, strip_cell_m = given_m
+    side_m = cell_m or _picture_side_m(sources, units, corners)
+    finest_m = cell_m if cell_m is not None and cell_m >= FINEST_CELL_M else None
+    strip_side_m = (finest_m, False) if strip_cell_m is None else (strip_cell_m, True)
+    reading = _Reading(sources, units, corners, side_m, strip_side_m, told)
     reading.read()
     if reading.surface.outside:
         corners = (reading.surface.low_m, reading.surface.high_m)
-        reading = _Reading(sources, units, corners, sides_m, told)
+        reading = _Reading(sources, units, corners, side_m, strip_side_m, told)
         reading.read()
     return reading
 
@@ -265,13 +264,6 @@ def _facts(reading: _Reading, number: int) -> StripFacts:
     density = float(coverage.pulses[whole].mean()) / cell_m**2 if whole.any() else math.nan
     area_m2 = float(coverage.there.sum()) * cell_m**2
     return StripFacts(reading.book.names[number], points, pulses, area_m2, density, length_m, sigma_m, largest_m)
-
-
-def _density(surface: Surface) -> tuple[float, float]:
-    """Mean pulses per m² where cells are covered wholly, and the area covered."""
-    density, cell_m = surface.density()
-    there = np.isfinite(density)
-    return float(density[inner(there)].mean()) if there.any() else math.nan, float(there.sum()) * cell_m**2
 
 
 def _profile(
@@ -297,7 +289,7 @@ def _profile(
     return profile
 
 
-def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None) -> list[str]:
+def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell_m: float | None) -> list[str]:
     """What was taken for granted, left out or changed."""
     notes = [reading.units.note] if reading.units.note else []
     notes += reading.book.notes
@@ -309,6 +301,9 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None) -> list[st
         )
     if cell_m and reading.surface.frame.cell_m > cell_m:
         notes.append(f"cells of {cell_m:g} m would be too many; they are {reading.surface.frame.cell_m:g} m")
+    if strip_cell_m and reading.cells.frame.cell_m > strip_cell_m:
+        made_m = reading.cells.frame.cell_m
+        notes.append(f"cells of {strip_cell_m:g} m would be too many; strips are compared in cells of {made_m:g} m")
     if reading.skipped:
         notes.append(f"{reading.skipped:,} points left out: noise (classes 7 and 18) or withheld")
     if reading.surface.unknown_sigma:
@@ -318,34 +313,6 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None) -> list[st
     if len(reading.book.names) > MOST_STRIPS:
         notes.append(f"only the first {MOST_STRIPS:,} of {len(reading.book.names):,} strips were compared")
     return notes
-
-
-def quality_of(look: Look) -> dict[str, Any]:
-    """Which USGS quality levels and which ASPRS 2014 class the numbers keep; None: nothing to judge by."""
-    all_pairs = look.overlap.numbers()
-    levels = []
-    for level, density, rms_m, max_m in QUALITY_LEVELS:
-        within = None
-        if all_pairs:
-            half = round(max_m * 1000)
-            middle = len(look.overlap.signed) // 2
-            within = float(look.overlap.signed[middle - half : middle + half + 1].sum()) / look.overlap.cells
-        levels.append(
-            {
-                "level": level,
-                "density_limit": density,
-                "density_ok": bool(look.density >= density),
-                "rmsdz_limit_m": rms_m,
-                "rmsdz_ok": None if all_pairs is None else bool(all_pairs["rms_m"] <= rms_m),
-                "max_limit_m": max_m,
-                "share_within_max": within,
-            }
-        )
-    best = next((one["level"] for one in levels if one["density_ok"] and one["rmsdz_ok"]), None)
-    kept = None
-    if all_pairs:
-        kept = next((size for size in ASPRS_CLASSES_M if all_pairs["rms_m"] <= ASPRS_SWATH_FACTOR * size), None)
-    return {"levels": levels, "best": best if all_pairs else None, "asprs_class_m": kept}
 
 
 def numbers_of(look: Look) -> dict[str, Any]:
@@ -376,7 +343,7 @@ def numbers_of(look: Look) -> dict[str, Any]:
             row | {"first": look.names[row["first"]], "second": look.names[row["second"]]} for row in look.overlap.rows
         ],
         "overlap": look.overlap.numbers(),
-        "quality": quality_of(look),
+        "quality": look.agreement.record(),
         "notes": look.notes,
     }
 

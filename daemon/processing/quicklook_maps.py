@@ -336,7 +336,7 @@ def draw_differences(look: Look, path: Path) -> None:
     made.get_title().set(fontsize=8.5, color=INK)
     made.set_alignment("left")
     told = (
-        f"RMSDz {100 * numbers['rms_m']:.1f} cm\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
+        f"RMSDz {100 * numbers['rms_m']:.1f} cm (all pairs)\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
         f"largest {100 * numbers['max_m']:.1f} cm"
     )
     page.say(1.2, told)

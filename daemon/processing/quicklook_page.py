@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-from daemon.processing.quicklook import ASPRS_SWATH_FACTOR, Look, quality_of
+from calib.accuracy_standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from daemon.processing.quicklook import Look
 from daemon.processing.quicklook_maps import (
     draw_density,
     draw_differences,
@@ -108,16 +109,18 @@ def _crs_words(look: Look) -> str:
 
 
 def _figures(look: Look) -> str:
-    numbers, quality = look.overlap.numbers(), quality_of(look)
+    agreement = look.agreement
     cards = [
         (thousands(look.surface.points), "points"),
         (_area(look.area_m2), "covered"),
         (f"{look.density:.3g} per m²", "pulses, all strips together"),
         (str(len(look.strips)), "strip" if len(look.strips) == 1 else "strips"),
     ]
-    if numbers:
-        cards.append((f"{100 * numbers['rms_m']:.1f} cm", "RMSDz of overlapping strips"))
-        cards.append((quality["best"] or "none", "best quality level kept"))
+    if agreement.numbers:
+        words = f"RMSDz of strips, planes in cells of {agreement.cell_m:g} m"
+        cards.append((f"{100 * agreement.numbers['rms_m']:.1f} cm", words))
+        level = agreement.best or ("none" if agreement.judged else "no verdict")
+        cards.append((level, "best quality level kept"))
     sigma_m = _root_mean_square(look)
     if sigma_m is not None:
         cards.append((f"{100 * sigma_m:.1f} cm", "sigma of height"))
@@ -167,37 +170,47 @@ def _judged(kept: bool | None) -> str:
 
 
 def _quality(look: Look) -> str:
-    quality, numbers = quality_of(look), look.overlap.numbers()
-    rows = [
-        [
-            one["level"],
-            f"≥ {one['density_limit']:g}",
-            _judged(one["density_ok"]),
-            f"≤ {100 * one['rmsdz_limit_m']:g} cm",
-            _judged(one["rmsdz_ok"]),
-            f"± {100 * one['max_limit_m']:g} cm",
-            "–" if one["share_within_max"] is None else f"{_percent(one['share_within_max'])} of cells",
-        ]
-        for one in quality["levels"]
-    ]
-    heads = ("level", "pulses per m²", f"here {look.density:.3g}", "RMSDz", "", "largest |dZ|", "")
-    measured = f"here {100 * numbers['rms_m']:.1f} cm" if numbers else "not compared"
-    told = "No strips overlap on smooth ground: relative accuracy is not judged."
-    if numbers:
-        size_m = quality["asprs_class_m"]
-        kept = f"the {100 * size_m:g} cm class" if size_m else "no class"
-        told = (
-            f"ASPRS 2014: RMSDz between swaths of at most {ASPRS_SWATH_FACTOR:g} × the vertical accuracy class; "
-            f"{100 * numbers['rms_m']:.1f} cm keeps {kept}."
-        )
+    agreement = look.agreement
+    if not agreement.judged:
+        return f"<h2>Quality levels</h2><p>{escape(_unjudged(look))}</p>"
+    numbers = agreement.numbers
+    assert numbers is not None
+    within_m = agreement.record()["within_m"]
+    kept = {one.level: one.kept for one in agreement.judged if one.standard == USGS}
+    rows = []
+    for level in QUALITY_LEVELS:
+        row = [level.name]
+        for limit, word in (
+            (f"≥ {level.pulses_m2:g}", "pulses_m2"),
+            (f"≤ {100 * level.overlap_m:g} cm", "overlap_m"),
+            (f"≤ {100 * level.overlap_max_m:g} cm", "overlap_max_m"),
+            (f"≤ {100 * level.within_m:g} cm", "within_m"),
+        ):
+            row += [limit, _judged(kept[level.name][word])]
+        rows.append(row)
+    heads = ["level", "pulses per m²", f"here {agreement.pulses_m2:.3g}", "RMSDz", f"here {_cm(numbers['rms_m'])}"]
+    heads += ("99 % of |dZ|", f"here {_cm(numbers['p99_m'])}", "within strips", f"here {_cm(within_m)}")
+    told = " ".join(f"{escape(line)}." for line in agreement.verdicts() if line != TO_CONFIRM)
     return (
         "<h2>Quality levels</h2>"
-        + _table([*heads[:4], measured, *heads[5:]], rows)
-        + f"<p>{told}</p><p class='muted'>Limits of the USGS Lidar Base Specification. Density: first returns "
-        "per m² where cells are covered wholly, all strips together. Single cars or leaves decide over a largest |dZ|, "
-        "so the share of cells within it is given instead of a verdict. Absolute accuracy wants check points; nothing "
-        "here says it.</p>"
+        + _table(heads, rows)
+        + f"<p>{told}</p><p class='muted'>{escape(agreement.measure)}. Density: first returns per m² where cells are "
+        "covered wholly, all strips together. Single cars or leaves decide over a largest |dZ|, so 99 % of the cells "
+        f"must keep its limit. ASPRS asks for an RMSDz between swaths of at most {ASPRS_OVERLAP:g} × the vertical "
+        f"accuracy class. {TO_CONFIRM[0].upper()}{TO_CONFIRM[1:]}. Absolute accuracy wants check points; nothing here "
+        "says it.</p>"
     )
+
+
+def _unjudged(look: Look) -> str:
+    if look.agreement.numbers is None:
+        return "No strips overlap on smooth ground: relative accuracy is not judged."
+    told = look.agreement.no_verdict
+    return f"{told[0].upper()}{told[1:]}."
+
+
+def _cm(metres: float | None) -> str:
+    return "–" if metres is None else f"{100 * metres:.1f} cm"
 
 
 def _percent(share: float) -> str:
@@ -221,7 +234,8 @@ def _pairs(look: Look) -> str:
         for row in sorted(look.overlap.rows, key=lambda row: -row["rms_m"])
     ]
     heads = ("strips", "smooth cells", "median dZ", "mean", "RMSDz", "95 % of |dZ|", "largest", "of cells smooth")
-    return "<h2>Strips against each other</h2>" + _table(heads, rows) + "<p class='muted'>Centimetres.</p>"
+    under = f"<p class='muted'>Centimetres. {escape(look.agreement.measure)}.</p>"
+    return "<h2>Strips against each other</h2>" + _table(heads, rows) + under
 
 
 def _strips(look: Look) -> str:

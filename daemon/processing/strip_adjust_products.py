@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.strip_functions import StripChoice
-from calib.strips import StripReport
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_products import Told, strips_entry
 from daemon.processing.flights import Flight as LoggedFlight
@@ -107,14 +106,7 @@ def _strips(done: StripsCorrected) -> Iterator[_Strip]:
         mine = (fit.flown == choice.flown) & (fit.strip == choice.strip)
         names = {swath.name for swath in done.kept.flight.swaths if swath.strip == choice.strip}
         own = (fit.time_ns[mine], corrections[mine], sigmas[mine], priors[mine])
-        yield _Strip(choice, *own, _rms_dz_m(done.before, names), _rms_dz_m(done.after, names))
-
-
-def _rms_dz_m(report: StripReport, names: set[str]) -> float:
-    """Of all pairs that a strip is in; nan: there are none."""
-    own = [pair.height for pair in report.pairs if {pair.first, pair.second} & names and pair.height.count]
-    count = sum(height.count for height in own)
-    return math.sqrt(sum(height.count * height.rms_m**2 for height in own) / count) if count else math.nan
+        yield _Strip(choice, *own, done.before.rms_of(names), done.after.rms_of(names))
 
 
 def _record(wish: AdjustWish, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
@@ -187,7 +179,7 @@ def _lines(done: StripsCorrected) -> list[str]:
         + (f", {control} of {len(done.control)} control points" if done.control else "")
         + f"; misclosures {math.sqrt(adjusted.variance_before):.2f} → {math.sqrt(adjusted.variance_after):.2f} sigmas"
     )
-    rms = [100.0 * report.all.height.rms_m for report in (done.before, done.after)]
+    rms = [100.0 * strips.rms_m for strips in (done.before, done.after)]
     lines.append(f"all strips: RMSDz {rms[0]:.1f} → {rms[1]:.1f} cm")
     if any(not strip.told.all() for strip in strips if strip.choice.model != UNCORRECTED):
         lines.append("not told: the planes of the strip do not determine it, so it is left as it was")

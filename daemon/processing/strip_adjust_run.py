@@ -24,14 +24,21 @@ from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError
 from calib.signatures import signatures
 from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
-from calib.strips import StripReport, differences
+from calib.strips import differences
 from daemon.errors import ExitCode, UserError
 from daemon.places import nearest_there
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, refuse_lost_control, refuse_no_planes
-from daemon.processing.calibration_flight import KeptFlight, read_flight, refuse_without_noise, replaced
+from daemon.processing.calibration_flight import (
+    KeptFlight,
+    read_flight,
+    refuse_without_noise,
+    replaced,
+    smoothed_prior,
+)
 from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import Wish
+from daemon.processing.strip_agreement import FlightStrips, before_and_after
 from daemon.processing.strips_run import is_of_logs, refuse_installations
 from daemon.processing.trajectory_files import TrajectoryFiles
 from daemon.processing.user_errors import told_in_a_line
@@ -97,8 +104,8 @@ class StripsCorrected:
     features: Features
     control: tuple[ControlPoint, ...]
     adjusted: StripAdjusted
-    before: StripReport
-    after: StripReport
+    before: FlightStrips
+    after: FlightStrips
     notes: tuple[str, ...]
 
 
@@ -178,8 +185,8 @@ def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     tell("adjustment", 0, 1)
     adjusted = adjust_strips(flight, features, calibrations, wish.settings)
     tell("strips before and after", 0, 1)
-    before, after = differences(flight), differences(moved(adjusted, "adjusted"))
-    notes += [*kept.holes, *_notes(wish, flight, features, before), *adjusted.notes]
+    before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
+    notes += [*kept.holes, *_notes(wish, kept, features), *adjusted.notes]
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 
@@ -202,8 +209,8 @@ def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
             )
 
 
-def _notes(wish: AdjustWish, flight: Flight, features: Features, before: StripReport) -> list[str]:
-    notes = []
+def _notes(wish: AdjustWish, kept: KeptFlight, features: Features) -> list[str]:
+    notes, flight = [], kept.flight
     if not wish.control:
         settings = wish.settings
         notes.append(
@@ -213,11 +220,11 @@ def _notes(wish: AdjustWish, flight: Flight, features: Features, before: StripRe
     seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
     for strip in sorted({swath.strip for swath in flight.swaths} - seen):
         notes.append(f"strip {strip:02d}: no plane of it is seen by another: not corrected")
-    found = signatures(before.checks, SeenFrom.of(flight)).found
+    found = signatures(differences(flight).checks, SeenFrom.of(flight), smoothed_prior(kept)).found
+    told = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
     notes += [
-        f"before, strips differed as by an error of the calibration, which is for swath calibrate: {one.words}"
-        for one in found
-        if one.level == "significant"
+        f"before, strips differed as by an error of the calibration, which is for swath calibrate: {words}"
+        for words in told
     ]
     return notes
 

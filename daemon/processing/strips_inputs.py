@@ -15,13 +15,25 @@ from numpy.typing import NDArray
 
 from calib.effects import SeenFrom
 from calib.flight import Flight, Tangent
-from calib.strip_cells import Cells, FlightStrip, Gathered, StripBlock, StripRules, blocks_of, gather, thinned
+from calib.strip_cells import (
+    Cells,
+    FlightStrip,
+    Gathered,
+    StripBlock,
+    StripRules,
+    blocks_of,
+    gather,
+    overlap_cells,
+    thinned,
+)
+from calib.trajectory_errors import TrajectoryPrior
 from daemon.errors import ExitCode, UserError
 from daemon.processing.quicklook import Look, StripFacts, look_at
 from daemon.processing.quicklook_grids import Surface, cell_for, frame_of
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
-from daemon.processing.quicklook_read import NOISE_CLASSES, Block, QuickLookError, StripBook, Units
-from daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE, StripCells, compare
+from daemon.processing.quicklook_read import NOISE_CLASSES, QuickLookError, StripBook, Units
+from daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE
+from daemon.processing.strip_agreement import compare_flight, corners_of
 from georef.formats.trajectory_file import read_trajectory
 from georef.mapping import Mapping, MappingError
 from georef.trajectory import Trajectory, TrajectoryError
@@ -46,6 +58,7 @@ class Strips:
         gathered: returns in cells of the overlap, in t where it is known, else in metres of the map.
         cell_m: side of these.
         seen: where from; None: no trajectory is known.
+        prior: joint covariance of the trajectory's errors; None: it is not known.
         notes: what the user should know.
     """
 
@@ -54,6 +67,7 @@ class Strips:
     gathered: Gathered
     cell_m: float
     seen: SeenFrom | None
+    prior: TrajectoryPrior | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -65,7 +79,7 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Str
     """
     what = ", ".join(map(str, paths))
     try:
-        look = look_at(paths, told=lambda done, of: told(f"reading {what}", done, of))
+        look = look_at(paths, strip_cell_m=rules.cell_m, told=lambda done, of: told(f"reading {what}", done, of))
     except QuickLookError as error:
         raise UserError(str(error), ExitCode.IO) from error
     notes = list(look.notes)
@@ -76,24 +90,37 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Str
         seen, place = _seen_from(look)
     except (TrajectoryError, MappingError, OSError, KeyError, TypeError, AttributeError, ValueError) as error:
         notes.append(f"{what}: no signatures: {error}")
-        return Strips(what, look, gathered, cells.cell_m, None, notes)
+        return Strips(what, look, gathered, cells.cell_m, None, notes=notes)
     if seen is None:
         notes.append(f"{what}: no signatures: there is no trajectory beside the points; want a folder of swath georef")
-        return Strips(what, look, gathered, cells.cell_m, None, notes)
-    return Strips(what, look, replace(gathered, points=place(gathered.points)), cells.cell_m, seen, notes)
+        return Strips(what, look, gathered, cells.cell_m, None, notes=notes)
+    return Strips(what, look, replace(gathered, points=place(gathered.points)), cells.cell_m, seen, notes=notes)
 
 
-def strips_of_flight(what: str, flight: Flight, rules: StripRules) -> Strips:
-    """Of a flight as its points are placed; the map's coordinates are those of t.
+def strips_of_flight(
+    what: str,
+    flight: Flight,
+    rules: StripRules,
+    mapping: Mapping | None = None,
+    prior: TrajectoryPrior | None = None,
+) -> Strips:
+    """Of a flight as its points are placed.
+
+    Args:
+        what: the logs, for people.
+        flight: its points stand in t.
+        rules: of the comparison.
+        mapping: of the products, settled: cells for heights are those of their files; None: they lie in t.
+        prior: joint covariance of the trajectory's errors; None: it is not known.
 
     Raises:
         UserError: it is one strip.
     """
-    look = look_of_flight(flight)
+    look = look_of_flight(flight, rules, mapping)
     refuse_one(what, look)
-    cells = cells_of(look, rules)
-    gathered = gather(blocks_of([FlightStrip(swath) for swath in flight.swaths]), cells)
-    return Strips(what, look, gathered, cells.cell_m, SeenFrom.of(flight))
+    strips = [FlightStrip(swath) for swath in flight.swaths]
+    cells = overlap_cells(strips, replace(rules, cell_m=look.cells.frame.cell_m))
+    return Strips(what, look, gather(blocks_of(strips), cells), cells.cell_m, SeenFrom.of(flight), prior)
 
 
 def refuse_one(what: str, look: Look) -> None:
@@ -212,41 +239,14 @@ def _flown(look: Look, number: int, trajectories: Sequence[Trajectory], of_sessi
 # ---------------------------------------------------------------------- a flight
 
 
-def look_of_flight(flight: Flight) -> Look:
-    """A quick look at a flight's points in t."""
-    full = [swath for swath in flight.swaths if len(swath)]
-    corners = [(np.nanmin(swath.points_t, axis=0), np.nanmax(swath.points_t, axis=0)) for swath in full]
-    low = np.min([corner[0] for corner in corners], axis=0) if full else np.zeros(3)
-    high = np.max([corner[1] for corner in corners], axis=0) if full else np.ones(3)
+def look_of_flight(flight: Flight, rules: StripRules, mapping: Mapping | None = None) -> Look:
+    """A quick look at a flight's points, on the map of its products, or in t."""
+    corners = low, high = corners_of(flight, mapping)
     area_m2 = max(float(np.prod((high - low)[:2])), 1.0)
-    density = max((len(swath) for swath in full), default=1) / area_m2
+    density = max((len(swath) for swath in flight.swaths), default=1) / area_m2
     surface = Surface(frame_of(low, high, float(np.clip(cell_for(density, 4), 0.25, 50.0))))
-    cells = StripCells(
-        frame_of(low, high, float(np.clip(cell_for(density, 16), 0.5, 20.0))), float(low[2] + high[2]) / 2
-    )
-    for number, swath in enumerate(flight.swaths):
-        for begin in range(0, len(swath), BLOCK_POINTS):
-            block = _block(
-                swath.points_t[begin : begin + BLOCK_POINTS], swath.rows[begin : begin + BLOCK_POINTS], number
-            )
-            surface.add(block)
-            cells.add(block)
+    strips = compare_flight(flight, mapping, cell_m=rules.cell_m, corners=corners, also=surface.add)
+    agreement, names = strips.agreement, list(strips.names)
     facts = [StripFacts(swath.name, len(swath), len(swath), 0.0, density, 0.0, None, None) for swath in flight.swaths]
-    names = [swath.name for swath in flight.swaths]
-    return Look([], Units(), names, surface, cells, compare(cells), facts, None, density, area_m2, 0, [])
-
-
-def _block(points_t: FloatArray, rows: NDArray[np.void], number: int) -> Block:
-    good = np.isfinite(points_t).all(axis=1)
-    points, rows = points_t[good], rows[good]
-    return Block(
-        x_m=np.ascontiguousarray(points[:, 0]),
-        y_m=np.ascontiguousarray(points[:, 1]),
-        z_m=np.ascontiguousarray(points[:, 2]),
-        intensity=np.ascontiguousarray(rows["intensity"]),
-        strip=np.full(len(points), number, np.int32),
-        first=np.asarray(rows["return_number"] <= 1),
-        single=np.asarray(rows["number_of_returns"] <= 1),
-        sigma_m=np.empty((0, 3), np.float32),
-        skipped=0,
-    )
+    numbers = agreement.pulses_m2, agreement.area_m2
+    return Look([], Units(), names, surface, strips.cells, strips.overlap, agreement, facts, None, *numbers, 0, [])

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib.accuracy_standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
 from calib.flight import FlightError
 from calib.signatures import Signatures, record_of, signatures
 from calib.strip_cells import StripRules
-from calib.strips import Numbers, StripReport, report_of
+from calib.strips import Numbers, PairReport, StripReport, report_of
 from daemon.errors import ExitCode, UserError
-from daemon.processing.calibration_flight import read_flight
+from daemon.processing.calibration_flight import read_flight, smoothed_prior
 from daemon.processing.flights import Wish
 from daemon.processing.json_values import finite
+from daemon.processing.strip_agreement import Agreement, difference_of
 from daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
 from daemon.processing.user_errors import told_in_a_line
 from georef.mapping import MappingError
@@ -28,13 +28,6 @@ Told = Callable[[str, int, int], None]
 RECORD = "strips.json"
 LOG_SUFFIX = ".mcap"
 POINT_SUFFIXES = (".las", ".laz")
-LIMITS = {
-    "pulses_m2": "{:g} pulses per m²",
-    "within_m": "{:g} m within strips",
-    "overlap_m": "{:g} m RMSDz",
-    "overlap_max_m": "{:g} m for the largest difference",
-    "rmse_z_m": "{:g} m RMSEz",
-}
 
 
 @dataclass(frozen=True)
@@ -91,9 +84,9 @@ def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
     return Compared(record, lines, now.problem(wish.level))
 
 
-def most_cells(count: int) -> StripRules:
-    """Rules by which so many cells are looked into."""
-    return StripRules(most_cells=count)
+def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
+    """Rules by which so many cells of such a side are looked into; None: by the strips' density."""
+    return StripRules(cell_m=cell_m, most_cells=most_cells)
 
 
 def is_of_logs(paths: Sequence[Path]) -> bool:
@@ -126,7 +119,8 @@ def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> 
     folder.mkdir(parents=True, exist_ok=True)
     kept = read_flight(replace(wish.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
-    strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules)
+    mapping = kept.logged[0].setup.mapping
+    strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
     strips.notes.extend(kept.holes)
     return strips
 
@@ -151,143 +145,87 @@ class Judgement:
     strips: Strips
     report: StripReport
     signatures: Signatures | None
-    judged: tuple[Judged, ...]
 
     @property
-    def grid(self) -> Numbers | None:
-        """Gridded dZ of all pairs: means of the pairs' squares, cell by cell."""
-        rows = [_gridded(row) for row in self.strips.look.overlap.rows]
-        cells = sum(row["cells"] for row in rows)
-        if not cells:
-            return None
-        mean = sum(row["cells"] * row["mean_m"] for row in rows) / cells
-        rms = math.sqrt(sum(row["cells"] * row["rms_m"] ** 2 for row in rows) / cells)
-        told = self.strips.look.overlap.numbers()
-        assert told is not None
-        std = math.sqrt(max(rms**2 - mean**2, 0.0))
-        return Numbers(cells, mean, std, rms, told["max_m"], told["median_m"], told["p95_m"])
+    def agreement(self) -> Agreement:
+        """By which strips are judged."""
+        return self.strips.look.agreement
 
-    def significant(self) -> list[str]:
-        """Sentences of effects that are in the strips and matter."""
+    def wrong(self) -> list[str]:
+        """Sentences of effects that are in the strips and matter, or that strips are too far apart to tell."""
         found = () if self.signatures is None else self.signatures.found
-        return [one.words for one in found if one.level == "significant"]
+        return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
 
     def problem(self, level: str | None) -> str:
         """What is wrong, a line; empty: nothing."""
-        wrong = self.significant()
-        if level is not None:
-            named = next(one for one in self.judged if one.level == level)
-            if broken := _broken(named):
-                wrong.append(f"{level} is not kept, for its limit of {', '.join(broken)}")
+        wrong = self.wrong()
+        if self.agreement.no_verdict:
+            wrong.append(self.agreement.no_verdict)
+        elif level is not None and (broken := self.agreement.broken(level)):
+            wrong.append(f"{level} is not kept, for its limit of {', '.join(broken)}")
         return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
+
+    def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
+        """Of `Overlap.rows`, by names of strips."""
+        names = self.strips.look.names
+        return {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
-        names, grid = self.strips.look.names, self.grid
-        gridded = {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
+        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
+        repeats = {self.strips.look.names[number]: one for number, one in self.agreement.repeatability_m.items()}
+        densities = dict(zip(self.strips.look.names, self.strips.look.cells.single_densities(), strict=False))
         return {
             "input": self.strips.what,
             "strips": [
                 {
                     "name": name,
                     "roughness_m": self.report.roughness_m.get(name),
-                    "repeatability_m": self.report.repeatability_m.get(name),
+                    "repeatability_m": repeats.get(name),
+                    "single_returns_m2": densities.get(name) or None,
                 }
                 for name in self.report.names
             ],
             "cell_m": self.report.cell_m,
             "pairs": [
-                {
-                    "first": pair.first,
-                    "second": pair.second,
-                    "point_to_plane": _values(pair.distance),
-                    "dz": _values(pair.height),
-                    "noise_m": pair.noise_m,
-                    "systematic_m": pair.systematic_m,
-                    "gridded": _gridded(row) if (row := gridded.get((pair.first, pair.second))) else None,
-                }
-                for pair in self.report.pairs
+                {"first": first, "second": second}
+                | _to_plane(to_plane.get((first, second)))
+                | {"gridded": _gridded(heights.get((first, second)))}
+                for first, second in sorted({*heights, *to_plane}, key=self._place)
             ],
-            "all": {
-                "point_to_plane": _values(self.report.all.distance),
-                "dz": _values(self.report.all.height),
-                "noise_m": _number(self.report.all.noise_m),
-                "systematic_m": _number(self.report.all.systematic_m),
-                "gridded": None if grid is None else _values(grid),
-            },
+            "all": _to_plane(self.report.all) | {"gridded": self.agreement.numbers},
             "refused": dict(self.report.refused),
             "signatures": None if self.signatures is None else record_of(self.signatures),
-            "quality": {
-                "levels": [
-                    {"standard": one.standard, "level": one.level, "limits": one.limits, "kept": one.kept}
-                    for one in self.judged
-                ],
-                "best": best_of(self.judged),
-                "note": TO_CONFIRM,
-            },
+            "quality": self.agreement.record(),
             "notes": self.strips.notes,
         }
 
+    def _place(self, pair: tuple[str, str]) -> tuple[int, int]:
+        names = self.strips.look.names
+        return names.index(pair[0]), names.index(pair[1])
+
     def lines(self, before: Judgement | None) -> list[str]:
         """For people."""
-        lines = [_row("strips", "n", "mean", "std", "RMS", "max", "noise", "dZ RMS") + "  cm"]
-        for pair in (*self.report.pairs, self.report.all):
-            name = f"{pair.first} − {pair.second}" if pair.first else "all"
-            d = pair.distance
-            values = (d.mean_m, d.std_m, d.rms_m, d.max_m, pair.noise_m, pair.height.rms_m)
-            lines.append(_row(name, f"{d.count:,}", *(f"{100.0 * value:.1f}" for value in values)))
-        grid = self.grid
-        if grid is not None:
-            lines.append(
-                f"gridded dZ of {grid.count:,} cells: mean {100 * grid.mean_m:.1f} std {100 * grid.std_m:.1f} "
-                f"RMS {100 * grid.rms_m:.1f} max {100 * grid.max_m:.1f} cm"
-            )
-        lines += [one.words for one in (self.signatures.found if self.signatures else ())]
-        lines += self.verdicts()
-        if before is not None:
-            was, now = before.report.all.distance, self.report.all.distance
-            lines.append(
-                f"before: RMS {100 * was.rms_m:.1f} cm, largest {100 * was.max_m:.1f} cm; "
-                f"now: {100 * now.rms_m:.1f} cm, {100 * now.max_m:.1f} cm"
-            )
+        lines = [_row("strips", "cells", "mean", "RMSDz", "95 %", "max", "to plane", "RMS", "noise") + "  cm"]
+        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
+        for pair in sorted({*heights, *to_plane}, key=self._place):
+            lines.append(_line(f"{pair[0]} − {pair[1]}", heights.get(pair), to_plane.get(pair)))
+        lines.append(_line("all", self.agreement.numbers, self.report.all))
+        lines.append(self.agreement.measure)
+        lines.append("to plane: single returns above the other strip's plane, RMS along its normal, all slopes to 45°")
+        lines += self.signatures.lines if self.signatures else []
+        lines += self.agreement.verdicts()
+        if before is not None and (was := before.agreement.numbers) and (now := self.agreement.numbers):
+            told = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
+            lines.append(f"before: {told[0]}; now: {told[1]}")
         return lines + self.strips.notes
-
-    def verdicts(self) -> list[str]:
-        """What specifications say."""
-        best = best_of(self.judged)
-        usgs = f"strips keep {best}" if best else "strips keep no quality level"
-        levels = [one for one in self.judged if one.standard == USGS]
-        above = levels[: next((k for k, one in enumerate(levels) if one.level == best), len(levels))]
-        if above:
-            usgs += f"; {above[-1].level} not for its limit of {', '.join(_broken(above[-1]))}"
-        asprs = next(one for one in self.judged if one.standard == ASPRS_2014)
-        fits = f"strips keep the {asprs.level} class" if asprs.all_kept else "strips keep no class"
-        return [f"{USGS}: {usgs}", f"{ASPRS_2014}: {fits}", TO_CONFIRM]
-
-
-def _broken(one: Judged) -> list[str]:
-    """Limits that are not kept, in words."""
-    return [LIMITS[word].format(one.limits[word]) for word, kept in one.kept.items() if kept is False]
 
 
 def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:
     told(f"comparing {strips.what}", 0, 1)
     report = report_of(strips.look.names, strips.gathered, wish.rules, strips.cell_m)
-    if not report.pairs:
-        why = ", ".join(f"{count:,} {reason}" for reason, count in report.refused.items()) or "none overlap"
-        raise UserError(
-            f"{strips.what}: no two strips share planar ground ({why}); differences want strips that overlap"
-        )
-    found = None if strips.seen is None else signatures(report.checks, strips.seen)
-    all_pairs = strips.look.overlap.numbers()
-    within = list(report.repeatability_m.values())
-    judged = judge(
-        overlap_rms_m=None if all_pairs is None else all_pairs["rms_m"],
-        overlap_max_m=None if all_pairs is None else all_pairs["max_m"],
-        within_rms_m=math.sqrt(sum(one**2 for one in within) / len(within)) if within else None,
-        pulses_m2=strips.look.density if strips.look.sources else None,
-    )
-    return Judgement(strips, report, found, judged)
+    found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
+    return Judgement(strips, report, found)
 
 
 def _draw(wish: StripsWish, now: Judgement, then: Judgement | None) -> list[Path]:
@@ -311,9 +249,37 @@ def _row(name: str, *values: str) -> str:
     return f"{name:<14}" + "".join(f"{value:>9}" for value in values)
 
 
-def _gridded(row: dict[str, Any]) -> dict[str, Any]:
-    std_m = math.sqrt(max(row["rms_m"] ** 2 - row["mean_m"] ** 2, 0.0))
-    return {key: value for key, value in row.items() if key not in ("first", "second")} | {"std_m": std_m}
+def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None) -> str:
+    """A row of the table, centimetres: of heights, then of returns above planes."""
+    values = ["–"] * 5
+    if heights is not None:
+        told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
+        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in told)]
+    if to_plane is None or not to_plane.distance.count:
+        return _row(name, *values, "–", "–", "–")
+    distance = to_plane.distance
+    more = (f"{100.0 * value:.1f}" for value in (distance.rms_m, to_plane.noise_m))
+    return _row(name, *values, f"{distance.count:,}", *more)
+
+
+def _to_plane(pair: PairReport | None) -> dict[str, Any]:
+    """Point to plane for JSON; ``dz``: its vertical part, on slopes below 10°."""
+    if pair is None:
+        return dict.fromkeys(("point_to_plane", "dz", "noise_m", "systematic_m"))
+    return {
+        "point_to_plane": _values(pair.distance),
+        "dz": _values(pair.height),
+        "noise_m": _number(pair.noise_m),
+        "systematic_m": _number(pair.systematic_m),
+    }
+
+
+def _gridded(row: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Heights of planes, the measure that is judged."""
+    if row is None:
+        return None
+    kept = {key: value for key, value in row.items() if key not in ("first", "second")}
+    return kept | {"std_m": difference_of(row).std_m}
 
 
 def _values(numbers: Numbers) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from daemon.processing.quicklook import Look, look_at, numbers_of, quality_of
+from daemon.processing.quicklook import Look, look_at, numbers_of
 from daemon.processing.quicklook_grids import Frame, frame_of, inner, round_up
 from daemon.processing.quicklook_profile import steps_of
 from daemon.processing.quicklook_read import BLOCK_POINTS, QuickLookError
@@ -198,11 +198,11 @@ def test_means_of_cells_are_those_of_their_points(tmp_path: Path) -> None:
 )
 def test_quality_levels_follow_density_and_rmsdz(tmp_path: Path, dz_m: float, best: str | None, asprs_m: float) -> None:
     """5 pulses a square metre are no QL1, whatever dZ is."""
-    quality = quality_of(two_strips(tmp_path, dz_m))
+    quality = two_strips(tmp_path, dz_m).agreement.record()
     assert quality["best"] == best
     assert quality["asprs_class_m"] == asprs_m
-    within = [level["share_within_max"] for level in quality["levels"]]
-    assert within == [float(dz_m < limit) for limit in (0.08, 0.16, 0.16, 0.32)]
+    within = [level["kept"]["overlap_max_m"] for level in quality["levels"][:4]]
+    assert within == [dz_m < limit for limit in (0.08, 0.16, 0.16, 0.32)]
 
 
 def test_feet_become_metres(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_before_and_after_stand_beside_each_other(tmp_path: Path, capsys: pytest
     now, then = lifted(tmp_path / "now", 0.01), lifted(tmp_path / "then", 0.20)
     run(str(now), "--before", str(then), "-o", str(tmp_path / "out"))
     told = capsys.readouterr().out
-    assert "before: RMS 19.8 cm, largest 19.8 cm; now: 1.0 cm, 1.0 cm" in told
+    assert "before: RMSDz 20.0 cm, largest 20.0 cm; now: RMSDz 1.0 cm, largest 1.0 cm" in told
     assert "strips keep QL2; QL1 not for its limit of 8 pulses per m²" in told
     assert "confirm them against the edition in the contract" in told
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
