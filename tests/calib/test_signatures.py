@@ -9,12 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from calib.effects import NAMES, SeenFrom, effect_columns
 from calib.flight import Flight
 from calib.signatures import Signature, record_of, signatures
 from calib.strip_cells import StripRules
 from calib.strips import differences
+from calib.trajectory_errors import Taus, apply, draw, gauss_markov
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
 from georef.jacobian import parameter_columns_e
@@ -191,6 +193,45 @@ def test_errors_of_strips_alone_are_not_taken_for_a_calibration(made: Cast) -> N
     found = found_in(replace(made.flight, swaths=tuple(swaths)))
     assert [one.words for one in found.values() if one.level == "significant"] == []
     assert found["pitch"].sigma > math.radians(0.001)
+
+
+def test_an_error_that_all_strips_share_is_no_calibration_and_the_sigma_says_so(made: Cast) -> None:
+    """A roll of 0.003°, as the trajectory's sigma has it, is common to all strips: it looks like a boresight."""
+    flight, roll_rad = made.flight, math.radians(0.003)
+    leaning = wrong(made, omega_rad=roll_rad)
+    found = signatures(differences(leaning, RULES).checks, SeenFrom.of(leaning))
+    roll = found.found[0]
+    assert roll.level in ("none", "not told"), roll.words
+    assert roll.sigma > 0.5 * roll_rad
+    shares = [f"{share} %" for share in (50, 20)]
+    assert all(share in found.prior_notes[0] for share in shares)
+    assert SeenFrom.of(flight).trajectories[0].attitude_sigma_rad[0, 0] == pytest.approx(roll_rad)
+
+
+def test_sigmas_hold_where_errors_are_those_of_the_covariance(made: Cast) -> None:
+    """Eight flights with errors drawn from it; Σ(value / σ)² of m values is within χ²'s 1e-4 bounds on either side."""
+    flight = made.flight
+    prior = gauss_markov(flight, Taus(lasting_tilt=0.4, lasting_heading=0.2), 2.0)
+    squares = []
+    for seed in np.random.SeedSequence(77).spawn(8):
+        rng = np.random.default_rng(seed)
+        moved = apply(flight.trajectories[0], 0, prior, -draw(prior, rng))
+        placed = replace(flight, trajectories=(moved,)).placed({"left": made.truth})
+        found = signatures(differences(placed, RULES).checks, SeenFrom.of(placed), prior).found
+        squares += [(one.value / one.sigma) ** 2 for one in found if math.isfinite(one.value)]
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], len(squares))
+    assert len(squares) > 20
+    assert low < sum(squares) < high
+
+
+def test_strips_decimetres_apart_are_rough_and_get_no_numbers(made: Cast) -> None:
+    flight = wrong(made, omega_rad=math.radians(0.3))
+    whole = signatures(differences(flight, RULES).checks, SeenFrom.of(flight))
+    assert whole.rough
+    (line,) = whole.lines
+    assert "run swath calibrate" in line
+    assert "±" not in line
+    assert all(math.isnan(one.sigma) for one in whole.found)
 
 
 def test_parallel_lines_over_flat_ground_do_not_tell_pitch_and_heading() -> None:

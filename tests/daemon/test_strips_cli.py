@@ -14,10 +14,14 @@ import typer
 from pyproj import CRS
 
 from calib.flight import Flight
+from calib.report_verdict import overall_rms_m
 from calib.strip_cells import StripRules
 from daemon.cli import strips
 from daemon.errors import ExitCode, UserError
+from daemon.processing.calibrate_products import level_words, strips_entry
+from daemon.processing.quicklook import look_at, numbers_of
 from daemon.processing.setup import Options, Setup
+from daemon.processing.strip_agreement import before_and_after, difference_map
 from daemon.processing.strips_inputs import strips_of_files, strips_of_flight
 from daemon.processing.strips_run import refuse_installations
 from georef.formats.trajectory_csv import csv_text
@@ -167,6 +171,32 @@ def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     assert numbers[0]["rms_m"] == pytest.approx(numbers[1]["rms_m"], rel=0.1)
     heights = of_files.gathered.points[:, 2], of_flight.gathered.points[:, 2]
     assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
+
+
+def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
+    made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`calibrate`, the map of its report, `strips` and `view`; coordinates of files are rounded to 0.1 mm."""
+    mapping = Mapping("EPSG:25832", datum="same")
+    mapping.settle(made.flight.trajectories[0].position_e[:1])
+    folder = products(tmp_path / "p", made.flight, mapping)
+    run(str(folder), "--json")
+    told = json.loads(capsys.readouterr().out)["quality"]
+    seen = numbers_of(look_at([folder]))["quality"]
+    tilted = made.flight.placed({"left": made.truth.changed(omega_rad=1e-3)})
+    before, after = before_and_after(tilted, made.flight, mapping)
+    calibrated = strips_entry(after)
+    drawn = difference_map(before, after, (0.0, 0.0), 400)
+    assert drawn is not None
+    assert drawn.after_words == f"RMSDz {100.0 * told['rmsdz_m']:.1f} cm"
+    assert before.rms_m > 5.0 * after.rms_m
+    report = overall_rms_m(after.pairs())
+    for rms_m in (seen["rmsdz_m"], calibrated["all"]["rms_m"], calibrated["quality"]["rmsdz_m"], report):
+        assert rms_m == pytest.approx(told["rmsdz_m"], abs=5e-5)
+    assert told["best"] is not None
+    assert seen["best"] == calibrated["quality"]["best"] == told["best"]
+    assert seen["measure"] == calibrated["quality"]["measure"] == told["measure"]
+    assert level_words(after) == f"strips keep {told['best']}"
 
 
 @pytest.mark.slow
