@@ -113,7 +113,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
             axes.text(limit_cm, 1.01, word, transform=axes.get_xaxis_transform(), fontsize=7, color=MUTED, ha="center")
         axes.set_yticks(at, words, fontsize=8, color=INK)
         axes.set_ylim(len(pairs) - 0.5, -0.5)
-        axes.set_xlabel("RMS of height differences (cm)", fontsize=8.5, color=MUTED)
+        axes.set_xlabel("RMSDz (cm)", fontsize=8.5, color=MUTED)
         canvas.legend(
             [
                 Line2D([], [], marker="o", ls="", ms=5, color="white", mec=BEFORE, mew=1.3, label="before"),

@@ -199,6 +199,7 @@ def compare_flight(
     *,
     cell_m: float | None = None,
     corners: tuple[FloatArray, FloatArray] | None = None,
+    like: StripCells | None = None,
     also: Callable[[Block], None] = lambda block: None,
 ) -> FlightStrips:
     """Compare a flight's strips where its points are placed.
@@ -208,10 +209,15 @@ def compare_flight(
         mapping: the map of the products, settled; None: cells lie in t.
         cell_m: side of the cells; None: by the strips' density.
         corners: south-western and north-eastern corner (3,) of the cells; None: `corners_of`.
+        like: cells that are to be taken, whatever else is said; None: none are.
         also: is given every block of points.
     """
-    low_m, high_m = corners_of(flight, mapping) if corners is None else corners
-    cells = StripCells(strip_frame(low_m, high_m, cell_m), float(low_m[2] + high_m[2]) / 2, fixed=cell_m is not None)
+    if like is None:
+        low_m, high_m = corners_of(flight, mapping) if corners is None else corners
+        reference_m = float(low_m[2] + high_m[2]) / 2
+        cells = StripCells(strip_frame(low_m, high_m, cell_m), reference_m, fixed=cell_m is not None)
+    else:
+        cells = StripCells(like.frame, like.reference_m, fixed=True)
     for block in _blocks(flight, mapping):
         cells.add(block)
         also(block)
@@ -264,7 +270,7 @@ def before_and_after(
     corners = [corners_of(flight, mapping) for flight in (before, after)]
     both = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
     now = compare_flight(after, mapping, corners=both)
-    return compare_flight(before, mapping, cell_m=now.cells.frame.cell_m, corners=both), now
+    return compare_flight(before, mapping, like=now.cells), now
 
 
 def difference_map(

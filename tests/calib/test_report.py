@@ -63,8 +63,7 @@ def test_verdict_of_a_good_calibration(report: ReportInput) -> None:
     assert not verdict.reasons
     # κ is the least certain: 2.4e-5 rad; 4.1 mm; ten pairs of 1.4 to 2.6 cm
     assert re.fullmatch(
-        r"Good: boresight to 0\.0014°, range offset to 4\u00a0mm; strips agree to (\d\.\d)\u00a0cm \(RMS of height "
-        r"differences\)\.",
+        r"Good: boresight to 0\.0014°, range offset to 4\u00a0mm; strips agree to (\d\.\d)\u00a0cm \(RMSDz\)\.",
         verdict.sentence,
     )
 
