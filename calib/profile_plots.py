@@ -61,7 +61,7 @@ def svg(profile: Profile) -> str:
 
 def _window(profile: Profile) -> tuple[float, float]:
     """From where to where it is drawn."""
-    section = profile.before[0]
+    section = profile.after[0] if profile.kind == "range" else profile.before[0]  # all targets are seen in the end
     low, high = (float(end) for end in (section.distance_m.min(), section.distance_m.max()))
     if profile.kind in ("roll", "range") or high - low <= WINDOW_M:
         return low - 0.5, high + 0.5

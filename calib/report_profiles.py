@@ -7,11 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
+from calib.features import ControlPoint
 from calib.flight import Flight
 from calib.profile_check import Check, Comparison
 from calib.profile_measure import Ground
 from calib.profile_plots import draw, svg
-from calib.profile_sections import Corridor
+from calib.profile_sections import Corridor, fit_pieces
 from calib.profiles import Profile, Section
 from calib.report_input import Profile as Picture
 from calib.report_tables import Table
@@ -70,11 +73,20 @@ def profiles_table(checked: Check) -> Table | None:
     return Table("", heads, rows, under, left=(0, 1, 6)) if rows else None
 
 
-def pictures(checked: Check, at_start: Flight) -> list[Picture]:
-    """The surest profiles of each kind as pictures: as the points lay at the start, and as they lie in the end."""
+def pictures(checked: Check, at_start: Flight, control: Sequence[ControlPoint] = ()) -> list[Picture]:
+    """Return the surest profiles of each kind as pictures: as the points lay at the start, and as they lie in the end.
+
+    What a profile itself finds is not taken out of the second, so that it shows what the adjustment left.
+
+    Args:
+        checked: profiles, measured with the points as adjusted.
+        at_start: the flight with the points as they lay before.
+        control: the surveyed points, which profiles for the range compare the ground with.
+    """
     found = []
     for profile in _surest(checked.profiles):
-        shown = profile if profile.kind == "range" else replace(profile, before=_sections(profile, at_start))
+        before = _targets if profile.kind == "range" else _sections
+        shown = replace(profile, before=before(profile, at_start, control), after=profile.before)
         title = f"Profile for {profile.kind}: {profile.names[0]} and {profile.names[1]}"
         found.append(Picture(title, "", svg(shown), partial(draw, shown)))
     return found
@@ -93,7 +105,7 @@ def _surest(profiles: Sequence[Profile]) -> list[Profile]:
     return in_turn[:MOST_DRAWN]
 
 
-def _sections(profile: Profile, flight: Flight) -> tuple[Section, Section]:
+def _sections(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
     """Both strips' returns along it, as this flight places them."""
     corridor = Corridor.between(profile.ends_t[0], profile.ends_t[1], profile.cells[0].half_width_m)
     first, second = (_section(corridor, Ground.of(flight.swaths[swath])) for swath in (profile.first, profile.second))
@@ -105,3 +117,24 @@ def _section(corridor: Corridor, ground: Ground) -> Section:
     rows = rows[:: max(1, math.ceil(len(rows) / MOST_RETURNS))]
     points_t = ground.swath.points_t[rows]
     return Section(corridor.coordinates(points_t)[0], points_t[:, 2])
+
+
+def _targets(profile: Profile, flight: Flight, control: Sequence[ControlPoint]) -> tuple[Section, Section]:
+    """The ground that this flight shows at the profile's targets, less what was surveyed; those without any are left
+    out."""
+    surveyed = {point.name: point.position_t for point in control}
+    ground = Ground.of(flight.swaths[profile.first])
+    right = profile.ends_t[1, :2] - profile.ends_t[0, :2]
+    ordered = sorted(
+        zip(profile.targets, profile.cells, strict=True), key=lambda one: float(right @ surveyed[one[0]][:2])
+    )
+    height_m = np.full(len(ordered), np.nan)
+    for row, (name, cell) in enumerate(ordered):
+        points_t = np.asarray(ground.swath.points_t[ground.rows_near(cell)])
+        if len(points_t):
+            along_m, aside_m = cell.coordinates(points_t)
+            piece = fit_pieces(along_m, aside_m, points_t[:, 2], 2.0 * cell.half_width_m, 1, 3)
+            height_m[row] = piece.height_m[0] - surveyed[name][2]
+    shown = np.isfinite(height_m)
+    distance_m = profile.before[0].distance_m[shown]  # in the order from left to right
+    return Section(distance_m, height_m[shown]), Section(distance_m, np.zeros(len(distance_m)))

@@ -250,7 +250,7 @@ def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Ma
     from calib.report import html, pdf
     from calib.report_profiles import pictures
 
-    report = replace(report, profiles=pictures(done.check, done.kept.flight))
+    report = replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
     files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
     for name, header in report.headers.items():
         matrices, known = f"{name}.record.npz", instruments_of(done.kept)

@@ -144,5 +144,5 @@ def test_in_the_report(flight: Flight, prior: TrajectoryPrior) -> None:
     assert len(compared.rows) == 4
     assert len(every.rows) == len(checked.profiles)
     assert all("=" in row[-1] for row in every.rows)
-    assert pictures(checked, flight)[0].svg.startswith("<?xml")
+    assert pictures(checked, flight, CONTROL)[0].svg.startswith("<?xml")
     assert compare(flight, (), known(flight), prior) == ()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib.features import ControlPoint
 from calib.flight import Flight
+from calib.profile_check import Check
 from calib.profile_measure import Settings
 from calib.profile_plots import draw, svg
 from calib.profiles import (
@@ -28,6 +29,7 @@ from calib.profiles import (
     stepwise,
     survey,
 )
+from calib.report_profiles import pictures
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables, only, retold, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -292,6 +294,41 @@ def test_picture() -> None:
     words = " ".join(one.get_text() for one in figure.findobj(Text) if isinstance(one, Text))
     assert profile.formula.split(" = ")[0] in words
     assert {"Before", "After", *profile.names} <= set(words.split())
+
+
+def test_the_report_shows_a_range_as_it_lay_before_and_as_it_lies_after() -> None:
+    """A laser 1.37 m off: before the ground lies that much too high, after on the survey but for what is left."""
+    flight = village((THERE,), range_offset_m=1.37)
+    start = flight.heads[0].start
+    for left_m in (0.0, 0.2):
+        adjusted = {"left": start.changed(range_offset_m=1.37 - left_m)}
+        profiles = survey(flight.placed(adjusted), "range", CONTROL, calibrations=adjusted).profiles
+        (picture,) = pictures(Check(profiles, ()), flight, CONTROL)
+        assert picture.figure is not None
+        before, after = picture.figure().axes
+        heights = [np.asarray(axes.collections[0].get_offsets())[:, 1] for axes in (before, after)]
+        assert len(heights[0]) == len(heights[1]) > 1
+        # along the vertical a range error counts by the cosine of the beam, 24° from it at most here
+        assert (heights[0] > 1.37 * 0.9).all()
+        assert (heights[0] < 1.37 * 1.01 + 0.05).all()
+        np.testing.assert_allclose(heights[1], left_m * heights[0] / 1.37, atol=0.05)
+        assert before.get_xlim() == after.get_xlim()
+
+
+def test_the_report_shows_what_the_adjustment_left_of_a_roll() -> None:
+    """Not what the profile's own finding would make of it, which always lies on each other."""
+    flight = village((THERE, BACK), omega_rad=0.01)
+    adjusted = {"left": flight.heads[0].start.changed(omega_rad=0.006)}
+    profiles = survey(flight.placed(adjusted), "roll", calibrations=adjusted).profiles[:1]
+    (picture,) = pictures(Check(profiles, ()), flight)
+    assert picture.figure is not None
+    apart = []
+    for axes in picture.figure().axes:
+        sections = [np.asarray(one.get_offsets(), np.float64) for one in axes.collections]
+        lines = [np.polyfit(section[:, 0], section[:, 1], 1)[0] for section in sections]
+        apart.append(abs(lines[0] - lines[1]))
+    assert apart[0] == pytest.approx(2.0 * 0.01, rel=0.2)
+    assert apart[1] == pytest.approx(2.0 * 0.004, rel=0.3)
 
 
 def test_a_pitch_found_for_one_scanner_is_not_known_of_another() -> None:
