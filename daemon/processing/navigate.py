@@ -189,7 +189,8 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: 
     setup, rows = inputs.setup, with_still_seconds(leg.inertial, leg.observations)
     solved = solve(leg.inertial, rows, setup, start, storage=storage)
     setup = solved.report.setup
-    return NavigatedLeg(leg, start, setup, solved, diagnose(leg.inertial, leg.observations, setup, solved))
+    findings = diagnose(leg.inertial, leg.observations, setup, solved) + inputs.findings
+    return NavigatedLeg(leg, start, setup, solved, findings)
 
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:

@@ -8,15 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.control_doubts import geoid_undulation
 from daemon.errors import UserError
 from daemon.processing.navigation_log import NavigationLog
 from daemon.processing.navigation_observations import Observed
 from daemon.processing.navigation_sources import NavigationSources
 from daemon.processing.navigation_times import ImuTimes
+from georef.earth import e_from_geodetic
+from georef.navigation.diagnosis_data import Finding
 from georef.navigation.inputs import Inertial, Kind
 from georef.records import StructArray
 from georef.trajectory import gps_text
 
+FEWEST_HEIGHTS = 10
 TIME_IS_KNOWN_S = 1e-4  # a better time of the IMU's samples needs no offset to be found: 6 mm at 60 m/s
 
 
@@ -138,6 +142,27 @@ def input_doubts(
     lines += [f"{log}: the recorder lost {count:,} units of {source}" for source, count in sorted(found.lost.items())]
     lines += _baseline_doubts(found, sources, log)
     return lines
+
+
+def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Finding]:
+    """Return a warning where a receiver's heights may be those above the geoid.
+
+    GGA tells the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11). A
+    separation that is 0 in every sentence is none: the altitude may then be either height.
+    """
+    told = [fix for fix in found.fixes if fix.message == "GGA" and fix.valid and fix.height_m is not None]
+    if len(told) < FEWEST_HEIGHTS or any(fix.undulation_m != 0.0 for fix in told):
+        return []
+    fix = told[len(told) // 2]
+    place = [np.nan if value is None else value for value in (fix.lat_rad, fix.lon_rad, fix.height_m)]
+    known = geoid_undulation(e_from_geodetic(*place))
+    size = "up to 107 m" if known is None else f"{known[0]:.1f} m ({known[1]})"
+    text = (
+        f"all {len(told):,} GGA of {sources.gnss_source} say that geoid and ellipsoid are one (separation 0.0 m), as "
+        "they are nowhere on a whole flight: unless its altitudes are ellipsoidal already, heights are wrong by the "
+        f"geoid's, {size}; let the receiver send its geoid separation, or compare with control"
+    )
+    return [Finding("geoid_unsaid", "warning", text)]
 
 
 def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daemon.errors import ExitCode, UserError
-from daemon.processing.navigation_doubts import TIME_IS_KNOWN_S, input_doubts, no_time, refuse_elsewhere, refuse_nothing
+from daemon.processing.navigation_doubts import (
+    TIME_IS_KNOWN_S,
+    height_findings,
+    input_doubts,
+    no_time,
+    refuse_elsewhere,
+    refuse_nothing,
+)
 from daemon.processing.navigation_log import NavigationLog, read_navigation_log, session_holes
 from daemon.processing.navigation_observations import (
     Observed,
@@ -27,6 +34,7 @@ from daemon.processing.navigation_sources import NavigationSources, config_of_lo
 from daemon.processing.navigation_times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
 from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_unreadable
 from daemon.processing.refusals import refuse_no_time
+from georef.navigation.diagnosis_data import Finding
 from georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
 from georef.navigation.samples import Sampler
 from georef.navigation.stores import IN_MEMORY, Storage
@@ -82,6 +90,7 @@ class NavigationInputs:
         assumed: observations whose sigmas are defaults, by kind.
         doubts: lines for the user; holes: what is missing, a line each.
         missing: stretches of the samples that no leg holds, longer than `LEAST_HOLE_S`; each is a hole too.
+        findings: what the receiver's messages themselves show to be wrong, which the verdict goes by.
     """
 
     session: Session
@@ -99,6 +108,7 @@ class NavigationInputs:
     doubts: list[str] = field(default_factory=list)
     holes: list[str] = field(default_factory=list)
     missing: list[Stretch] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @property
     def log(self) -> Path:
@@ -177,6 +187,7 @@ def read_inputs(session: Session, wish: InputWish, storage: Storage = IN_MEMORY)
         doubts=doubts,
         holes=holes,
         missing=missing,
+        findings=height_findings(found, sources) if outside is None else [],
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import radians
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from daemon.config import Config
 from daemon.errors import ConfigError, UserError
 from daemon.log_parsers import stored_config
+from daemon.processing import navigation_doubts
+from daemon.processing.navigation_doubts import height_findings
 from daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
 from daemon.processing.navigation_observations import (
     DEFAULT_SIGMAS,
@@ -28,7 +31,11 @@ from daemon.processing.navigation_observations import (
 from daemon.processing.navigation_sources import noise_of
 from daemon.processing.navigation_times import counted_arrivals, imu_times
 from daemon.processing.outside_positions import outside_observations
+from drivers.core.parser import DeviceSettings
+from drivers.gnss.nmea import NmeaParser
+from drivers.gnss.nmea_sentences import encode_gga
 from georef.formats.antenna_positions import read_antenna_positions
+from georef.navigation.diagnosis_data import Finding
 from georef.navigation.inputs import GRADES, Kind
 from georef.records import (
     IMU_DTYPE,
@@ -45,6 +52,7 @@ from georef.records import (
 from georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
 from georef.trajectory import Poses
 from tests.daemon.short_flight import CLOCK_SIGMA_S, MARK_AFTER_NS, Flown, fly_short
+from tests.drivers.harness import feed_pieces
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -75,6 +83,7 @@ rotation_b_imu = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
 [scanner.left]
 prf_hz = 500
 """
+NMEA = '[gnss.rover]\nprotocol = "nmea"\nundulation_m = 0.0\nrate_hz = 5'
 ARM = np.array([0.1, -0.05, -1.2])
 BASELINE = np.array([0.8, 0.65, 0.0])
 
@@ -485,3 +494,50 @@ def test_positions_that_say_no_quality_are_as_good_as_their_sigmas(tmp_path: Pat
     rows = rows[rows["kind"] == Kind.POSITION]
     assert rows["fix_type"].tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT, FixType.SINGLE]
     assert rows["sigma"][0].tolist() == [0.010, 0.011, 0.020]
+
+
+# ---------------------------------------------------------------------- heights that may be above the geoid
+
+
+def gga_fixes(separations_m: list[float]) -> list[GnssFix]:
+    """Fixes of a receiver in the Alps, a GGA each second that tells such a geoid."""
+    sentences = [
+        encode_gga((36_000 + second) * S, 0.82, 0.16, 850.0, separation_m, quality=4, satellites=14)
+        for second, separation_m in enumerate(separations_m)
+    ]
+    fixes = [
+        record
+        for record in feed_pieces(NmeaParser(DeviceSettings("gnss/rover")), sentences)
+        if isinstance(record, GnssFix)
+    ]
+    assert len(fixes) > 10
+    return fixes
+
+
+def findings_of(fixes: list[GnssFix]) -> list[Finding]:
+    found: Any = SimpleNamespace(fixes=fixes)
+    sources: Any = SimpleNamespace(gnss_source="gnss/rover")
+    return height_findings(found, sources)
+
+
+def test_a_geoid_separation_of_zero_in_every_gga_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    fixes = gga_fixes([0.0] * 20)
+    assert {fix.undulation_m for fix in fixes} == {0.0}
+    for known, size in ((None, "up to 107 m"), ((48.2, "EGM2008"), "48.2 m (EGM2008)")):
+        monkeypatch.setattr(navigation_doubts, "geoid_undulation", lambda place, known=known: known)
+        (finding,) = findings_of(fixes)
+        assert finding.severity == "warning"
+        assert f"heights are wrong by the geoid's, {size}; let the receiver send its geoid separation" in finding.text
+
+
+def test_a_geoid_separation_that_is_said_or_once_zero_is_no_finding() -> None:
+    assert not findings_of(gga_fixes([48.0] * 20))
+    assert not findings_of(gga_fixes([0.1, 0.0, -0.1] * 8))
+    assert not findings_of(gga_fixes([0.0] * 20)[:5])  # too few to say
+
+
+def test_a_log_whose_receiver_says_no_geoid_has_the_finding(tmp_path: Path) -> None:
+    plan = PLAN.replace("[gnss.rover]\nrate_hz = 5\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]", NMEA)
+    assert NMEA in plan
+    inputs = read_inputs(fly_short(tmp_path, plan, 10.0).session(), InputWish())
+    assert [finding.code for finding in inputs.findings] == ["geoid_unsaid"]
