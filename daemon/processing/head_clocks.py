@@ -151,8 +151,16 @@ def _leap_at(unix_ns: int) -> int:
 
 
 def stamp_lines(clocks: FrozenClocks) -> list[str]:
-    """Return a line of each scanner whose stamps were found or configured, for the user: which scale, and why."""
-    return [
+    """Return a line of each scanner whose stamps or sentences are the time, for the user: which, and why."""
+    host = clocks.host
+    own = [source for source, plan in host.plan.devices.items() if plan.clock == source]
+    lines = [
+        f"{source}: no receiver is in the log: GPS time is by the head's own sentences and stamps, with "
+        f"{host.by_source[source].leap_seconds_at(near_ns)} leap seconds"
+        for source in sorted(own)
+        if (near_ns := host.by_source[source].coarse_gps_ns()) is not None
+    ]
+    return lines + [
         f"{source}: its stamps are taken as {found.scale.value}: {found.text}"
         for source, found in sorted(clocks.stamps.items())
         if found.scale is not StampScale.FREE

@@ -172,6 +172,7 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
             "last_gps_ns": last_ns,
             "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
         },
+        "clock": flight.clock,
         "stamps": {
             source: {"scale": found.scale.value, "why": found.text, "sigma_ns": round(found.sigma_ns)}
             for source, found in sorted(flight.clocks.clocks.stamps.items())

@@ -226,6 +226,11 @@ class PpsClock:
         """Take the GPS time of a host time as from the arrival of a message: good to some 0.1 s, and no vote."""
         self._coarse.add(host_ns, gps_ns)
 
+    def coarse_gps_ns(self) -> int | None:
+        """Return the GPS time of the latest message, to some 0.1 s; None: none has come."""
+        last, offset = self._coarse.last_host_ns, self._coarse.offset_ns()
+        return None if last is None or offset is None else last + offset
+
     def _refuse_message(self, reason: str) -> None:
         self.messages_refused[reason] = self.messages_refused.get(reason, 0) + 1
 

@@ -167,6 +167,9 @@ def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path
     error, sigma_ns = errors_ns(clocks, HOURS, 1)
     assert max(map(abs, error)) < 1_000
     assert sigma_ns == 20_000.0
+    (line,) = stamp_lines(clocks)
+    assert "scanner/top: no receiver is in the log: GPS time is by the head's own sentences" in line
+    assert "18 leap seconds" in line
 
 
 def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
