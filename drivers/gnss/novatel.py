@@ -146,7 +146,7 @@ class NovatelParser(StreamParser):
 
     def _second_of_raw(self, frame: Frame, name: str) -> list[Record | Row]:
         """Name the whole second of raw measurements, in a log for post-processing that holds no solution."""
-        header, _ = _split(frame, name, self._state.floor_week)
+        header, _ = _split(frame, name, self._state.dates)
         wanted = self._wanted is None or TimeMessage in self._wanted
         if header is None or self._has_solutions or not wanted:
             return []
