@@ -32,7 +32,12 @@ from daemon.processing.navigation_observations import (
 )
 from daemon.processing.navigation_sources import NavigationSources, config_of_log, files_of
 from daemon.processing.navigation_times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
-from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_unreadable
+from daemon.processing.outside_positions import (
+    OutsidePositions,
+    outside_observations,
+    refuse_shifted,
+    refuse_unreadable,
+)
 from daemon.processing.refusals import refuse_no_time
 from georef.navigation.diagnosis_data import Finding
 from georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
@@ -310,6 +315,7 @@ class _Placed:
         fixes = fix_observations(found.fixes, self.fix_ns, len(setup.lever_arms_b))
         parts = {"fix": fixes}
         if outside is not None:
+            refuse_shifted(outside, fixes.rows)
             replaced = np.isin(fixes.rows["kind"], np.unique(outside.observed.rows["kind"]))
             fixes.refused["replaced_from_outside"] += int(replaced.sum())
             fixes.rows = fixes.rows[~replaced]

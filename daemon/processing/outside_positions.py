@@ -18,7 +18,13 @@ from georef.formats.trajectory_columns import TrajectoryColumns
 from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
 from georef.navigation.measurements import POSITION_FLOORS_M
 from georef.records import FixType, StructArray
+from georef.timescales import SECOND_NS
 from georef.trajectory import TrajectoryError, gps_text
+
+FEWEST_SHIFTED = 10
+MOST_SHIFT_S = 40  # TAI is 37 s from UTC, 19 s from GPS time
+SHIFTED_M, NEARER = 5.0, 5.0  # apart by more, and by so many times more than with the shift
+LARGEST_STEP_NS = 2 * SECOND_NS  # positions farther apart are not interpolated
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +71,46 @@ def outside_observations(
             f"{gps_text(span_ns[0])} to {gps_text(span_ns[1])}: of another flight, or of another time scale"
         )
     return OutsidePositions(file, _observed(columns))
+
+
+def refuse_shifted(outside: OutsidePositions, own: StructArray) -> None:
+    """Refuse positions that are the receiver's own, but whole seconds before or after them.
+
+    Args:
+        outside: what a file gave.
+        own: observations of the log's receiver.
+
+    Raises:
+        UserError: a shift by whole seconds brings them together, and without it they are apart.
+    """
+    own = own[own["kind"] == Kind.POSITION]
+    rows = outside.observed.rows
+    rows = rows[rows["kind"] == Kind.POSITION]
+    if len(own) < FEWEST_SHIFTED or len(rows) < FEWEST_SHIFTED:
+        return
+    apart_m = {shift_s: _apart_m(own, rows, shift_s) for shift_s in range(-MOST_SHIFT_S, MOST_SHIFT_S + 1)}
+    best_s = min(apart_m, key=lambda shift_s: apart_m[shift_s])
+    if best_s == 0 or not apart_m[0] > max(SHIFTED_M, NEARER * apart_m[best_s]):
+        return
+    raise UserError(
+        f"--gnss {outside.file}: its positions are those of the log's receiver {abs(best_s)} s "
+        f"{'later' if best_s > 0 else 'earlier'} ({apart_m[0]:.0f} m apart as they are, {apart_m[best_s]:.1f} m so): "
+        "written with another number of leap seconds, or in another time scale (GPS for UTC); write it in GPS time"
+    )
+
+
+def _apart_m(own: StructArray, rows: StructArray, shift_s: int) -> float:
+    """Median distance of the receiver's positions from the file's so many seconds later; inf: too few have both."""
+    epochs = rows["time_ns"]
+    wanted = own["time_ns"] + shift_s * SECOND_NS
+    after = np.clip(np.searchsorted(epochs, wanted), 1, len(epochs) - 1)
+    close = epochs[after] - epochs[after - 1] <= LARGEST_STEP_NS
+    there = close & (wanted >= epochs[0]) & (wanted <= epochs[-1])
+    if there.sum() < FEWEST_SHIFTED:
+        return float("inf")
+    since, at = ((times - epochs[0]).astype(np.float64) for times in (wanted[there], epochs))
+    places = np.stack([np.interp(since, at, column) for column in rows["value"].T], axis=1)
+    return float(np.median(np.linalg.norm(places - own["value"][there], axis=1)))
 
 
 def _observed(columns: TrajectoryColumns) -> Observed:

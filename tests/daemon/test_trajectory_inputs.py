@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from math import radians
 from pathlib import Path
@@ -22,6 +23,7 @@ from daemon.processing.navigation_doubts import height_findings
 from daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
 from daemon.processing.navigation_observations import (
     DEFAULT_SIGMAS,
+    Observed,
     fix_observations,
     heading_observations,
     heading_times,
@@ -30,13 +32,13 @@ from daemon.processing.navigation_observations import (
 )
 from daemon.processing.navigation_sources import noise_of
 from daemon.processing.navigation_times import counted_arrivals, imu_times
-from daemon.processing.outside_positions import outside_observations
+from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
 from drivers.core.parser import DeviceSettings
 from drivers.gnss.nmea import NmeaParser
 from drivers.gnss.nmea_sentences import encode_gga
 from georef.formats.antenna_positions import read_antenna_positions
 from georef.navigation.diagnosis_data import Finding
-from georef.navigation.inputs import GRADES, Kind
+from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Kind
 from georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
@@ -45,6 +47,7 @@ from georef.records import (
     GnssHeading,
     NamesEdge,
     PpsEdge,
+    StructArray,
     TimeMessage,
     TimeScale,
     TimeTag,
@@ -541,3 +544,30 @@ def test_a_log_whose_receiver_says_no_geoid_has_the_finding(tmp_path: Path) -> N
     assert NMEA in plan
     inputs = read_inputs(fly_short(tmp_path, plan, 10.0).session(), InputWish())
     assert [finding.code for finding in inputs.findings] == ["geoid_unsaid"]
+
+
+# ---------------------------------------------------------------------- positions from outside, whole seconds away
+
+
+def flown_rows(later_s: float = 0.0, north_m: float = 0.0) -> StructArray:
+    """Positions twice a second of a turning flight at 50 m/s, stamped so much later, or so far away."""
+    second = np.arange(0.0, 120.0, 0.5)
+    rows = np.zeros(len(second), OBSERVATION_DTYPE)
+    rows["kind"], rows["time_ns"] = Kind.POSITION, np.rint(1e9 * (1e9 + second + later_s)).astype(np.int64)
+    rows["value"] = 800.0 * np.stack([np.sin(second / 16.0), np.cos(second / 16.0), 0.0 * second], axis=1)
+    rows["value"][:, 0] += north_m
+    return rows
+
+
+@pytest.mark.parametrize(("later_s", "words"), [(2.0, "2 s later"), (-18.0, "18 s earlier"), (37.0, "37 s later")])
+def test_positions_written_with_other_leap_seconds_are_named(later_s: float, words: str) -> None:
+    outside = OutsidePositions(Path("a.pos"), Observed(flown_rows(later_s), Counter(), Counter()))
+    with pytest.raises(UserError, match=f"a.pos: its positions are those of the log's receiver {words} .*leap seconds"):
+        refuse_shifted(outside, flown_rows())
+
+
+@pytest.mark.parametrize(("later_s", "north_m"), [(0.0, 0.0), (0.02, 0.0), (0.0, 3.0), (0.0, 300.0)])
+def test_positions_of_the_same_time_or_of_another_place_are_not_called_shifted(later_s: float, north_m: float) -> None:
+    outside = OutsidePositions(Path("a.pos"), Observed(flown_rows(later_s, north_m), Counter(), Counter()))
+    refuse_shifted(outside, flown_rows())
+    refuse_shifted(outside, flown_rows()[:3])
