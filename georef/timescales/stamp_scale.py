@@ -20,7 +20,8 @@ from georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
 
 TAI_MINUS_GPS_S = 19  # since 1980, by definition
 ABSOLUTE_FROM_NS = 1_000_000_000 * SECOND_NS  # from 2001-09-09 on: counted from 1970; a counter takes 30 years there
-LEAST_SPAN_S = 5
+LEAST_SPAN_S = 1.0  # of stamps: where they stand is no chance after one second; how they drift is said from five on
+LEAST_SECONDS = 5
 GREATEST_LATENCY_NS = 100_000_000  # of the quickest datagram of a second
 AHEAD_NS = 5_000_000  # a datagram cannot come before its pulse; the host's clock may be that wrong
 LOCKED_SIGMA_NS = 20_000.0  # makers say 10 µs to 50 µs of a head locked to PPS; PTP is better
@@ -145,7 +146,7 @@ def _drift(at: Int64Array, quickest: Int64Array, slack_ns: float) -> tuple[float
     span_s = float(at.max() - at.min()) / SECOND_NS
     x = (at - at.min()).astype(np.float64) / SECOND_NS - span_s / 2
     y = (quickest - quickest[0]).astype(np.float64)
-    if len(at) < LEAST_SPAN_S or slack_ns > SIGMAS * AHEAD_NS:
+    if len(at) < LEAST_SECONDS or slack_ns > SIGMAS * AHEAD_NS:
         return 0.0, f"over {span_s:.0f} s"
     x = x - x.mean()
     slope = float(x @ (y - y.mean()) / (x @ x))

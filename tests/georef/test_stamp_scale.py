@@ -16,7 +16,7 @@ LEAP = 18
 HOUR = 3600 * NS
 
 
-def truth_ns(seconds: int = 60, step_s: float = 0.02) -> Int64Array:
+def truth_ns(seconds: float = 60.0, step_s: float = 0.02) -> Int64Array:
     """GPS times of pulses."""
     return START_S * NS + np.rint(np.arange(10.0, seconds, step_s) * NS).astype(np.int64)
 
@@ -62,6 +62,12 @@ def test_ptp_stamps_are_found_and_keep_their_fraction(
     assert (found.scale, found.sigma_ns) == (scale, 20_000.0)
     assert np.array_equal(stamps + found.offset_ns, gps)
     assert f"from 1970 in {scale.value[4:].upper()}" in found.text
+
+
+def test_a_capture_of_two_seconds_is_enough() -> None:
+    gps = truth_ns(12)
+    assert judged(absolute(gps, 19), gps).scale is StampScale.TAI
+    assert judged(hour_stamps(gps), gps, past_hour=True).scale is StampScale.HOUR
 
 
 def test_absolute_stamps_of_no_known_scale_run_free_until_they_are_configured() -> None:
@@ -131,7 +137,7 @@ def test_the_configuration_decides(wanted: StampScale) -> None:
 
 
 def test_too_little_or_no_time_beside_is_no_judgement() -> None:
-    gps = truth_ns(14)
+    gps = truth_ns(10.9)
     sigma = np.full(len(gps), 2e3)
     assert judge(absolute(gps, 19), gps, sigma, LEAP, past_hour=False) is None
     gps = truth_ns()
