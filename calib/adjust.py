@@ -9,6 +9,10 @@ which is nothing where a row knows little of it, and sigmas where the trajectory
 The trajectory's errors are unknowns too, with what is known of them beforehand as their prior: correlated in time, they
 are the same for thousands of returns, and a calibration that takes them as noise of each return believes itself far
 too much. What this flight does not determine is held, and said (`calib.observability`).
+
+A held parameter is wrong by something, too. With N the reduced normal matrix of the estimated ones, B their part with
+the held ones and S what is plausible of these, the covariance is N⁻¹ + N⁻¹ B S Bᵀ N⁻¹, and −N⁻¹ B S between the two
+(S. F. Schmidt, "Application of state-space methods to navigation problems", Advances in Control Systems 3, 1966).
 """
 
 from __future__ import annotations
@@ -22,19 +26,20 @@ from calib.features import Features
 from calib.flight import Flight
 from calib.normals import NormalError
 from calib.observability import spectrum
-from calib.outcome import Adjusted
+from calib.outcome import Adjusted, Considered
 from calib.parameters import Unknowns, Wish, unknowns
 from calib.quality import Solution, trajectory_fit
 from calib.robust import global_test
-from calib.solve import Block, Settings, Solved, determined, settled
+from calib.solve import Block, HeldEffects, Settings, Solved, determined, settled
 from calib.trajectory_errors import TrajectoryPrior
-from georef.calibration import Calibration
+from georef.calibration import PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 Rematch = Callable[[dict[str, Calibration]], Features | None]
 
 AS_USUAL = Settings()
 STABLE = 0.1  # sigmas by which new correspondences may still move a parameter
+CONTRADICTED = 4.0  # sigmas by which a flight may disagree with what is held
 _NO_PRIOR = (
     "the trajectory's errors were taken as independent from return to return: sigmas are too small, perhaps by a "
     "factor of 5 to 10; want a trajectory with sigmas and its errors estimated along"
@@ -49,6 +54,8 @@ def adjust(
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
     rematch: Rematch | None = None,
+    first: Mapping[str, Calibration] | None = None,
+    doubted: Mapping[str, float] | None = None,
 ) -> Adjusted:
     """Estimate.
 
@@ -58,19 +65,21 @@ def adjust(
         wish: what is to be estimated.
         prior: of the trajectory's errors; None: its sigmas count as noise of single returns, and a note says so.
         settings: how.
-        start: calibrations to start from, by scanner, with which the flight's points are placed; None: the heads' own.
+        start: calibrations to start from, by scanner; None: the heads' own. What is held keeps their values.
         rematch: finds the features anew with better calibrations; None, or if it gives None: they stay.
+        first: by scanner, boresight angles from which iterations begin; None: from the start.
+        doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
 
     Returns:
         What was found. Sigmas are those that the observations' sigmas imply; where the global test rejects, times the
-        root of the variance factor if that is above 1.
+        root of the variance factor if that is above 1; and with what is plausible of the parameters that are held.
 
     Raises:
         ParameterError: the wish cannot be met; NormalError: nothing can be solved.
     """
     if not features.planes and not features.ties:
         raise NormalError("no planes and no tie points: nothing to adjust; want strips that overlap over roofs")
-    asked, placed_with = unknowns(flight, wish, start), None
+    asked, placed_with = unknowns(flight, wish, start, first, doubted), None
     found: Solved | None = None
     for matching in range(1, settings.matchings + 1):
         before = found
@@ -101,9 +110,11 @@ def predict(
         ParameterError, NormalError: as of `adjust`.
     """
     block = determined(Block.of(flight, features, unknowns(flight, wish, start), prior, None), settings)
-    equations = block.normals(block.start(), block.weights())
-    p = equations.parameters
-    return block.rows.unknowns, equations.covariance()[:p, :p]
+    state, weights, asked = block.start(), block.weights(), block.rows.unknowns
+    equations = block.normals(state, weights)
+    p, covariance = equations.parameters, equations.covariance()
+    moved = HeldEffects.at(block, state, weights, covariance).by_unit * [one.plausible for one in asked.considered]
+    return asked, covariance[:p, :p] + moved @ moved.T
 
 
 def _stable(before: Solved, found: Solved) -> bool:
@@ -120,11 +131,20 @@ def _adjusted(found: Solved, settings: Settings, matchings: int) -> Adjusted:
     factor = quality.square / quality.redundancy if quality.redundancy > 0.0 else 1.0
     chance = global_test(quality.square, quality.redundancy)
     scaled = chance < settings.test_level and factor > 1.0
-    covariance = solution.parameters * (factor if scaled else 1.0)
+    effects = HeldEffects.at(
+        Block(solution.rows, solution.ties, solution.trajectory),
+        solution.state,
+        (solution.row_weight, solution.tie_weight),
+        solution.covariance,
+    )
+    considered = considered_of(asked, effects, factor if scaled else 1.0)
+    held_sigmas = np.array([one.sigma for one in considered], dtype=np.float64)
+    moved = effects.by_unit * held_sigmas
+    covariance = solution.parameters * (factor if scaled else 1.0) + moved @ moved.T
     sigmas = np.sqrt(np.diag(covariance))
     notes = (_NO_PRIOR,) if solution.rows.prior is None else solution.rows.prior.notes
     return Adjusted(
-        calibrations=asked.finished(solution.state.values, covariance),
+        calibrations=asked.finished(solution.state.values, covariance, held_sigmas, moved),
         names=asked.names,
         start=asked.start,
         values=solution.state.values,
@@ -147,7 +167,43 @@ def _adjusted(found: Solved, settings: Settings, matchings: int) -> Adjusted:
         scaled=scaled,
         notes=notes,
         planes_e=_planes(solution),
+        considered=considered,
+        moved=moved,
     )
+
+
+def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple[Considered, ...]:
+    """Return the held parameters with their sigmas; where the flight contradicts one, with what the flight says.
+
+    The score of the held ones has the covariance f I + I S I, with I their information and S what is plausible of them.
+    The one that is farthest beyond is taken to be wrong by what the flight says, until none is.
+
+    Args:
+        asked: whose `considered` they are.
+        effects: at the solution.
+        factor: of the observations' variances.
+    """
+    sigmas = np.array([item.plausible for item in asked.considered], dtype=np.float64)
+    likely = np.array([PARAMETERS[item.kind].plausible for item in asked.considered], dtype=np.float64)
+    information, own = effects.information, np.diag(effects.information)
+    seen = own * likely**2 > 1e-2  # else the flight knows it to ten times what is plausible, and rounding as much
+    told = np.where(seen, effects.score / np.where(seen, own, 1.0), np.nan)
+    wrong = np.zeros(len(sigmas), np.bool_)
+    while True:
+        spread = np.diag(factor * information + (information * sigmas**2) @ information)
+        spread = np.sqrt(np.maximum(spread, 0.0)) / np.where(seen, own, 1.0)
+        beyond = np.where(seen & ~wrong, np.abs(told) / np.where(seen, spread, 1.0), 0.0)
+        worst = int(np.argmax(beyond)) if len(beyond) else -1
+        if worst < 0 or beyond[worst] <= CONTRADICTED:
+            break
+        wrong[worst], sigmas[worst] = True, max(abs(float(told[worst])), float(sigmas[worst]))
+    found = []
+    for at, item in enumerate(asked.considered):
+        scanner, _, name = item.name.partition(".")
+        told_sigma = float(spread[at]) if seen[at] else np.inf
+        one = Considered(scanner, name, item.start, float(sigmas[at]), float(told[at]), told_sigma, bool(wrong[at]))
+        found.append(one)
+    return tuple(found)
 
 
 def _planes(solution: Solution) -> FloatArray:

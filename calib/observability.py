@@ -1,7 +1,7 @@
 """What a flight determines, decided by the reduced normal matrix: what it does not is held, and said in plain words.
 
-A parameter is determined where its sigma is a stated fraction of what it may plausibly be, and where it can be told
-apart from every other of its head: |ρ| < 0.98. Which of several that look alike is held is a matter of physics, not of
+A parameter is determined where its sigma, beside all others, is below what it may plausibly be off by anyway; whether
+that is good enough is for the verdict to say. Which of several that look alike is held is a matter of physics, not of
 numbers: the boresight stays as long as possible, then what the other errors of a scanner are usually made of (`RULES`,
 from the top). The known sets are those of FORMULAS 5.5, by their effects on the ground (Skaloud and Lichti 2006; Filin
 2003).
@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.outcome import Held
+from calib.report_words import sized
+from georef.calibration import INDEX, PARAMETERS
 
 FloatArray = NDArray[np.float64]
 
-LARGEST_CORRELATION = 0.98
 ALIKE = 0.8  # from here on two parameters take each other's errors
 NOTHING = 300.0  # sigma in plausible sizes that is as good as none
 _WEAK = 1e-3  # 1 / plausible sizes: as little is known of each beforehand, so that nothing is singular
@@ -30,21 +31,14 @@ class Rule:
     """When a parameter counts as determined, and what to do where it is not.
 
     Attributes:
-        plausible: what it may be off by before the calibration, one sigma, SI.
-        fraction: of that, which its sigma must be below.
+        plausible: what it may be off by before the calibration, one sigma, SI; its sigma must be below.
         looks: its effect on the ground, in words.
         remedy: what would determine it.
     """
 
     plausible: float
-    fraction: float
     looks: str
     remedy: str
-
-    @property
-    def wanted(self) -> float:
-        """The sigma it must be below."""
-        return self.plausible * self.fraction
 
 
 _DEG = float(np.pi / 180.0)
@@ -53,62 +47,80 @@ _CONTROL = "ground control: at least 8 points at 1 cm on flat hard ground"
 _SPEED = "fly a second height at least 1.7 times the first, or one line at another speed"
 _EDGE = "lines of which the edge of one overlaps the middle of the other over flat ground, and ground control"
 
+
+def _plausible(name: str) -> float:
+    return PARAMETERS[INDEX[name]].plausible
+
+
 RULES: Mapping[str, Rule] = {  # by how long it is kept: the last is held first
     "omega_rad": Rule(
-        0.02 * _DEG, 0.25, "it tilts the swath", "fly a line and the same line in the opposite direction"
+        _plausible("omega_rad"), "it tilts the swath", "fly a line and the same line in the opposite direction"
     ),
     "phi_rad": Rule(
-        0.02 * _DEG,
-        0.25,
+        _plausible("phi_rad"),
         "it shifts the swath along the track, which flat ground does not show",
         "fly opposite lines over roofs or slopes that face along the track",
     ),
     "kappa_rad": Rule(
-        0.04 * _DEG,
-        0.25,
+        _plausible("kappa_rad"),
         "it skews the swath, most at its edges, which flat ground does not show",
         "fly parallel lines that overlap by half a swath over roofs or slopes that face along the track",
     ),
     "range_offset_m": Rule(
-        0.1,
-        0.4,
+        _plausible("range_offset_m"),
         "it lowers all points alike, and roofs only by how steeply the beam meets them",
         f"{_CONTROL}; or roofs seen from several lines with a side overlap of half a swath, and crossing lines",
     ),
-    "range_scale": Rule(5e-5, 0.5, "it lowers points by their distance", f"{_HEIGHT}; or {_CONTROL} at both heights"),
-    "scan_angle_scale": Rule(3e-4, 0.4, "it bends the swath up at both edges", _EDGE),
-    "time_offset_s": Rule(1e-3, 0.25, "it shifts points along the track by the speed", _SPEED),
-    "scan_plane_tilt_rad": Rule(
-        0.02 * _DEG, 0.25, "it shifts points backwards, hardly more at the edges", "only a much wider swath shows it"
+    "range_scale": Rule(
+        _plausible("range_scale"), "it lowers points by their distance", f"{_HEIGHT}; or {_CONTROL} at both heights"
     ),
-    "lever_arm_y_m": Rule(0.05, 0.5, "it shifts points across the track, as roll does at one height", _HEIGHT),
-    "lever_arm_x_m": Rule(0.05, 0.5, "it shifts points along the track, as pitch does at one height", _HEIGHT),
-    "lever_arm_z_m": Rule(0.05, 0.5, "it lowers all points alike, as a height error of GNSS does", _CONTROL),
-    "imu_latency_s": Rule(1e-3, 0.25, "it acts only while the aircraft turns", "roll and pitch gently on some lines"),
+    "scan_angle_scale": Rule(_plausible("scan_angle_scale"), "it bends the swath up at both edges", _EDGE),
+    "time_offset_s": Rule(_plausible("time_offset_s"), "it shifts points along the track by the speed", _SPEED),
+    "scan_plane_tilt_rad": Rule(
+        _plausible("scan_plane_tilt_rad"),
+        "it shifts points backwards, hardly more at the edges",
+        "only a much wider swath shows it",
+    ),
+    "lever_arm_y_m": Rule(
+        _plausible("lever_arm_y_m"), "it shifts points across the track, as roll does at one height", _HEIGHT
+    ),
+    "lever_arm_x_m": Rule(
+        _plausible("lever_arm_x_m"), "it shifts points along the track, as pitch does at one height", _HEIGHT
+    ),
+    "lever_arm_z_m": Rule(
+        _plausible("lever_arm_z_m"), "it lowers all points alike, as a height error of GNSS does", _CONTROL
+    ),
+    "imu_latency_s": Rule(
+        _plausible("imu_latency_s"), "it acts only while the aircraft turns", "roll and pitch gently on some lines"
+    ),
     "encoder_latency_s": Rule(
-        2e-6, 0.25, "it tears lines of the two mirror directions apart", "a scan of both directions over flat ground"
+        _plausible("encoder_latency_s"),
+        "it tears lines of the two mirror directions apart",
+        "a scan of both directions over flat ground",
     ),
     "torsion_s2": Rule(
-        2e-9, 0.25, "at one scan rate it bends the swath as a scale of the scan angle does", "fly a second scan rate"
+        _plausible("torsion_s2"),
+        "at one scan rate it bends the swath as a scale of the scan angle does",
+        "fly a second scan rate",
     ),
-    "range_offset_slot": Rule(0.02, 0.5, "it acts on returns of one number only", "more of such returns on planes"),
+    "range_offset_slot": Rule(0.02, "it acts on returns of one number only", "more of such returns on planes"),
     "range_offset_zone": Rule(
-        0.02, 0.5, "it acts on one number of pulses in air only", "lines over the same roofs in both zones"
+        0.02, "it acts on one number of pulses in air only", "lines over the same roofs in both zones"
     ),
-    "ibrc": Rule(0.02, 0.5, "it acts on returns of one intensity only", "planes of that brightness in several strips"),
-    "beam.range_m": Rule(0.02, 0.5, "it acts on one beam only", "planes that this beam sees in several strips"),
-    "beam.azimuth_rad": Rule(0.05 * _DEG, 0.25, "it acts on one beam only", "roofs that this beam sees in many strips"),
-    "beam.elevation_rad": Rule(
-        0.05 * _DEG, 0.25, "it acts on one beam only", "roofs that this beam sees in many strips"
-    ),
+    "ibrc": Rule(0.02, "it acts on returns of one intensity only", "planes of that brightness in several strips"),
+    "beam.range_m": Rule(0.02, "it acts on one beam only", "planes that this beam sees in several strips"),
+    "beam.azimuth_rad": Rule(0.05 * _DEG, "it acts on one beam only", "roofs that this beam sees in many strips"),
+    "beam.elevation_rad": Rule(0.05 * _DEG, "it acts on one beam only", "roofs that this beam sees in many strips"),
     "pitch_slope": Rule(
-        5e-4, 0.25, "it skews the swath as heading does", "nothing but a bench measurement of the mirror"
+        _plausible("pitch_slope"), "it skews the swath as heading does", "nothing but a bench measurement of the mirror"
     ),
     "scan_angle_offset_rad": Rule(
-        0.02 * _DEG, 0.25, "it turns the swath about the track as roll does", "none is needed: roll takes it"
+        _plausible("scan_angle_offset_rad"),
+        "it turns the swath about the track as roll does",
+        "none is needed: roll takes it",
     ),
 }
-_OTHER = Rule(1.0, 0.5, "", "")
+_OTHER = Rule(1.0, "", "")
 
 PAIRS: Mapping[frozenset[str], str] = {  # what tells two apart, where it is more than what determines the one
     frozenset(("omega_rad", "scan_angle_offset_rad")): "none is needed: they are one and the same turn",
@@ -131,11 +143,9 @@ class Rules:
 
     Attributes:
         table: rules by parameter, most wanted first.
-        correlation: two parameters whose correlation is larger cannot be told apart.
     """
 
     table: Mapping[str, Rule] = field(default_factory=lambda: RULES)
-    correlation: float = LARGEST_CORRELATION
 
     def of(self, name: str) -> Rule:
         """Of an unknown by its name, as ``left.ibrc.3``."""
@@ -196,7 +206,7 @@ class _Case:
     def __init__(self, normal: FloatArray, names: Sequence[str], prior_sigmas: FloatArray | None, rules: Rules) -> None:
         self._names, self._rules = list(names), rules
         size = np.array([rules.of(name).plausible for name in names])
-        self._size, self._limit = size, np.array([rules.of(name).fraction for name in names])
+        self._size = size
         self._rank = np.array([rules.rank(name) for name in names])
         # two heads of one aircraft share its trajectory's errors: that makes them alike, and neither undetermined
         heads = np.array([name.partition(".")[0] for name in names])
@@ -223,8 +233,7 @@ class _Case:
             if self.partner[at] in self.partner:
                 continue
             active = sorted([*self._active(), at])
-            sigma, rho = self._figures(active)
-            if self._determined(active, sigma, rho).all():
+            if self._determined(active, self._figures(active)[0]).all():
                 del self.partner[at]
 
     def told(self, at: int) -> Held:
@@ -258,10 +267,8 @@ class _Case:
         np.fill_diagonal(rho, 0.0)
         return sigma, rho
 
-    def _determined(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> NDArray[np.bool_]:
-        own = np.abs(rho) * self._of_one_head[np.ix_(active, active)]
-        apart = own.max(axis=1, initial=0.0) < self._rules.correlation
-        found: NDArray[np.bool_] = self._given[active] | ((sigma <= self._limit[active]) & apart)
+    def _determined(self, active: list[int], sigma: FloatArray) -> NDArray[np.bool_]:
+        found: NDArray[np.bool_] = self._given[active] | (sigma <= 1.0)
         return found
 
     def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:
@@ -269,10 +276,10 @@ class _Case:
 
         Of the worst and of those that look like it, the least wanted; of equals the worse one.
         """
-        open_ = ~self._determined(active, sigma, rho)
+        open_ = ~self._determined(active, sigma)
         if not open_.any():
             return None
-        excess = np.where(open_, sigma / self._limit[active], 0.0)
+        excess = np.where(open_, sigma, 0.0)
         worst = int(np.argmax(excess))
         own = np.abs(rho[worst]) * self._of_one_head[active[worst], active]
         alike = np.flatnonzero((own >= ALIKE) & ~self._given[active])
@@ -289,7 +296,8 @@ class _Case:
         elif np.isinf(sigma):
             text = "nothing in this flight shows it"
         else:
-            text = f"this flight would leave it {sigma / rule.wanted:.1f} times as uncertain as is of use"
+            found, before = (sized(self._names[at], size) for size in (sigma, rule.plausible))
+            text = f"this flight would find it to {found}, and its start is plausible to {before}"
         return f"{text}: {rule.looks}" if rule.looks else text
 
     def _remedy(self, at: int, others: Sequence[str]) -> str:

@@ -34,6 +34,28 @@ class Held:
     with_others: tuple[tuple[str, float], ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Considered:
+    """A parameter that kept its start, and what the flight says of that.
+
+    Attributes:
+        scanner, name: as ``left``, ``scan_angle_scale``.
+        value: at which it is held, SI.
+        sigma: one sigma of its error, SI: what is plausible, or what the flight says where that is more.
+        told: by how much the flight would change it if it were free, SI; nan: the flight says nothing.
+        told_sigma: of that, with what is plausible of all that is held.
+        contradicted: whether that is more than its sigmas allow.
+    """
+
+    scanner: str
+    name: str
+    value: float
+    sigma: float
+    told: float = np.nan
+    told_sigma: float = np.inf
+    contradicted: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Of one group of observations, one row an observation (n,).
@@ -126,8 +148,10 @@ class Adjusted:
             sigmas, correlations, tables.
         names: (u,) of the unknowns as ``left.omega_rad``, ``left.ibrc.3``, ``left.beam.12.azimuth_rad``.
         values, sigmas: (u,) SI; `start`: (u,) before; `prior_sigmas`: (u,) inf: none.
-        correlation: (u, u).
+        correlation: (u, u). Sigmas and correlations hold what those considered may have wrong.
         held: what was not estimated, and why.
+        considered: (c,) what was held and may be wrong.
+        moved: (u, c) by how much one sigma of each of them moves the unknowns, SI.
         trajectory: corrections of it; None: it was taken as free of errors.
         residuals: by group.
         groups: fits by group.
@@ -167,3 +191,16 @@ class Adjusted:
     scaled: bool = False
     notes: tuple[str, ...] = ()
     planes_e: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    considered: tuple[Considered, ...] = ()
+    moved: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(u, u) SI, with what those considered may have wrong."""
+        whole: FloatArray = self.correlation * np.outer(self.sigmas, self.sigmas)
+        return whole
+
+    @property
+    def movements(self) -> FloatArray:
+        """(u, c) `moved`, also where nothing is considered."""
+        return self.moved if self.moved.size else np.zeros((len(self.names), len(self.considered)))

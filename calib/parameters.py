@@ -33,6 +33,10 @@ MODELS: Mapping[str, tuple[str, ...]] = {
 SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
 BEAM_PARTS = {"azimuth_rad": AZIMUTH, "elevation_rad": ELEVATION, "range_m": RANGE}
 _BY_CONVENTION = "scan_angle_offset_rad"
+ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
+# One sigma of what is installed and measured with the aircraft on the ground; every parameter that the model `scanner`
+# lacks and nobody asks for is known exactly otherwise.
+INSTALLED: Mapping[str, float] = {f"lever_arm_{axis}_m": 0.002 for axis in "xyz"}
 
 
 class ParameterError(ValueError):
@@ -49,7 +53,8 @@ class Wish:
         model: key of `MODELS`.
         fix: parameters of the model that keep their value.
         free: parameters beyond the model.
-        priors: one sigma by which a parameter is held to its start, SI; it is estimated, in the model or not.
+        priors: one sigma by which a parameter is held to its start, SI; it is estimated, in the model or not. Of one
+            in `fix`: how well its value is known.
         ibrc_knots: rising intensities of a range correction by intensity; none: it is not estimated.
         ibrc_reference: the knot whose correction is 0; None: the middle one.
         ibrc_smoothness_m: one sigma of a knot's distance from the line through its neighbours.
@@ -81,6 +86,8 @@ class Unknown:
         name: as ``left.omega_rad``.
         start: its value before, SI.
         prior_sigma: by which it is held to that; inf: free.
+        plausible: one sigma, SI, of the start's error where it is held; 0: the start is exact, or a reference.
+        first: the value from which iterations begin; nan: the start.
     """
 
     head: int
@@ -89,6 +96,8 @@ class Unknown:
     name: str
     start: float
     prior_sigma: float = np.inf
+    plausible: float = 0.0
+    first: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +111,7 @@ class Unknowns:
         knots: (k,) intensities of the range correction by intensity; none: it is not estimated. The base's tables
             are at these.
         smoothness_m: of it.
+        considered: (c,) parameters that keep their start, each wrong by what is plausible.
     """
 
     base: tuple[Calibration, ...]
@@ -109,6 +119,7 @@ class Unknowns:
     held: tuple[Held, ...] = ()
     knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     smoothness_m: float = 0.02
+    considered: tuple[Unknown, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,6 +130,12 @@ class Unknowns:
     def start(self) -> FloatArray:
         """(u,) values before."""
         return np.array([item.start for item in self.items], dtype=np.float64)
+
+    @property
+    def first(self) -> FloatArray:
+        """(u,) values from which iterations begin."""
+        first = np.array([item.first for item in self.items], dtype=np.float64)
+        return np.where(np.isnan(first), self.start, first)
 
     @property
     def prior_sigmas(self) -> FloatArray:
@@ -137,25 +154,44 @@ class Unknowns:
         return np.array(at, dtype=np.int64), np.array(kinds, dtype=np.int64), np.array(arguments, dtype=np.int64)
 
     def without(self, names: frozenset[str], held: Sequence[Held] = ()) -> Unknowns:
-        """The same, some of them held at their start."""
+        """Return the same, some of them held at their start."""
         items = tuple(item for item in self.items if item.name not in names)
-        return replace(self, items=items, held=(*self.held, *held))
+        gone = tuple(item for item in self.items if item.name in names and item.plausible > 0.0)
+        return replace(self, items=items, held=(*self.held, *held), considered=(*self.considered, *gone))
+
+    def complete(self) -> Unknowns:
+        """Return the same with those that are considered among the unknowns, behind the others."""
+        free = tuple(replace(item, prior_sigma=np.inf) for item in self.considered)
+        return replace(self, items=(*self.items, *free), considered=())
 
     def calibrations(self, values: FloatArray) -> dict[str, Calibration]:
         """By scanner, with values (u,)."""
         return {base.scanner: self._with(head, values) for head, base in enumerate(self.base)}
 
-    def finished(self, values: FloatArray, covariance: FloatArray) -> dict[str, Calibration]:
-        """By scanner, with values (u,) and their covariance (u, u) as sigmas and correlations."""
+    def finished(
+        self, values: FloatArray, covariance: FloatArray, held_sigmas: FloatArray, moved: FloatArray
+    ) -> dict[str, Calibration]:
+        """Return calibrations by scanner, with the joint covariance of their parameters.
+
+        Args:
+            values: (u,) of the unknowns.
+            covariance: (u, u) of them, with what those considered do to them.
+            held_sigmas: (c,) one sigma of those considered.
+            moved: (u, c) by which that moves the unknowns.
+        """
         done = {}
+        joint = np.block([[covariance, moved * held_sigmas], [(moved * held_sigmas).T, np.diag(held_sigmas**2)]])
+        items = (*self.items, *self.considered)
         for head, base in enumerate(self.base):
-            at, kinds, _ = self.of_head(head)
-            at, kinds = at[kinds < SLOT], kinds[kinds < SLOT]
-            sigma = np.sqrt(np.diag(covariance)[at])
-            sigmas, correlation = np.zeros(len(PARAMETERS)), np.eye(len(PARAMETERS))
-            sigmas[kinds] = sigma
-            correlation[np.ix_(kinds, kinds)] = covariance[np.ix_(at, at)] / np.outer(sigma, sigma)
-            done[base.scanner] = replace(self._with(head, values), sigmas=sigmas, correlation=correlation)
+            at = np.array([i for i, one in enumerate(items) if one.head == head and one.kind < SLOT], dtype=np.int64)
+            kinds = np.array([items[i].kind for i in at], dtype=np.int64)
+            sigma, estimated = np.sqrt(np.diag(joint)[at]), at < len(self.items)
+            sigmas, held, correlation = np.zeros(len(PARAMETERS)), np.zeros(len(PARAMETERS)), np.eye(len(PARAMETERS))
+            sigmas[kinds[estimated]], held[kinds[~estimated]] = sigma[estimated], sigma[~estimated]
+            correlation[np.ix_(kinds, kinds)] = joint[np.ix_(at, at)] / np.outer(sigma, sigma)
+            correlation[kinds, kinds] = 1.0
+            found = self._with(head, values)
+            done[base.scanner] = replace(found, sigmas=sigmas, held_sigmas=held, correlation=correlation)
         return done
 
     def pseudo(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -213,33 +249,46 @@ class Unknowns:
         return replace(base, parameters=parameters, range_offsets=tuple(offsets), ibrc=table, beams=beams)
 
 
-def unknowns(flight: Flight, wish: Wish, start: Mapping[str, Calibration] | None = None) -> Unknowns:
-    """The unknowns of a flight.
+def unknowns(
+    flight: Flight,
+    wish: Wish,
+    start: Mapping[str, Calibration] | None = None,
+    first: Mapping[str, Calibration] | None = None,
+    doubted: Mapping[str, float] | None = None,
+) -> Unknowns:
+    """Return the unknowns of a flight.
 
     Args:
         flight: whose heads they are.
         wish: what is to be estimated.
-        start: calibrations to start from, by scanner; None: the heads' own.
+        start: calibrations to start from, by scanner; None: the heads' own. What is held keeps their values.
+        first: by scanner, boresight angles from which iterations begin; None: from the start.
+        doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
 
     Raises:
         ParameterError: the wish names what is not known, or what such a scanner does not have.
     """
     _check(flight, wish)
-    bases, items, held = [], [], []
+    bases, items, held, considered = [], [], [], []
     for index, head in enumerate(flight.heads):
         calibration = head.start if start is None else start[head.name]
         base = _with_knots(replace(calibration, scanner=head.name), wish)
         bases.append(base)
         for parameter in PARAMETERS:
-            word = _word(head, parameter.name, wish)
+            name, word = parameter.name, _word(head, parameter.name, wish)
+            near = np.nan if first is None or name not in ANGLES else first[head.name].value(name)
+            plausible = max(_plausible(head, base, name, wish), (doubted or {}).get(f"{head.name}.{name}", 0.0))
+            known = Unknown(index, INDEX[name], 0, f"{head.name}.{name}", base.value(name), plausible=plausible)
             if word is None:
-                sigma = _prior(head, parameter.name, wish)
-                items.append(_parameter(index, base, parameter.name, sigma))
-            elif parameter.name in MODELS[wish.model]:
-                held.append(Held(head.name, parameter.name, word))
+                items.append(replace(known, prior_sigma=_prior(head, name, wish), first=near))
+                continue
+            if plausible > 0.0:
+                considered.append(known)
+            if name in MODELS[wish.model] or _asked(head, name, wish) == "fix":
+                held.append(Held(head.name, name, word))
         items += _extras(index, head, base, wish)
     knots = np.array(wish.ibrc_knots, dtype=np.float64)
-    return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m)
+    return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m, tuple(considered))
 
 
 def _asked(head: Head, name: str, wish: Wish) -> str:
@@ -273,8 +322,25 @@ def _word(head: Head, name: str, wish: Wish) -> str | None:
     return None if name in MODELS[wish.model] else "not in the model"
 
 
-def _parameter(index: int, base: Calibration, name: str, sigma: float) -> Unknown:
-    return Unknown(index, INDEX[name], 0, f"{base.scanner}.{name}", base.value(name), sigma)
+def _plausible(head: Head, base: Calibration, name: str, wish: Wish) -> float:
+    """Return one sigma, SI, by which a parameter may be wrong while it is held; 0: not at all.
+
+    The user's word counts first, then what an earlier calibration found, then what is plausible. By convention the scan
+    angle's offset is part of roll, and what neither the model nor the user names is as it was installed.
+    """
+    if name in head.geometry.without:
+        return 0.0
+    said = wish.priors.get(f"{head.name}.{name}", wish.priors.get(name))
+    if said is not None:
+        return said
+    if name == _BY_CONVENTION:
+        return 0.0
+    stated = 0.0 if base.method == "nominal" else float(base.all_sigmas[INDEX[name]])
+    if stated > 0.0:
+        return stated
+    if name in _SCANNER or name in MODELS[wish.model] or _asked(head, name, wish):
+        return PARAMETERS[INDEX[name]].plausible
+    return INSTALLED.get(name, 0.0)
 
 
 def _extras(index: int, head: Head, base: Calibration, wish: Wish) -> Iterator[Unknown]:

@@ -35,6 +35,7 @@ _CONTROL_SPACINGS, _CONTROL_POINTS = 1.3, 3  # around a control point, returns w
 _RANGE_HEIGHTS, _RANGE_LEAST_M = 0.0075, 0.2
 _OVERSAMPLED = 4  # as many returns as are wanted are looked at for those where swaths overlap
 _OVERLAP_WIDTHS = 0.1  # side of the cells by which overlap is found, in widths of a swath
+_HELD = 1e-9  # rad, or m, by which what is held may move
 _STEP_MOST_RAD = np.radians(2.0)
 _NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
 _REWEIGHTINGS, _HUBER, _SIGMA_LEAST_M = 3, 2.0, 0.02
@@ -57,6 +58,7 @@ class PrealignSettings:
         settled_rad: the finest level ends when no angle changes by more; a coarser one when by as much more.
         greatest_rad: beyond this it is no coarse error of a mounting but a wrong installation matrix.
         control_sigma_m: of control against heights of the surface.
+        held: of `NAMES`, by scanner as ``left.kappa_rad`` or of all: they keep their start.
     """
 
     smooth_m: tuple[float, ...] | None = None
@@ -67,6 +69,7 @@ class PrealignSettings:
     settled_rad: float = float(np.radians(0.004))
     greatest_rad: float = float(np.radians(6.0))
     control_sigma_m: float = 0.1
+    held: frozenset[str] = frozenset()
 
 
 _DEFAULT = PrealignSettings()
@@ -89,6 +92,30 @@ def prealign(
     Raises:
         PrealignError: there is one swath only, swaths do not overlap, or their heights do not come together.
     """
+    return prealigned(flight, settings, start, control_t).calibrations
+
+
+@dataclass(frozen=True)
+class Prealigned:
+    """What came of it.
+
+    Attributes:
+        calibrations: by scanner.
+        sigmas: (4,) of `NAMES` by scanner, SI, as far as heights of the strips tell; of what they do not tell, those of
+            the settings. Formal ones: what heights alone cannot show is not in them.
+    """
+
+    calibrations: dict[str, Calibration]
+    sigmas: dict[str, FloatArray]
+
+
+def prealigned(
+    flight: Flight,
+    settings: PrealignSettings = _DEFAULT,
+    start: Mapping[str, Calibration] | None = None,
+    control_t: FloatArray | None = None,
+) -> Prealigned:
+    """Return coarse calibrations with sigmas; arguments and errors as of `prealign`."""
     if len(flight.swaths) < 2:
         raise PrealignError(f"prealignment: got {len(flight.swaths)} swath, want at least two that overlap")
     found = dict(start or flight.starts())
@@ -96,7 +123,7 @@ def prealign(
     samples, scale = _samples(flight, found, settings.returns)
     range_m = min(settings.range_sigma_m, max(_RANGE_HEIGHTS * scale.height_m, _RANGE_LEAST_M))
     settings = replace(settings, range_sigma_m=range_m)
-    step = np.zeros((len(flight.heads), len(NAMES)))
+    step, sigma = np.zeros((2, len(flight.heads), len(NAMES)))
     levels, improved = _levels(scale, settings), None
     control = None if control_t is None else _Control(control_t, _CONTROL_SPACINGS * scale.spacing_m)
     for smooth_m in levels:
@@ -108,13 +135,13 @@ def prealign(
             improved = _improved(flight, placed, found, began, smooth_m, settings, control)
             if improved is None:  # a coarse level on a narrow overlap: a finer one may still do
                 break
-            found, step = improved
+            found, step, sigma = improved
             if np.abs(step[:, :3]).max() < coarser * settings.settled_rad:
                 break
     if improved is None:
         raise PrealignError("prealignment: the swaths do not overlap; want strips over the same ground")
     _refuse(found, began, step, settings)
-    return found
+    return Prealigned(found, {head.name: one for head, one in zip(flight.heads, sigma, strict=True)})
 
 
 def _refuse(
@@ -209,9 +236,11 @@ def _improved(
     smooth_m: float,
     settings: PrealignSettings,
     control: _Control | None,
-) -> tuple[dict[str, Calibration], FloatArray] | None:
-    """One step: better calibrations, and by how much each head's parameters changed, (h, 4); None: too few cells are
-    in two swaths."""
+) -> tuple[dict[str, Calibration], FloatArray, FloatArray] | None:
+    """Return better calibrations, and by how much each head's parameters changed, (h, 4), with their sigmas (h, 4).
+
+    None: too few cells are in two swaths.
+    """
     if any(not len(points) for points, _ in placed):
         raise PrealignError(f"prealignment: {_NO_POINTS}")
     lattice = Lattice.over([points for points, _ in placed], smooth_m / _SMOOTH_CELLS, _CELLS_MOST)
@@ -231,14 +260,17 @@ def _improved(
         right += rows.T @ above / settings.control_sigma_m**2
     names = [head.name for head in flight.heads]
     away = np.concatenate([[found[name].value(p) - began[name][INDEX[p]] for p in NAMES] for name in names])
-    prior = np.tile([settings.boresight_sigma_rad] * 3 + [settings.range_sigma_m], len(names)) ** -2.0
+    sigmas = np.tile([settings.boresight_sigma_rad] * 3 + [settings.range_sigma_m], len(names))
+    held = [p in settings.held or f"{name}.{p}" in settings.held for name in names for p in NAMES]
+    prior = np.where(held, _HELD, sigmas) ** -2.0
     step = -np.linalg.solve(normal + np.diag(prior), right + prior * away).reshape(-1, len(NAMES))
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal + np.diag(prior)))).reshape(-1, len(NAMES))
     step *= min(1.0, _STEP_MOST_RAD / max(float(np.abs(step[:, :3]).max()), 1e-12))
     better = {
         name: found[name].changed(**{p: found[name].value(p) + float(by) for p, by in zip(NAMES, one, strict=True)})
         for name, one in zip(names, step, strict=True)
     }
-    return {**found, **better}, step
+    return {**found, **better}, step, sigma
 
 
 def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Calibration]) -> FloatArray:

@@ -12,8 +12,10 @@ what changes along it, and an opposite pair side by side knows that pitch moves 
 The angles and the range of all profiles together are x̂ = W y, by least squares with V = L C Lᵀ + D, C the prior
 covariance of the trajectory's errors. Their difference d from the adjustment is W S of what the adjustment has wrong,
 less what W makes of L t + v. An efficient estimate is uncorrelated with its difference from any other unbiased one
-(Hausman 1978, Econometrica 46, lemma 2.1), so cov d = W V Wᵀ − (W S) Σ (W S)ᵀ, Σ that of the adjustment; never less
-than the profiles' noise alone, which the adjustment does not share.
+(Hausman 1978, Econometrica 46, lemma 2.1), so cov d = W V Wᵀ − (W S) Σ (W S)ᵀ, Σ that of the adjustment's own errors;
+never less than the profiles' noise alone, which the adjustment does not share. What parameters that were held have
+wrong, and what it did to the estimated ones, is in d as it is in the profiles: it adds (W S) H (W S)ᵀ, H its
+covariance.
 """
 
 from __future__ import annotations
@@ -170,6 +172,7 @@ class _Together:
         names: all parameters of all scanners; `by_parameter` (p, names) S.
         variance: (p, p) V; noise: (p,) of it the pieces' own, sigmas.
         adjusted: (names, names) Σ; zero where one was held.
+        held: (names, c) what one sigma of each held parameter moves, itself too.
     """
 
     found: FloatArray
@@ -178,6 +181,7 @@ class _Together:
     variance: FloatArray
     noise: FloatArray
     adjusted: FloatArray
+    held: FloatArray
 
     @classmethod
     def of(
@@ -205,7 +209,7 @@ class _Together:
         factor = adjusted.variance_factor if adjusted.scaled else 1.0
         variance = factor * (by_knot @ prior.covariance @ by_knot.T + shared @ shared.T + np.diag(noise**2))
         found = np.array([profile.found for profile in profiles])
-        return cls(found, names, by_parameter, variance, noise, _covariance(adjusted, names))
+        return cls(found, names, by_parameter, variance, noise, *_covariances(adjusted, names))
 
     def solved(self, names: Sequence[str]) -> _Solved:
         """Of these parameters; all others as adjusted."""
@@ -222,9 +226,9 @@ class _Together:
         efficient = np.diag(through @ self.adjusted @ through.T)
         others = through.copy()
         others[:, columns] = 0.0
-        told = np.diag(own + others @ self.adjusted @ others.T)
+        told = np.diag(own + others @ (self.adjusted + self.held @ self.held.T) @ others.T)
         least = ((gain * self.noise) ** 2).sum(axis=1)
-        apart = np.maximum(np.diag(own) - efficient, least)
+        apart = np.maximum(np.diag(own) - efficient, least) + ((through @ self.held) ** 2).sum(axis=1)
         return _Solved(gain @ self.found, np.sqrt(told), np.sqrt(apart))
 
 
@@ -235,17 +239,14 @@ def _by_parameter(part: Influence, profile: Profile, names: Sequence[str]) -> Fl
     return row
 
 
-def _covariance(adjusted: Adjusted, names: Sequence[str]) -> FloatArray:
-    """(names, names) of the parameters that were estimated."""
-    covariance = np.zeros((len(names), len(names)))
-    known = [
-        (i, names.index(name))
-        for i, name in enumerate(adjusted.names)
-        if name.partition(".")[2] in INDEX and name in names
-    ]
-    rows, to = (
-        (np.array(column, np.int64) for column in zip(*known, strict=True)) if known else (np.zeros(0, np.int64),) * 2
-    )
-    sigmas = adjusted.sigmas[rows]
-    covariance[np.ix_(to, to)] = adjusted.correlation[np.ix_(rows, rows)] * np.outer(sigmas, sigmas)
-    return covariance
+def _covariances(adjusted: Adjusted, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """Return (names, names) of the estimated parameters' own errors, (names, c) what one sigma of held ones moves."""
+    covariance, held = np.zeros((len(names), len(names))), np.zeros((len(names), len(adjusted.considered)))
+    at = [i for i, name in enumerate(adjusted.names) if name.partition(".")[2] in INDEX and name in names]
+    to = [names.index(adjusted.names[i]) for i in at]
+    moved = adjusted.movements[at]
+    covariance[np.ix_(to, to)] = adjusted.covariance[np.ix_(at, at)] - moved @ moved.T
+    held[to] = moved
+    for column, one in enumerate(adjusted.considered):
+        held[names.index(f"{one.scanner}.{one.name}"), column] = one.sigma
+    return covariance, held

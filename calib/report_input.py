@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib.calibration_file import Header
 from calib.features import Features
 from calib.flight import Flight
+from calib.need import Need
 from calib.outcome import Adjusted
 from calib.profile_check import Check
 
@@ -86,6 +87,23 @@ class Profile:
     figure: Callable[[], Any] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that speaks against a calibration, found beside its figures.
+
+    Attributes:
+        what: is the matter, with the figure.
+        change: what to do about it.
+        excess: by how much it is beyond what is expected, to put the worst first.
+        unusable: whether the calibration must not be used with it.
+    """
+
+    what: str
+    change: str
+    excess: float = 1.0
+    unusable: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class ReportInput:
     """All that a report shows.
@@ -101,6 +119,8 @@ class ReportInput:
         inputs: name and SHA-256 of every file that went in.
         settings: of the run, in words, among them software and versions.
         notes: for the reader, one sentence each.
+        findings: reasons against it that its figures do not tell.
+        need: how accurate it has to be, and what it leaves in the points; None: not looked into.
         title: of the whole; empty: made of installation and scanners.
         measure: what the height differences are, for people; empty: unsaid.
         level: the quality level that strips keep, or why there is none; empty: not judged.
@@ -118,6 +138,8 @@ class ReportInput:
     inputs: Sequence[tuple[str, str]] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    findings: Sequence[Finding] = ()
+    need: Need | None = None
     title: str = ""
     measure: str = ""
     level: str = ""

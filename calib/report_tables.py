@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib.outcome import Held, Residuals
 from calib.report_input import ReportInput
 from calib.report_plots import SUSPECT
+from calib.report_verdict import held_words
 from calib.report_words import (
     Unknown,
     decimals_of,
@@ -24,7 +25,7 @@ from calib.report_words import (
     unknown,
     words_of,
 )
-from georef.calibration import PARAMETERS
+from georef.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0
@@ -79,11 +80,15 @@ def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
             one = unknown(f"{scanner}.{parameter.name}")
             told = number(calibration.value(parameter.name) * one.factor, ".6g")
             why = "not determined" if is_undetermined(held[parameter.name]) else "held"
-            rows.append([one.words, one.unit, told, "–", told, why, "–", "–"])
+            sigma = float(calibration.held_sigmas[INDEX[parameter.name]]) * one.factor
+            plausible = number(sigma, f".{decimals_of(sigma)}f") if sigma > 0.0 else "–"
+            rows.append([one.words, one.unit, told, plausible, told, why, "–", "–"])
     heads = ("parameter", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
     honest = adjusted.trajectory is not None
     words = "errors of the trajectory included" if honest else "too small: without what the trajectory's errors share"
-    under = f"Sigmas are one standard deviation, {words}."
+    under = f"Sigmas are one standard deviation, {words}, and what held parameters may have wrong."
+    for told in held_words(adjusted):
+        under += f" {told[0].upper()}{told[1:]}."
     if any(row[6].endswith("·") for row in rows):
         under += f" · the change is below {INSIGNIFICANT:g} sigmas: the start may have been as good."
     title = f"Parameters of {scanner}" if several else "Parameters"

@@ -9,12 +9,16 @@ from enum import IntEnum
 
 import numpy as np
 
+from calib.outcome import Adjusted, Considered
 from calib.report_input import Difference, Pair, ReportInput
-from calib.report_words import degrees, is_undetermined, length, listed, number, share, unknown, words_of
+from calib.report_words import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
 
+DEG = 180.0 / math.pi
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
-BASIC = (*BORESIGHT, "range_offset_m")
 MOST_CORRELATED = 0.95
+TOO_LARGE = 10.0  # times what is wanted
+# What is wanted where nobody says and the flight's points do not tell
+WANTED = {"omega_rad": 0.003 / DEG, "phi_rad": 0.003 / DEG, "kappa_rad": 0.006 / DEG, "range_offset_m": 0.02}
 
 
 class Level(IntEnum):
@@ -87,10 +91,50 @@ def overall_rms_m(pairs: dict[Pair, Difference]) -> float | None:
 
 
 def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
-    """The largest sigma (SI) of estimated parameters of these names, over all scanners; None: none is estimated."""
+    """Return the largest sigma (SI) of parameters of these names, estimated or held; None: nothing is said of them."""
     adjusted = report.adjusted
     known = [s for n, s in zip(adjusted.names, adjusted.sigmas.tolist(), strict=True) if unknown(n).name in names]
+    known += [one.sigma for one in adjusted.considered if one.name in names]
     return max(known, default=None)
+
+
+def wanted_of(report: ReportInput) -> dict[str, float]:
+    """Return one sigma (SI) that is wanted, by parameter's name."""
+    told = {} if report.need is None else report.need.wanted
+    return {**WANTED, **{name: sigma for name, sigma in told.items() if math.isfinite(sigma)}}
+
+
+def held_words(adjusted: Adjusted) -> list[str]:
+    """Return what held parameters would do, a sentence each: those that move an estimated one by more than its sigma.
+
+    An estimated parameter's own sigma is the one it would have if nothing that is held were wrong.
+    """
+    several = len(adjusted.calibrations) > 1
+    moved = adjusted.movements
+    own = np.sqrt(np.maximum(adjusted.sigmas**2 - (moved**2).sum(axis=1), 0.0))
+    found = []
+    for column, one in enumerate(adjusted.considered):
+        at = np.argsort(-np.abs(moved[:, column]) / np.maximum(own, 1e-300)).tolist()
+        told = [
+            f"{unknown_words(adjusted.names[i], several)} by {sized(adjusted.names[i], abs(float(moved[i, column])))}"
+            for i in at
+            if abs(float(moved[i, column])) > own[i]
+        ]
+        if told:
+            found.append(f"{_held(one, several)}, would move {listed(told)}")
+    return found
+
+
+def unknown_words(name: str, several: bool) -> str:
+    """Return the words of an unknown, as ``left.omega_rad``."""
+    one = unknown(name)
+    return words_of(one.scanner, one.name, several=several)
+
+
+def _held(one: Considered, several: bool) -> str:
+    """Return what is held, and how well it is known."""
+    name = f"{one.scanner}.{one.name}"
+    return f"{unknown_words(name, several)}, held, plausible to {sized(name, one.sigma)}"
 
 
 def undetermined(report: ReportInput) -> list[str]:
@@ -108,26 +152,76 @@ def _no_redundancy(report: ReportInput) -> Iterator[tuple[str, float]]:
     yield number(report.adjusted.redundancy, ".0f"), 100.0 / max(report.adjusted.redundancy, 1e-9)
 
 
-def _missing_basic(report: ReportInput) -> Iterator[tuple[str, float]]:
+def _held_angles(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield the boresight angles that are held, and how many times what is wanted they are uncertain by."""
+    yield from _held_of(report, BORESIGHT)
+
+
+def _held_range(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield from _held_of(report, ("range_offset_m",))
+
+
+def _held_of(report: ReportInput, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    adjusted, wanted = report.adjusted, wanted_of(report)
+    several = len(adjusted.calibrations) > 1
+    sigmas = {(one.scanner, one.name): one for one in adjusted.considered}
+    held = [one for one in adjusted.held if one.name in names]
+    if not held:
+        return
+    words, worst = [], 1e-9
+    for one in held:
+        known = sigmas.get((one.scanner, one.name), Considered(one.scanner, one.name, 0.0, 0.0))
+        words.append(_held(known, several))
+        worst = max(worst, known.sigma / wanted[one.name])
+    yield listed(words), worst
+
+
+def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield estimated parameters with their sigmas and what is wanted, and the ratio."""
     several = len(report.adjusted.calibrations) > 1
-    for scanner in report.adjusted.calibrations:
-        held = [h.name for h in report.adjusted.held if h.scanner == scanner and is_undetermined(h)]
-        missing = [name for name in BASIC if name in held]
-        if missing:
-            angles = sum(name in BORESIGHT for name in missing)
-            words = listed([unknown(f"{scanner}.{name}").words for name in missing])
-            yield (words + (f" of {scanner}" if several else "")), 1.0 + (angles == len(BORESIGHT))
+    wanted = wanted_of(report)
+    for name, sigma in zip(report.adjusted.names, report.adjusted.sigmas.tolist(), strict=True):
+        limit = wanted.get(unknown(name).name)
+        if limit is not None:
+            words = (
+                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only, {sized(name, limit)} is wanted"
+            )
+            yield words, sigma / limit
 
 
-def _sigmas(names: tuple[str, ...], factor: float) -> Measure:
-    def measure(report: ReportInput) -> Iterator[tuple[str, float]]:
-        several = len(report.adjusted.calibrations) > 1
-        for name, sigma in zip(report.adjusted.names, report.adjusted.sigmas.tolist(), strict=True):
-            one = unknown(name)
-            if one.name in names:
-                yield words_of(one.scanner, one.name, several=several), sigma * factor
+def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield what the calibration leaves in points, over what is wanted."""
+    need = report.need
+    if need is None or not need.point_m > 0.0:
+        return
+    several = len(need.left_m) > 1
+    for scanner, left_m in need.left_m.items():
+        of = f" of {scanner}" if several else ""
+        if math.isfinite(left_m):
+            yield f"leaves {length(left_m)} in points{of}, {length(need.point_m)} is wanted", left_m / need.point_m
 
-    return measure
+
+def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield held parameters that the flight says are wrong."""
+    several = len(report.adjusted.calibrations) > 1
+    for one in report.adjusted.considered:
+        if one.contradicted:
+            name = f"{one.scanner}.{one.name}"
+            told = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
+            yield f"{unknown_words(name, several)} that is held: it would change it by {told}", 1.0
+
+
+def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield what profiles say against the adjustment, in sigmas of the difference."""
+    several = len(report.adjusted.calibrations) > 1
+    for one in () if report.check is None else report.check.comparisons:
+        name = f"{one.scanner}.{one.parameter}"
+        told = sized(name, one.told - one.adjusted, sign=True)
+        sigmas = number(one.normalised, "+.1f")
+        yield (
+            f"{one.profiles} profiles put {unknown_words(name, several)} {told} from the adjustment ({sigmas} sigmas)",
+            abs(one.normalised),
+        )
 
 
 def _variance(report: ReportInput) -> Iterator[tuple[str, float]]:
@@ -206,7 +300,6 @@ def _sigmas_words(value: float) -> str:
     return number(value, ".1f")
 
 
-DEG = 180.0 / math.pi
 RULES: tuple[Rule, ...] = (
     Rule(
         _not_converged,
@@ -223,35 +316,46 @@ RULES: tuple[Rule, ...] = (
         "fly over more roofs and slopes, with more overlap of lines",
     ),
     Rule(
-        _missing_basic,
-        0.5,
-        1.5,
-        "this flight does not determine {of}",
+        _held_angles,
+        0.0,
+        TOO_LARGE,
+        "not a boresight calibration: {of}",
         "fly the lines, or give the control, that stand below under Not determined",
     ),
     Rule(
-        _sigmas(("omega_rad", "phi_rad"), DEG),
-        0.003,
-        0.03,
-        "{of} is known to {value} only",
-        "more opposite lines, more slopes along track, a better trajectory",
-        degrees,
-    ),
-    Rule(
-        _sigmas(("kappa_rad",), DEG),
-        0.006,
-        0.06,
-        "{of} is known to {value} only",
-        "parallel lines with half a swath of overlap over slopes along track",
-        degrees,
-    ),
-    Rule(
-        _sigmas(("range_offset_m",), 1.0),
-        0.02,
-        0.5,
-        "{of} is known to {value} only",
+        _held_range,
+        1.0,
+        None,
+        "{of}",
         "control on flat, hard ground (at least 8 points of 1 cm)",
-        length,
+    ),
+    Rule(
+        _beyond_wanted,
+        1.0,
+        TOO_LARGE,
+        "{of}",
+        "fly more of the lines that determine it, or say [calibration] wanted where less will do",
+    ),
+    Rule(
+        _points,
+        1.0,
+        TOO_LARGE,
+        "the calibration {of}",
+        "more lines, control or heights; or say [calibration] wanted where less will do",
+    ),
+    Rule(
+        _contradicted,
+        0.5,
+        None,
+        "the flight contradicts {of}",
+        "free it (--free), or give it the value it has",
+    ),
+    Rule(
+        _profiles,
+        2.9,
+        8.0,
+        "{of}",
+        "look below at the profiles: which pairs say so, and whether all have one sign",
     ),
     Rule(
         _variance,
@@ -335,6 +439,10 @@ RULES: tuple[Rule, ...] = (
 def judge(report: ReportInput) -> Verdict:
     """The verdict."""
     reasons = [reason for rule in RULES for reason in rule.judged(report)]
+    reasons += [
+        Reason(Level.UNUSABLE if one.unusable else Level.CARE, one.what, one.change, one.excess)
+        for one in report.findings
+    ]
     reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
     level = max((reason.level for reason in reasons), default=Level.GOOD)
     return Verdict(level, _sentence(level, report, reasons), tuple(reasons))
@@ -346,7 +454,7 @@ def accuracy_words(report: ReportInput) -> str:
     words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
     words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []
     rms_m = overall_rms_m(dict(report.after))
-    told = ", ".join(words) or "nothing was estimated"
+    told = ", ".join(words) or "the model has neither boresight nor range offset"
     return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
 
 
@@ -355,6 +463,4 @@ def _sentence(level: Level, report: ReportInput, reasons: list[Reason]) -> str:
     tail = f" Not determined by this flight: {listed(missing)}." if missing else ""
     if level is Level.GOOD:
         return f"{level.words}: {accuracy}.{tail}"
-    more = len(reasons) - 1
-    count = f"; {more} more {'reason' if more == 1 else 'reasons'} below" if more else ""
-    return f"{level.words}: {reasons[0].what}{count}. {accuracy[0].upper()}{accuracy[1:]}.{tail}"
+    return f"{level.words}: {reasons[0].what}. {accuracy[0].upper()}{accuracy[1:]}.{tail}"

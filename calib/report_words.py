@@ -128,6 +128,17 @@ def degrees(value_deg: float | None) -> str:
     return number(value_deg, f".{max(4, decimals_of(value_deg) - 1)}f" if value_deg < 0.1 else ".2f") + "°"
 
 
+def sized(name: str, value: float, *, sign: bool = False) -> str:
+    """Return a sigma or a difference (SI) of an unknown, as ``left.omega_rad``, in the unit of reports."""
+    one = unknown(name)
+    if one.unit == "m":
+        told = length(value)
+        return f"+{told}" if sign and value > 0.0 else told
+    size = value * one.factor
+    digits = decimals_of(abs(size))
+    return number(size, f"{'+' if sign else ''}.{digits}f") + ("°" if one.unit == "°" else SPACE + one.unit)
+
+
 def share(value: float) -> str:
     """Per cent; what is not nothing is not 0 %."""
     return "0 %" if value <= 0.0 else "< 0.01 %" if value < 1e-4 else f"{100.0 * value:.2f} %"

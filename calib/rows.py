@@ -153,7 +153,7 @@ class Rows:
         """Before the first step; tie points where they were seen first."""
         normals = np.array([plane.normal_t for plane in self.planes]).reshape(-1, 3) @ self.flight.frame.rot_t_from_e
         knots = np.zeros((0 if self.prior is None else len(self.prior.time_ns), 6))
-        return State(self.unknowns.start, knots, normals, np.zeros(len(self.planes)), np.zeros((ties, 3)))
+        return State(self.unknowns.first, knots, normals, np.zeros(len(self.planes)), np.zeros((ties, 3)))
 
     def summed(self, state: State, weight: SingleArray, huber: float) -> Sums:
         """Normal equations at a state.

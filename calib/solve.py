@@ -104,6 +104,40 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
+class HeldEffects:
+    """What parameters that are held do to an adjustment (Schmidt 1966: "consider" parameters).
+
+    Attributes:
+        by_unit: (u, c) change of each unknown per unit of each held parameter's error.
+        information: (c, c) of the observations about the held ones, unknowns, states and features eliminated.
+        score: (c,) gradient there: information · (what the observations would change them by), 0 at the optimum.
+    """
+
+    by_unit: FloatArray
+    information: FloatArray
+    score: FloatArray
+
+    @classmethod
+    def at(
+        cls, block: Block, state: State, weights: tuple[SingleArray, SingleArray], covariance: FloatArray
+    ) -> HeldEffects:
+        """Return them at a solution, whose parameters and states have this covariance (n, n)."""
+        asked = block.rows.unknowns
+        p, c = len(asked), len(asked.considered)
+        if not c:
+            return cls(np.zeros((p, 0)), np.zeros((0, 0)), np.zeros(0))
+        values = np.concatenate([state.values, [item.start for item in asked.considered]])
+        wider = block.with_unknowns(asked.complete()).normals(replace(state, values=values), weights)
+        held = np.arange(p, p + c)
+        own = np.delete(np.arange(len(wider.normal)), held)
+        mixed = wider.normal[np.ix_(own, held)]
+        gain = covariance @ mixed
+        information = wider.normal[np.ix_(held, held)] - mixed.T @ gain
+        score = -(wider.right[held] - gain.T @ wider.right[own])
+        return cls(-gain[:p], (information + information.T) / 2.0, score)
+
+
+@dataclass(frozen=True, eq=False)
 class Solved:
     """What came out of it, and how often it was linearised."""
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,
+    CalibrationConfig,
     CorrectionsConfig,
     GnssConfig,
     ImuConfig,
@@ -118,6 +119,11 @@ class Config:
     def profile(self) -> ProfileConfig:
         """``[profile]``."""
         return self.tables.profile
+
+    @property
+    def calibration(self) -> CalibrationConfig:
+        """``[calibration]``."""
+        return self.tables.calibration
 
     @property
     def output(self) -> OutputConfig:

@@ -365,6 +365,26 @@ class OutputConfig(Section):
     )
 
 
+class WantedConfig(Section):
+    """``[calibration.wanted]``: one sigma that a calibration has to reach."""
+
+    point_m: float | None = Field(None, gt=0.0, le=100.0, description="what it may leave in points, of three axes")
+    omega_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight ω")
+    phi_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight φ")
+    kappa_deg: float | None = Field(None, gt=0.0, le=10.0, description="boresight κ")
+    range_offset_m: float | None = Field(None, gt=0.0, le=100.0, description="range offset")
+    range_scale_ppm: float | None = Field(None, gt=0.0, le=1e6, description="range scale")
+    scan_angle_scale_ppm: float | None = Field(None, gt=0.0, le=1e6, description="scan angle scale")
+    scan_plane_tilt_deg: float | None = Field(None, gt=0.0, le=10.0, description="scan plane tilt")
+    time_offset_us: float | None = Field(None, gt=0.0, le=1e6, description="time offset")
+
+
+class CalibrationConfig(Section):
+    """``[calibration]``: what `swath calibrate` judges by."""
+
+    wanted: WantedConfig = Field(default_factory=WantedConfig, description="what it has to reach")
+
+
 class LiveConfig(Section):
     """``[live]``: what `swath live` writes beside the log."""
 
@@ -389,4 +409,5 @@ class Tables(Section):
     mta: MtaConfig = Field(default_factory=MtaConfig)
     profile: ProfileConfig = Field(default_factory=ProfileConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
+    calibration: CalibrationConfig = Field(default_factory=CalibrationConfig)
     live: LiveConfig = Field(default_factory=LiveConfig)

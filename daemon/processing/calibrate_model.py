@@ -34,7 +34,7 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     Args:
         model: of `calib.parameters.MODELS`, or a file (`daemon.processing.model_file`).
         fix, free: keys, with commas between.
-        priors: ``KEY=SIGMA``, each in its key's unit.
+        priors: ``KEY=SIGMA``, each in its key's unit; of one that is fixed, how well its value is known.
 
     Raises:
         UserError: there is no such model or file, a key is no parameter, or a sigma is none.
@@ -44,15 +44,17 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     known = _PARAMETERS | _entries(wish)
     said = _states(tables.parameters.items(), f"{model}: parameters.", known)
     own = _states(((key, FREE) for key in free.split(",") if key), "--free ", known)
-    own |= _states(map(_prior, priors), "--prior ", known)
+    sigmas = _states(map(_prior, priors), "--prior ", known)
+    own |= sigmas
     own |= _states(((key, FIXED) for key in fix.split(",") if key), "--fix ", known)
     left = {at: state for at, state in said.items() if at not in own and ("", at[1]) not in own}
     states = {f"{scanner}.{name}" if scanner else name: state for (scanner, name), state in (left | own).items()}
+    held = {f"{scanner}.{name}" if scanner else name: sigma for (scanner, name), sigma in sigmas.items()}
     return replace(
         wish,
         fix=frozenset(name for name, state in states.items() if state == FIXED),
         free=frozenset(name for name, state in states.items() if state == FREE),
-        priors={name: state for name, state in states.items() if not isinstance(state, str)},
+        priors={name: state for name, state in (states | held).items() if not isinstance(state, str)},
     )
 
 

@@ -16,12 +16,18 @@ from typing import Any
 import numpy as np
 
 from calib.calibration_file import CalibrationFileError, Header, calibration_text
+from calib.effects import SeenFrom
+from calib.need import POINT, Need, need_of
 from calib.outcome import Adjusted
+from calib.parameters import ANGLES
 from calib.profile_check import Check
 from calib.record_values import Plain
-from calib.report_input import ReportInput
-from calib.report_verdict import Verdict, judge
-from daemon.errors import ExitCode, UserError
+from calib.report_input import Finding, ReportInput
+from calib.report_verdict import DEG, Verdict, held_words, judge
+from calib.signatures import signatures
+from calib.strips import differences
+from calib.validation import validate
+from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
@@ -29,9 +35,11 @@ from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from daemon.processing.trajectory_files import write_whole
+from georef.calibration import INDEX, PARAMETERS
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 MAP_CELLS = 400  # across a map of differences
+BEYOND = 3.0  # sigmas, of strips and calibration together, beyond which strips contradict it
 
 
 @dataclass(frozen=True)
@@ -51,18 +59,22 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     tell("strips before and after", 0, 1)
     before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
     inputs = _inputs(wish, done)
-    headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
+    headers = {name: _header(wish, done, name, inputs) for name in done.adjusted.calibrations}
+    tell("checks", 0, 1)
+    findings = (*done.findings, *strips_say(done), *validation_says(done))
+    report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
+    verdict = judge(report)
+    headers = {name: _judged(header, done, name, verdict) for name, header in headers.items()}
     try:
         texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
     except CalibrationFileError as error:
         raise UserError(str(error)) from error
     files: dict[Path, bytes] = {path: texts[name].encode() for name, path in paths_of(wish, headers).items()}
-    report = _report(wish, done, headers, before, after, inputs)
-    verdict = judge(report)
     record = _record(done, headers, before, after, inputs) | {
         "model": in_words(wish.model),
         "ibrc_knots": list(wish.model.ibrc_knots),
         "verdict": _verdict_entry(verdict),
+        "need": _need_entry(report.need),
     }
     if wish.report is not None:
         tell("report", 0, 1)
@@ -75,6 +87,38 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
         record | {"files": written},
         [*_lines(done, wish.model.ibrc_knots, before, after), verdict.sentence, *reasons, *written],
     )
+
+
+def strips_say(done: Calibrated) -> list[Finding]:
+    """Return effects that strips still show and that neither their sigmas nor the calibration's explain."""
+    seen = signatures(differences(done.flight).checks, SeenFrom.of(done.flight), done.prior)
+    found = []
+    for one in seen.found:
+        if one.level != "significant":
+            continue
+        known = max(float(each.all_sigmas[INDEX[one.effect.parameter]]) for each in done.adjusted.calibrations.values())
+        excess = abs(one.value) / (BEYOND * math.hypot(one.sigma, known))
+        if excess > 1.0:
+            change = "look at swath strips: a strip of its own kind, a bad trajectory, too few strips to part effects"
+            found.append(Finding(f"strips still show {one.words}", change, excess))
+    return found
+
+
+def validation_says(done: Calibrated) -> list[Finding]:
+    """Return the tests of a validation that the calibration fails on its own planes and control.
+
+    They have been adjusted with it, so what fails here fails in spite of that.
+    """
+    outcome = validate(done.flight, done.features, done.adjusted.calibrations, done.control)
+    change = "look at swath validate: its planes and pairs say where the calibration does not hold"
+    return [Finding(f"validation: {one.sentence}", change) for one in outcome.methods if one.passed is False]
+
+
+def _judged(header: Header, done: Calibrated, name: str, verdict: Verdict) -> Header:
+    """Return the header with the verdict on all, and what of this scanner was asked for and held."""
+    held = tuple(key_of(one.name)[0] for one in done.adjusted.held if one.scanner == name and one.name in INDEX)
+    reasons = tuple(one_line(reason.what) for reason in verdict.reasons)
+    return replace(header, verdict=verdict.level.words.lower(), verdict_reasons=reasons, held=held)
 
 
 def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:
@@ -96,7 +140,7 @@ def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
     return [(path.name, sha256_of(path)) for path in paths]
 
 
-def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
+def _header(wish: CalibrateWish, done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
     now = dt.datetime.now(dt.UTC).replace(microsecond=0)
     found = done.adjusted.calibrations[name]
     digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
@@ -114,7 +158,15 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
         logs=logs,
         variance_factor=done.adjusted.variance_factor,
         redundancy=done.adjusted.redundancy,
+        trajectory=_trajectory_of(wish, done),
     )
+
+
+def _trajectory_of(wish: CalibrateWish, done: Calibrated) -> str:
+    """Return the word of a calibration file for the trajectory that it was made with."""
+    if wish.logs.trajectory.file is not None:
+        return "file"
+    return "navigated" if done.kept.logged[0].navigated is not None else "ins"
 
 
 def method_of(done: Calibrated) -> str:
@@ -152,6 +204,10 @@ def _record(
         "held": [
             {"scanner": one.scanner, "name": one.name, "why": one.why, "remedy": one.remedy} for one in adjusted.held
         ],
+        "considered": [_considered_entry(adjusted, column) for column in range(len(adjusted.considered))],
+        "prealigned": {
+            name: {angle: found.value(angle) for angle in ANGLES} for name, found in done.prealigned.items()
+        },
         "variance_factor": adjusted.variance_factor,
         "redundancy": adjusted.redundancy,
         "global_test": adjusted.global_test,
@@ -167,6 +223,19 @@ def _record(
         "notes": list(done.notes),
         "inputs": [{"name": name, "sha256": digest} for name, digest in inputs],
     }
+
+
+def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
+    """Return what was held, how well it is known, and by how much one sigma of it moves what was estimated; SI."""
+    one, moved = adjusted.considered[column], adjusted.movements[:, column]
+    told = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
+    moves = dict(zip(adjusted.names, moved.tolist(), strict=True))
+    return {"scanner": one.scanner, "name": one.name, "value": one.value, "sigma": one.sigma, **told, "moves": moves}
+
+
+def _need_entry(need: Need | None) -> dict[str, Any] | None:
+    """Return what is wanted and what the calibration leaves in points; SI."""
+    return None if need is None else finite(asdict(need))
 
 
 def strips_entry(strips: FlightStrips) -> dict[str, Any]:
@@ -226,6 +295,7 @@ def _report(
         check=done.check,
         inputs=inputs,
         settings=_settings(wish, done),
+        need=need_of(done.flight, done.adjusted.calibrations, done.adjusted.trajectory, _wanted(done)),
         notes=[note for note in done.notes if note not in done.adjusted.notes],  # which the report has anyway
     )
 
@@ -242,6 +312,15 @@ def level_words(strips: FlightStrips) -> str:
     if not agreement.judged:
         return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
     return f"strips keep {agreement.best or 'no quality level'}"
+
+
+def _wanted(done: Calibrated) -> dict[str, float]:
+    """Return what the configuration wants, SI, by parameter's name."""
+    factors = {parameter.key: (parameter.name, parameter.factor) for parameter in PARAMETERS} | {
+        "point_m": (POINT, 1.0)
+    }
+    wanted = done.kept.logged[0].setup.config.calibration.wanted.model_dump(exclude_none=True)
+    return {factors[key][0]: sigma * factors[key][1] for key, sigma in wanted.items()}
 
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
@@ -292,6 +371,8 @@ def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after
     for held in adjusted.held:
         remedy = f"; {held.remedy}" if held.remedy else ""
         lines.append(f"not estimated: {held.scanner} {key_of(held.name, knots)[0]}: {held.why}{remedy}")
+    lines += [f"held: {words}" for words in held_words(adjusted)]
+    lines += _prealigned_lines(done)
     planes, ties = len(done.features.planes), len(done.features.ties)
     seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
     control = sum(len(plane.control) for plane in done.features.planes)
@@ -303,6 +384,17 @@ def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after
     lines.append(after.agreement.measure)
     lines += _profile_lines(done.check)
     return [*lines, *(f"note: {note}" for note in done.notes)]
+
+
+def _prealigned_lines(done: Calibrated) -> list[str]:
+    """Return where iterations began, which is not the start that was given."""
+    starts = done.kept.flight.starts()
+    lines = []
+    for name, found in done.prealigned.items():
+        away = [f"{key_of(angle)[0]} {found.value(angle) * DEG:.3f}" for angle in ANGLES]
+        if any(abs(found.value(angle) - starts[name].value(angle)) > 1e-6 for angle in ANGLES):
+            lines.append(f"pre-aligned: {name}: {', '.join(away)}")
+    return lines
 
 
 def _profile_lines(check: Check) -> list[str]:

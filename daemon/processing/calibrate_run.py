@@ -24,16 +24,18 @@ from calib.features import ControlPoint, Features
 from calib.flight import Flight, FlightError
 from calib.normals import NormalError
 from calib.outcome import Adjusted
-from calib.parameters import ParameterError
+from calib.parameters import ANGLES, ParameterError
 from calib.parameters import Wish as Model
 from calib.picked_points import PickedError, carried
 from calib.plane_given import given_planes
 from calib.plane_matching import rematch
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError, PlaneSettings
-from calib.prealign import PrealignError, prealign
+from calib.prealign import PrealignError, PrealignSettings, prealigned
 from calib.profile_check import Check, check
 from calib.record_values import Plain
+from calib.report_input import Finding
+from calib.report_words import number, unknown
 from calib.trajectory_errors import TrajectoryPrior, gauss_markov
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
@@ -53,11 +55,12 @@ from georef.strips import StripError
 from georef.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best
+COARSE_SIGMAS = 3.0
 OUTCOME = "calibration.json"  # of a report
 # All returns of a patch share what the attitude does between two knots, some millimetres: the mean of 25 is as good as
 # that, and the mean of thousands would be taken for better than it is.
 PLANES = PlaneSettings(most_points=25)
-ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
 REFUSED = (
     ControlError,
     FlightError,
@@ -114,7 +117,8 @@ class Calibrated:
     Attributes:
         kept: the flight as read.
         flight: placed with the calibrations found.
-        prealigned: by scanner, what the adjustment began with.
+        prealigned: by scanner, what the adjustment's iterations began with.
+        findings: what the pre-alignment says against angles that are held, for the verdict.
         check: what profiles say of the outcome.
         notes: for people, a line each.
     """
@@ -128,6 +132,7 @@ class Calibrated:
     control: tuple[ControlPoint, ...]
     check: Check
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
@@ -153,8 +158,9 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     points = _control(wish, kept.flight)
     workers = wish.logs.workers
     tell("pre-alignment", 0, 1)
-    start = _aligned(kept.flight)
-    flight = replaced(kept.flight, start, folder, "aligned", workers)
+    first, away = _aligned(kept.flight, wish.model.fix)
+    doubted = {name: abs(apart) for name, apart in away.items()}
+    flight = replaced(kept.flight, first, folder, "aligned", workers)
     notes = _doubts(flight, points)
     tell("planes", 0, 1)
     rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
@@ -189,23 +195,51 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
         return features
 
     tell("adjustment", 0, 1)
-    adjusted = adjust(flight, features, wish.model, prior, start=start, rematch=found_anew)
+    adjusted = adjust(flight, features, wish.model, prior, rematch=found_anew, first=first, doubted=doubted)
     _refuse_far(wish, kept.flight, adjusted)
     refuse_lost_control(wish.control, features)
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
     told = (*kept.holes, *notes, *adjusted.notes)
-    return Calibrated(kept, flight, features, prior, start, adjusted, points, checked, told)
+    findings = prealigned_otherwise(away, adjusted)
+    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, told, findings)
 
 
-def _aligned(flight: Flight) -> dict[str, Calibration]:
-    """Coarse boresight; the range offset stays, which heights of strips alone hardly tell."""
+def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibration], dict[str, float]]:
+    """Return a coarse boresight by scanner, and by how much it contradicts the start, by name, SI.
+
+    The range offset stays, which heights of strips alone hardly tell. A coarse angle contradicts the start where it is
+    away from it by more than heights of strips may be wrong.
+    """
     starts = flight.starts()
-    return {
-        name: found.changed(range_offset_m=starts[name].value("range_offset_m"))
-        for name, found in prealign(flight).items()
-    }
+    coarse = prealigned(flight, PrealignSettings(held=fixed))
+    first, away = {}, {}
+    for name, found in coarse.calibrations.items():
+        first[name] = found.changed(range_offset_m=starts[name].value("range_offset_m"))
+        for angle, sigma in zip(ANGLES, coarse.sigmas[name].tolist(), strict=False):
+            apart = found.value(angle) - starts[name].value(angle)
+            if abs(apart) > max(COARSE_SIGMAS * sigma, COARSE_RAD):
+                away[f"{name}.{angle}"] = apart
+    return first, away
+
+
+def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple[Finding, ...]:
+    """Return what the pre-alignment says against angles that the adjustment held at their start.
+
+    Args:
+        away: by name, as ``left.kappa_rad``, by how much it contradicts the start, SI.
+        adjusted: the outcome.
+    """
+    found = []
+    for held in adjusted.held:
+        apart = away.get(f"{held.scanner}.{held.name}")
+        if apart is not None:
+            words, told = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
+            what = f"the pre-alignment puts {words} {told}° from the start at which it is held"
+            change = "fly the lines that determine it, or start from a calibration that holds"
+            found.append(Finding(what, change, abs(apart) / COARSE_RAD, unusable=True))
+    return tuple(found)
 
 
 def _refuse_existing(wish: CalibrateWish, files: Iterable[Path]) -> None:

@@ -76,6 +76,27 @@ class PlanWish:
     control_sigma_m: float = 0.01
 
 
+# One sigma, in files' units, with which a parameter is of use to points of the usual flight; worse is not determined.
+USEFUL = {
+    "omega_deg": 0.005,
+    "phi_deg": 0.005,
+    "kappa_deg": 0.01,
+    "range_offset_m": 0.04,
+    "range_scale_ppm": 25.0,
+    "scan_angle_offset_deg": 0.005,
+    "scan_angle_scale_ppm": 120.0,
+    "scan_plane_tilt_deg": 0.005,
+    "lever_arm_x_m": 0.025,
+    "lever_arm_y_m": 0.025,
+    "lever_arm_z_m": 0.025,
+    "time_offset_us": 250.0,
+    "imu_latency_us": 250.0,
+    "encoder_latency_us": 0.5,
+    "torsion_us2": 500.0,
+    "pitch_slope_ppm": 125.0,
+}
+
+
 @dataclass(frozen=True, eq=False)
 class PlannedCalibration:
     """The answer, and what the picture is made of.
@@ -182,16 +203,20 @@ def _rows(predicted: Predicted) -> list[dict[str, Any]]:
     for name, sigma, held in order:
         scanner, short = name.split(".", 1)
         parameter = by_name[short][1]
+        wanted = USEFUL[parameter.key]
+        useful = held is None and sigma <= wanted * parameter.factor
+        told, need = (f"{value:.3g} {parameter.key.rpartition('_')[2]}" for value in (sigma / parameter.factor, wanted))
+        poor = f"would be known to {told}, where {need} is of use"
         rows.append(
             {
                 "scanner": scanner,
                 "name": parameter.key,
                 "sigma": sigma / parameter.factor if math.isfinite(sigma) else None,
-                "wanted": RULES_OF_ALL.of(name).wanted / parameter.factor,
-                "determined": held is None,
+                "wanted": wanted,
+                "determined": useful,
                 "basic": parameter.key in BASIC,
-                "why": "" if held is None else held.why,
-                "remedy": "" if held is None else held.remedy,
+                "why": held.why if held is not None else "" if useful else poor,
+                "remedy": held.remedy if held is not None else "" if useful else RULES_OF_ALL.of(name).remedy,
             }
         )
     return rows

@@ -16,6 +16,7 @@ from georef.calibration import Calibration, nominal
 from georef.earth import e_from_geodetic, geodetic_from_e
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise
+from tests.calib.roofs import exactly_known
 
 FloatArray = NDArray[np.float64]
 SECOND, BEGIN = 10**9, 1_400_000_000 * 10**9
@@ -73,7 +74,7 @@ def surfaces(*, roofs: bool = True, count: int = 7, spread_m: float = 300.0) -> 
 def scanner(name: str = "left", **values: float) -> Head:
     """With some parameters."""
     start: Calibration = nominal(name, [0.15, -0.08, 0.42], np.eye(3)).changed(**values)
-    return Head(name, start, LineGeometry(), NOISE, (20.0, 3000.0))
+    return Head(name, exactly_known(start), LineGeometry(), NOISE, (20.0, 3000.0))
 
 
 def flown(

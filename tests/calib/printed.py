@@ -18,7 +18,7 @@ from georef.calibration import nominal
 from georef.records import RETURN_DTYPE, Int64Array
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise
-from tests.calib.roofs import START_NS, frame
+from tests.calib.roofs import START_NS, exactly_known, frame
 
 FloatArray = NDArray[np.float64]
 
@@ -101,7 +101,12 @@ class Printed:
                 on = np.flatnonzero(self.plane[mine] == index)
                 if len(on):
                     patches[index].append(Patch(line, on))
-        head = Head("left", nominal("left", ARM, np.eye(3)), LineGeometry(), Noise(0.02, float(SIGMAS[7]), 0.0, 0.0))
+        head = Head(
+            "left",
+            exactly_known(nominal("left", ARM, np.eye(3))),
+            LineGeometry(),
+            Noise(0.02, float(SIGMAS[7]), 0.0, 0.0),
+        )
         found = tuple(
             Plane(f"{index}", ENU_FROM_NED @ centre, ENU_FROM_NED @ normal, tuple(patches[index]))
             for index, (centre, normal) in enumerate(planes)

@@ -22,9 +22,10 @@ from calib.rows import Rows, State
 from calib.solve import Settings
 from calib.tie_rows import Ties
 from calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
+from georef.calibration import INDEX, Calibration, nominal
 from georef.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
-from tests.calib.roofs import LINES, Made, made, roofs
+from tests.calib.roofs import LINES, Line, Made, made, roofs
 from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -329,10 +330,9 @@ def test_what_is_not_determined_is_held_at_its_start() -> None:
     built = made(lines=LINES[:2], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)
     found = adjust(built.flight, built.features, Wish(), prior)
-    held = {one.name for one in found.held}
-    assert {"phi_rad", "kappa_rad", "range_offset_m"} <= held
-    assert found.names == ("left.omega_rad",)
-    assert found.calibrations["left"].value("phi_rad") == 0.0
+    assert {one.name for one in found.held} == {"range_offset_m"}
+    assert found.names == ("left.omega_rad", "left.phi_rad", "left.kappa_rad")
+    assert found.calibrations["left"].value("range_offset_m") == 0.0
     assert found.calibrations["left"].sigmas[0] == found.sigmas[0] > 0.0
 
 
@@ -378,6 +378,67 @@ def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
 def test_without_observations_there_is_one_plain_line() -> None:
     with pytest.raises(NormalError, match="nothing to adjust; want strips that overlap"):
         adjust(made(lines=LINES[:1]).flight, Features(), Wish())
+
+
+SCALED = {
+    "omega_rad": 0.0037,
+    "phi_rad": -0.0061,
+    "kappa_rad": 0.0021,
+    "range_offset_m": 0.18,
+    "scan_angle_scale": 2.5e-4,
+}
+CROSSING = (LINES[0], LINES[4])
+
+
+def unknown_start(built: Made) -> dict[str, Calibration]:
+    """A start of which nothing is known but what is plausible."""
+    return {"left": nominal("left", built.flight.heads[0].start.lever_arm_b, np.eye(3))}
+
+
+@pytest.mark.parametrize("lines", [CROSSING, LINES[:3]], ids=["two crossing", "three"])
+def test_a_held_scale_stands_in_the_sigma_of_the_range_offset(lines: tuple[Line, ...]) -> None:
+    """A scan angle scale 250 ppm off moves the range offset by decimetres; taken as exact it would be many sigmas."""
+    built = made(truth=SCALED, lines=lines)
+    prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
+    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    certain = adjust(built.flight, built.features, Wish(), prior, PLAIN)
+    error = np.abs(found.values - built.truth.parameters[[INDEX[name.partition(".")[2]] for name in found.names]])
+    assert error[3] > 4.0 * certain.sigmas[3]
+    assert (error < 3.0 * found.sigmas).all()
+    column = [one.name for one in found.considered].index("scan_angle_scale")
+    assert abs(found.moved[3, column]) > certain.sigmas[3]
+    written = found.calibrations["left"]
+    assert written.held_sigmas[INDEX["scan_angle_scale"]] == pytest.approx(3e-4)
+    crossed = written.covariance()[INDEX["range_offset_m"], INDEX["scan_angle_scale"]]
+    assert crossed == pytest.approx(found.moved[3, column] * 3e-4)
+
+
+def test_what_a_held_parameter_does_is_what_another_start_of_it_does() -> None:
+    """Against the adjustment itself, started with the parameter one sigma away."""
+    built = made(lines=LINES[:6])
+    prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
+    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    for name in ("scan_angle_scale", "range_scale", "time_offset_s"):
+        column = [one.name for one in found.considered].index(name)
+        away = {"left": start["left"].changed(**{name: found.considered[column].sigma})}
+        other = adjust(built.flight, built.features, Wish(), prior, PLAIN, away)
+        moved = found.moved[:, column]  # linear to a thousandth
+        assert (np.abs(other.values - found.values - moved) < 1e-3 * (np.abs(moved) + found.sigmas)).all()
+
+
+def test_a_flight_that_contradicts_what_is_held_says_so() -> None:
+    """A scale said to be known to 5 ppm that is 250 ppm off: the flight sees it, and its sigma is not believed."""
+    built = made(truth=SCALED)
+    prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
+    wish = Wish(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
+    found = adjust(built.flight, built.features, wish, prior, PLAIN, start)
+    (one,) = (one for one in found.considered if one.contradicted)
+    assert one.name == "scan_angle_scale"
+    assert abs(one.told - 2.5e-4) < 4.0 * one.told_sigma
+    assert one.sigma == pytest.approx(abs(one.told))
+    assert (np.abs(found.values - built.truth.parameters[:4]) < 4.0 * found.sigmas).all()
+    plain = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    assert not any(one.contradicted for one in plain.considered)
 
 
 def test_where_nothing_is_determined_all_is_held() -> None:

@@ -12,7 +12,7 @@ from calib.flight import Flight, Head
 from calib.intensity_curve import at_knots
 from calib.parameters import MODELS, ParameterError, Unknowns, Wish, unknowns
 from georef.beams import LineGeometry, SpinningGeometry
-from georef.calibration import INDEX, BeamCorrection, RangeOffset, nominal
+from georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset, nominal
 from tests.calib.roofs import LINES, frame, trajectory
 
 
@@ -163,10 +163,63 @@ def test_sigmas_and_correlations_go_to_their_head() -> None:
     asked = unknowns(flight(), Wish())
     root = np.random.default_rng(5).normal(size=(8, 8))
     covariance = root @ root.T
-    done = asked.finished(asked.start, covariance)
+    held = np.array([one.plausible for one in asked.considered])
+    moved = 1e-3 * np.random.default_rng(6).normal(size=(8, len(held)))
+    done = asked.finished(asked.start, covariance, held, moved)["top"]
     at = [INDEX[name] for name in MODELS["basic"]]
-    np.testing.assert_allclose(done["top"].covariance()[np.ix_(at, at)], covariance[4:, 4:])
-    assert done["top"].sigmas[INDEX["lever_arm_x_m"]] == 0.0
+    np.testing.assert_allclose(done.covariance()[np.ix_(at, at)], covariance[4:, 4:])
+    arm = INDEX["lever_arm_x_m"]
+    own = [one.name for one in asked.considered].index("top.lever_arm_x_m")
+    assert (done.sigmas[arm], done.held_sigmas[arm]) == (0.0, 0.002)
+    np.testing.assert_allclose(done.covariance()[at, arm], moved[4:, own] * 0.002)
+
+
+def held_sigma(name: str, wish: Wish, start: Calibration | None = None) -> float:
+    """One sigma of a parameter of ``left`` that is not estimated; 0: it counts as exact."""
+    starts = flight().starts()
+    asked = unknowns(flight(), wish, starts if start is None else {**starts, "left": start})
+    assert f"left.{name}" not in asked.names
+    return {one.name: one.plausible for one in asked.considered}.get(f"left.{name}", 0.0)
+
+
+def test_how_well_a_held_parameter_is_known() -> None:
+    """By the user, by an earlier calibration, by what is plausible of it, in this order."""
+    scale, fixed = INDEX["scan_angle_scale"], frozenset(["scan_angle_scale"])
+    assert held_sigma("scan_angle_scale", Wish()) == pytest.approx(3e-4)
+    assert held_sigma("scan_angle_scale", Wish("scanner", fix=fixed)) == pytest.approx(3e-4)
+    assert held_sigma("scan_angle_scale", Wish(fix=fixed, priors={"scan_angle_scale": 1e-5})) == 1e-5
+    assert (
+        held_sigma(
+            "scan_angle_scale", Wish(fix=frozenset(["left.scan_angle_scale"]), priors={"left.scan_angle_scale": 2e-5})
+        )
+        == 2e-5
+    )
+    found = np.zeros(len(PARAMETERS))
+    found[scale] = 6e-6
+    earlier = replace(flight().starts()["left"], method="planes", sigmas=found)
+    assert held_sigma("scan_angle_scale", Wish(), earlier) == 6e-6
+    assert held_sigma("scan_angle_scale", Wish(), replace(earlier, sigmas=0.0 * found, held_sigmas=found)) == 6e-6
+    assert held_sigma("scan_angle_scale", Wish(), replace(earlier, method="nominal")) == pytest.approx(3e-4)
+    assert held_sigma("lever_arm_z_m", Wish("scanner")) == 0.002
+    assert held_sigma("lever_arm_z_m", Wish("full", fix=frozenset(["lever_arm_z_m"]))) == 0.05
+    assert held_sigma("pitch_slope", Wish("scanner")) == 0.0
+    assert held_sigma("scan_angle_offset_rad", Wish("full")) == 0.0
+
+
+def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -> None:
+    starts = flight().starts()
+    near = {name: one.changed(omega_rad=0.01, kappa_rad=0.02, range_offset_m=9.0) for name, one in starts.items()}
+    asked = unknowns(flight(), Wish(fix=frozenset(["kappa_rad"])), starts, near)
+    first = dict(zip(asked.names, asked.first.tolist(), strict=True))
+    start = dict(zip(asked.names, asked.start.tolist(), strict=True))
+    assert first["left.omega_rad"] == 0.01
+    assert start["left.omega_rad"] == starts["left"].value("omega_rad")
+    assert first["left.range_offset_m"] == start["left.range_offset_m"]
+    found = asked.calibrations(asked.first)["left"]
+    assert found.value("kappa_rad") == starts["left"].value("kappa_rad")
+    less = asked.without(frozenset(["left.omega_rad"]))
+    assert less.calibrations(less.first)["left"].value("omega_rad") == starts["left"].value("omega_rad")
+    assert {one.name: one.plausible for one in less.considered}["left.omega_rad"] == pytest.approx(np.radians(1.0))
 
 
 @pytest.mark.parametrize(

@@ -16,15 +16,17 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.features import Features
-from calib.outcome import Adjusted, ControlFit, GroupFit, Held
+from calib.need import Need
+from calib.outcome import Adjusted, Considered, ControlFit, GroupFit, Held
 from calib.report import PairDifference, Profile, ReportInput, html, judge, pdf
 from calib.report_canvas import NARROW, PAPER
 from calib.report_cut_plots import cuts_of
+from calib.report_input import Finding
 from calib.report_map_plots import plane_rms_cm
 from calib.report_pdf import width_in, wrapped
 from calib.report_residual_plots import residual_picture, seen_of
 from calib.report_tables import entries_table, held_table, parameter_tables
-from calib.report_verdict import Level
+from calib.report_verdict import Level, held_words
 from calib.report_words import decimals_of, degrees, length, number, plain, share, unknown
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
 
@@ -77,9 +79,56 @@ def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
     pitch = Held("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
     verdict = judge(sound(report, held=(pitch,)))
     assert verdict.level is Level.CARE
-    assert "does not determine boresight φ (pitch)" in verdict.sentence
-    every = tuple(replace(pitch, name=name) for name in ("omega_rad", "phi_rad", "kappa_rad"))
-    assert judge(sound(report, held=every)).level is Level.UNUSABLE
+    assert verdict.sentence.startswith("Usable with care: not a boresight calibration: boresight φ (pitch), held, ")
+
+
+@pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
+def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg: float, level: Level) -> None:
+    """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""
+    held = (Held("left", "kappa_rad", "held at your word"),)
+    considered = (Considered("left", "kappa_rad", 0.0, math.radians(sigma_deg)),)
+    verdict = judge(sound(report, held=held, considered=considered))
+    assert verdict.level is level
+    assert f"not a boresight calibration: boresight κ (heading), held, plausible to {sigma_deg:.2g}" in verdict.sentence
+    assert "Boresight to 0.0100°" in verdict.sentence or "Boresight to 1.00°" in verdict.sentence
+
+
+def test_a_held_parameter_that_moves_an_estimated_one_is_named_with_its_size(report: ReportInput) -> None:
+    adjusted = report.adjusted
+    considered = (
+        Considered("left", "torsion_s2", 0.0, 2e-9),
+        Considered("left", "encoder_latency_s", 0.0, 2e-6),
+    )
+    moved = np.zeros((len(adjusted.names), 2))
+    moved[3] = 0.2, 1e-4
+    sigmas = np.sqrt(adjusted.sigmas**2 + (moved**2).sum(axis=1))
+    assert held_words(replace(adjusted, considered=considered, moved=moved, sigmas=sigmas)) == [
+        "torsion, held, plausible to 2000\u00a0µs², would move range offset by 20.0\u00a0cm"
+    ]
+
+
+def test_what_the_flight_says_against_a_held_parameter_is_a_reason(report: ReportInput) -> None:
+    considered = (Considered("left", "torsion_s2", 0.0, 2e-9, 9e-9, 1e-9, contradicted=True),)
+    verdict = judge(sound(report, considered=considered))
+    assert verdict.level is Level.CARE
+    assert "the flight contradicts torsion that is held: it would change it by +9000\u00a0µs²" in verdict.sentence
+
+
+def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
+    """An angle and the points against what the user wants of them."""
+    need = Need(0.05, {"kappa_rad": math.radians(0.001)}, 0.1, {"left": 0.04})
+    (reason,) = judge(replace(sound(report), need=need)).reasons
+    assert reason.what == "boresight κ (heading) is known to 0.0014° only, 0.0010° is wanted"
+    assert not judge(replace(sound(report), need=replace(need, wanted={}))).reasons
+    (reason,) = judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.03))).reasons
+    assert reason.what == "the calibration leaves 4.0\u00a0cm in points, 3.0\u00a0cm is wanted"
+    assert judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.003))).level is Level.UNUSABLE
+
+
+def test_findings_are_reasons(report: ReportInput) -> None:
+    found = (Finding("the pre-alignment puts κ elsewhere", "fly"), Finding("worse", "stop", 2.0, unusable=True))
+    verdict = judge(replace(sound(report), findings=found))
+    assert (verdict.level, [reason.what for reason in verdict.reasons]) == (Level.UNUSABLE, ["worse", found[0].what])
 
 
 @pytest.mark.parametrize(
@@ -122,7 +171,7 @@ def test_the_worst_comes_first(report: ReportInput) -> None:
     points = tuple(ControlFit(f"K{w}", 0.01 * w, 0.01, float(w)) for w in (4, 9, 6))
     verdict = judge(sound(report, control=points, variance_factor=2.1))
     assert [reason.what.split()[2] for reason in verdict.reasons[:3]] == ["K9", "K6", "K4"]
-    assert "3 more reasons below" in verdict.sentence
+    assert "below" not in verdict.sentence
 
 
 def test_trajectory_corrections_beyond_their_sigmas(report: ReportInput) -> None:
