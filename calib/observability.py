@@ -1,9 +1,11 @@
 """What a flight determines, decided by the reduced normal matrix: what it does not is held, and said in plain words.
 
-A parameter is determined where its sigma, beside all others, is below what it may plausibly be off by anyway; whether
-that is good enough is for the verdict to say. Which of several that look alike is held is a matter of physics, not of
+Each parameter is known beforehand to what is plausible of it. One of which the flight tells next to nothing beyond
+that is held. What the flight tells in part is estimated, with its start as an observation of that sigma: held, it
+would leave its error in all that looks like it, as a scan angle scale does in the range offset. Whether what comes out
+is good enough is for the verdict to say. Which of several that look alike is held is a matter of physics, not of
 numbers: the boresight stays as long as possible, then what the other errors of a scanner are usually made of (`RULES`,
-from the top). The known sets are those of FORMULAS 5.5, by their effects on the ground (Skaloud and Lichti 2006; Filin
+from its top). The known sets are those of FORMULAS 5.5, by their effects on the ground (Skaloud and Lichti 2006; Filin
 2003).
 """
 
@@ -23,7 +25,9 @@ FloatArray = NDArray[np.float64]
 
 ALIKE = 0.8  # from here on two parameters take each other's errors
 NOTHING = 300.0  # sigma in plausible sizes that is as good as none
-_WEAK = 1e-3  # 1 / plausible sizes: as little is known of each beforehand, so that nothing is singular
+_WEAK = 1e-3  # 1 / plausible sizes: as little is known of each, so that nothing is singular, for what people are told
+NOTHING_TOLD = 0.95  # of what is plausible: a flight that leaves so much of it tells nothing
+WEAK = 0.3  # of what is plausible: what is known better needs no start beside it
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +35,7 @@ class Rule:
     """When a parameter counts as determined, and what to do where it is not.
 
     Attributes:
-        plausible: what it may be off by before the calibration, one sigma, SI; its sigma must be below.
+        plausible: what it may be off by before the calibration, one sigma, SI.
         looks: its effect on the ground, in words.
         remedy: what would determine it.
     """
@@ -174,8 +178,8 @@ def decide(
     names: Sequence[str],
     prior_sigmas: FloatArray | None = None,
     rules: Rules = RULES_OF_ALL,
-) -> tuple[Held, ...]:
-    """Which unknowns are to be held.
+) -> tuple[tuple[Held, ...], dict[str, float]]:
+    """Return which unknowns are to be held, and which are to be estimated with their start as an observation.
 
     The worst is held and all is reckoned anew, until every other is determined; at last those that are determined
     after all come back, unless they would take the place of one that is held.
@@ -188,12 +192,12 @@ def decide(
         rules: sizes and limits.
 
     Returns:
-        In the order of the names; empty: all are determined.
+        What is held, in the order of the names; of what is only weakly determined, one sigma of its start by name.
     """
     case = _Case(normal, names, prior_sigmas, rules)
     case.hold_the_worst()
     case.take_back()
-    return tuple(case.told(at) for at in sorted(case.partner))
+    return tuple(case.told(at) for at in sorted(case.partner)), case.weak()
 
 
 class _Case:
@@ -213,8 +217,10 @@ class _Case:
         self._of_one_head = heads[:, np.newaxis] == heads
         sigmas = np.full(len(names), np.inf) if prior_sigmas is None else np.asarray(prior_sigmas, dtype=np.float64)
         self._given = np.isfinite(sigmas)
-        own = np.where(self._given, size / np.where(self._given, sigmas, 1.0), _WEAK)
-        self._information = _positive(normal, size) + np.diag(own**2)
+        own = np.where(self._given, size / np.where(self._given, sigmas, 1.0), 1.0)
+        observed = _positive(normal, size)
+        self._information = observed + np.diag(own**2)
+        self._observed = observed + np.diag(np.where(self._given, own, _WEAK) ** 2)
         self.partner: dict[int, int] = {}
 
     def hold_the_worst(self) -> None:
@@ -243,7 +249,7 @@ class _Case:
             free.add(other)
             other = self.partner[other]
         active = sorted(free)
-        sigma, rho = self._figures(active)
+        sigma, rho = self._figures(active, self._observed)
         here = active.index(at)
         own = np.abs(rho[here]) * self._of_one_head[at, active]
         alike = tuple(
@@ -257,9 +263,19 @@ class _Case:
     def _active(self) -> list[int]:
         return [at for at in range(len(self._names)) if at not in self.partner]
 
-    def _figures(self, active: list[int]) -> tuple[FloatArray, FloatArray]:
+    def weak(self) -> dict[str, float]:
+        """Return, of what is estimated, what its start helps to determine: one sigma of it by name, SI."""
+        active = self._active()
+        sigma, _ = self._figures(active)
+        return {
+            self._names[at]: float(self._size[at])
+            for at, size in zip(active, sigma.tolist(), strict=True)
+            if size > WEAK and not self._given[at]
+        }
+
+    def _figures(self, active: list[int], information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Sigmas in plausible sizes, correlations with a zero diagonal."""
-        part = self._information[np.ix_(active, active)]
+        part = (self._information if information is None else information)[np.ix_(active, active)]
         root = np.sqrt(np.diag(part))
         covariance = np.linalg.inv(part / np.outer(root, root)) / np.outer(root, root) if active else part
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -268,7 +284,7 @@ class _Case:
         return sigma, rho
 
     def _determined(self, active: list[int], sigma: FloatArray) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = self._given[active] | (sigma <= 1.0)
+        found: NDArray[np.bool_] = self._given[active] | (sigma <= NOTHING_TOLD)
         return found
 
     def _next(self, active: list[int], sigma: FloatArray, rho: FloatArray) -> tuple[int, int] | None:

@@ -88,6 +88,7 @@ class Unknown:
         prior_sigma: by which it is held to that; inf: free.
         plausible: one sigma, SI, of the start's error where it is held; 0: the start is exact, or a reference.
         first: the value from which iterations begin; nan: the start.
+        assumed: whether the prior is what is plausible, not the user's.
     """
 
     head: int
@@ -98,6 +99,7 @@ class Unknown:
     prior_sigma: float = np.inf
     plausible: float = 0.0
     first: float = np.nan
+    assumed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +160,19 @@ class Unknowns:
         items = tuple(item for item in self.items if item.name not in names)
         gone = tuple(item for item in self.items if item.name in names and item.plausible > 0.0)
         return replace(self, items=items, held=(*self.held, *held), considered=(*self.considered, *gone))
+
+    def assuming(self, sigmas: Mapping[str, float]) -> Unknowns:
+        """Return the same, the starts of some observed with one sigma (SI) by name."""
+        items = tuple(
+            replace(item, prior_sigma=sigmas[item.name], assumed=True) if item.name in sigmas else item
+            for item in self.items
+        )
+        return replace(self, items=items)
+
+    @property
+    def given_sigmas(self) -> FloatArray:
+        """(u,) of the user's priors; inf: none."""
+        return np.where([item.assumed for item in self.items], np.inf, self.prior_sigmas)
 
     def complete(self) -> Unknowns:
         """Return the same with those that are considered among the unknowns, behind the others."""

@@ -208,12 +208,15 @@ def _examined(
 
 
 def _without(block: Block, equations: Normals, settings: Settings) -> Block | None:
-    """Without what equations do not determine; None: it determines all."""
+    """Return the block with what equations do not determine held, or observed at its start; None: nothing changes."""
     asked = block.rows.unknowns
-    held = decide(equations.of_parameters, asked.names, asked.prior_sigmas, settings.rules)
-    if not held:
+    held, weak = decide(equations.of_parameters, asked.names, asked.given_sigmas, settings.rules)
+    assumed = {item.name for item in asked.items if item.assumed}
+    if not held and weak.keys() <= assumed:
         return None
-    return block.with_unknowns(asked.without(frozenset(f"{one.scanner}.{one.name}" for one in held), held))
+    return block.with_unknowns(
+        asked.without(frozenset(f"{one.scanner}.{one.name}" for one in held), held).assuming(weak)
+    )
 
 
 def _carried(before: Solution, block: Block) -> State:

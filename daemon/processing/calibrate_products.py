@@ -26,7 +26,7 @@ from calib.report_input import Finding, ReportInput
 from calib.report_verdict import DEG, Verdict, held_words, judge
 from calib.signatures import signatures
 from calib.strips import differences
-from calib.validation import validate
+from calib.validation import Asked, validate
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
@@ -109,7 +109,8 @@ def validation_says(done: Calibrated) -> list[Finding]:
 
     They have been adjusted with it, so what fails here fails in spite of that.
     """
-    outcome = validate(done.flight, done.features, done.adjusted.calibrations, done.control)
+    asked = Asked(done.control or None)
+    outcome = validate(done.flight, done.features, done.adjusted.calibrations, asked, done.prior)
     change = "look at swath validate: its planes and pairs say where the calibration does not hold"
     return [Finding(f"validation: {one.sentence}", change) for one in outcome.methods if one.passed is False]
 

@@ -17,12 +17,12 @@ from calib.flight import Flight
 from calib.intensity_curve import STEPS, at_knots, curve_by_knots
 from calib.normals import NormalError, TrajectoryWeight, moved, normals
 from calib.outcome import Adjusted
-from calib.parameters import Wish, unknowns
+from calib.parameters import MODELS, Wish, unknowns
 from calib.rows import Rows, State
 from calib.solve import Settings
 from calib.tie_rows import Ties
 from calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
-from georef.calibration import INDEX, Calibration, nominal
+from georef.calibration import INDEX, PARAMETERS, Calibration, nominal
 from georef.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
 from tests.calib.roofs import LINES, Line, Made, made, roofs
@@ -398,19 +398,31 @@ def unknown_start(built: Made) -> dict[str, Calibration]:
 @pytest.mark.parametrize("lines", [CROSSING, LINES[:3]], ids=["two crossing", "three"])
 def test_a_held_scale_stands_in_the_sigma_of_the_range_offset(lines: tuple[Line, ...]) -> None:
     """A scan angle scale 250 ppm off moves the range offset by decimetres; taken as exact it would be many sigmas."""
-    built = made(truth=SCALED, lines=lines)
+    built = made(truth=SCALED, lines=lines, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
     found = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
-    certain = adjust(built.flight, built.features, Wish(), prior, PLAIN)
-    error = np.abs(found.values - built.truth.parameters[[INDEX[name.partition(".")[2]] for name in found.names]])
-    assert error[3] > 4.0 * certain.sigmas[3]
+    assert found.names == tuple(f"left.{name}" for name in MODELS["basic"])
+    error = np.abs(found.values - built.truth.parameters[:4])
+    own = np.sqrt(found.sigmas**2 - (found.moved**2).sum(axis=1))
     assert (error < 3.0 * found.sigmas).all()
+    assert lines != CROSSING or error[3] > 5.0 * own[3]
     column = [one.name for one in found.considered].index("scan_angle_scale")
-    assert abs(found.moved[3, column]) > certain.sigmas[3]
+    assert abs(found.moved[3, column]) > own[3]
     written = found.calibrations["left"]
     assert written.held_sigmas[INDEX["scan_angle_scale"]] == pytest.approx(3e-4)
     crossed = written.covariance()[INDEX["range_offset_m"], INDEX["scan_angle_scale"]]
     assert crossed == pytest.approx(found.moved[3, column] * 3e-4)
+
+
+def test_what_two_lines_tell_in_part_is_estimated_with_its_start() -> None:
+    """Of the model `scanner`: each sigma is at most what is plausible, and the scale is no reason for a wrong range."""
+    built = made(truth=SCALED, lines=CROSSING, points=100)
+    prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
+    found = adjust(built.flight, built.features, Wish("scanner"), prior, PLAIN, start)
+    kinds = [INDEX[name.partition(".")[2]] for name in found.names]
+    assert INDEX["scan_angle_scale"] in kinds
+    assert (found.sigmas <= [1.001 * PARAMETERS[kind].plausible for kind in kinds]).all()
+    assert (np.abs(found.values - built.truth.parameters[kinds]) < 3.0 * found.sigmas).all()
 
 
 def test_what_a_held_parameter_does_is_what_another_start_of_it_does() -> None:

@@ -1,0 +1,221 @@
+"""Are sigmas of a calibration true whatever the flight and whatever is held? Virtual flights of many designs.
+
+    python -m benchmarks.calibration_designs --flights 200
+
+Each flight draws a design (two opposite lines, two crossing, three, six at one height, eight at two; low or high; roofs
+or level ground; with or without control), a grade of inertial unit, a model, errors of its trajectory from their prior,
+noise, and an error of every parameter that the scanner model knows: what is plausible of it, boresight and range offset
+included. Planes are given: what is looked at is the adjustment, the choice of what is held, and the sigmas. Ranges are
+made by CONVENTIONS' formula without georef. A parameter further than four of its sigmas from the truth, estimated or
+held, is a failure; one in 500 is allowed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.adjust import adjust
+from calib.features import ControlPoint, Features
+from calib.normals import NormalError, TrajectoryWeight
+from calib.outcome import Adjusted
+from calib.parameters import MODELS, Wish, unknowns
+from calib.rows import Rows
+from calib.solve import Settings
+from calib.trajectory_errors import Taus, gauss_markov
+from georef.calibration import INDEX, PARAMETERS, nominal
+from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
+from tests.calib.test_rows import shifted
+
+FloatArray = NDArray[np.float64]
+
+LIMIT = 4.0  # sigmas
+ALLOWED = 1.0 / 500.0
+SHARE = 1.0  # of what is plausible, one sigma of what is drawn
+DESIGNS: dict[str, tuple[Line, ...]] = {
+    "two opposite": LINES[:2],
+    "two crossing": (LINES[0], LINES[4]),
+    "three": (LINES[0], LINES[1], LINES[4]),
+    "three parallel": LINES[:3],
+    "six": LINES[:6],
+    "two heights": LINES,
+}
+GRADES = {"tactical": 1.0, "MEMS": 6.0}  # times the attitude sigmas of the tactical unit
+MODEL_NAMES = ("basic", "scanner", "full")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One flight.
+
+    Attributes:
+        seed: of all that is drawn.
+        design, grade, model: keys of the tables above.
+        scale: of the heights above ground.
+        slope_deg: of the roofs; 0: level ground only.
+        control: points of 1 cm on level planes.
+    """
+
+    seed: int
+    design: str
+    grade: str
+    model: str
+    scale: float
+    slope_deg: float
+    control: bool
+
+    @property
+    def words(self) -> str:
+        """For the table."""
+        ground = "roofs" if self.slope_deg else "level"
+        control = "control" if self.control else "no control"
+        return f"{self.design}, × {self.scale:g}, {ground}, {control}, {self.grade}, {self.model}"
+
+
+@dataclass(frozen=True)
+class Offset:
+    """A parameter of a flight: its error in sigmas, and whether it was held."""
+
+    case: Case
+    name: str
+    normalised: float
+    held: bool
+
+
+def case_of(seed: int) -> Case:
+    """Draw a flight."""
+    rng = np.random.default_rng(seed)
+    return Case(
+        seed,
+        str(rng.choice(list(DESIGNS))),
+        str(rng.choice(list(GRADES))),
+        str(rng.choice(MODEL_NAMES)),
+        float(rng.choice([0.25, 1.0, 2.0])),
+        float(rng.choice([35.0, 35.0, 35.0, 0.0])),
+        bool(rng.integers(2)),
+    )
+
+
+def lines_of(case: Case) -> tuple[Line, ...]:
+    """Return the design's lines at the case's heights; what lies aside comes nearer with the swath."""
+    return tuple(
+        Line(one.heading_deg, case.scale * one.height_m, case.scale * one.aside_m) for one in DESIGNS[case.design]
+    )
+
+
+def true_errors(case: Case) -> dict[str, float]:
+    """Return by how much each parameter of the scanner model is off, SI; of `full` also what that adds."""
+    rng = np.random.default_rng([case.seed, 1])
+    names = (
+        MODELS["scanner"]
+        if case.model != "full"
+        else (*MODELS["scanner"], "lever_arm_x_m", "lever_arm_y_m", "pitch_slope")
+    )
+    return {name: SHARE * PARAMETERS[INDEX[name]].plausible * float(rng.normal()) for name in names}
+
+
+def flight_of(case: Case) -> tuple[Made, Features]:
+    """Fly it; the trajectory told differs from the true one by a draw of its prior."""
+    lines, rng = lines_of(case), np.random.default_rng([case.seed, 2])
+    told = trajectory(lines)
+    told = replace(told, attitude_sigma_rad=told.attitude_sigma_rad * GRADES[case.grade])
+    squeeze = min(case.scale, 1.0)
+    planes = [(centre * [squeeze, squeeze, 1.0], normal) for centre, normal in roofs(case.slope_deg)]
+    base = made(lines=lines, planes=planes, points=2, seed=case.seed)
+    flight = replace(base.flight, trajectories=(told,))
+    prior = gauss_markov(flight, Taus(), 4.0)
+    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, Wish()), prior))
+    draw = np.linalg.cholesky(prior.covariance) @ rng.normal(size=len(prior.covariance))
+    true = shifted(told, prior, weight.to_e(draw[:, np.newaxis]).reshape(-1, 6))
+    errors = true_errors(case)
+    built = made(truth=errors, lines=lines, planes=planes, points=24, seed=case.seed, true=true)
+    start = nominal("left", built.flight.heads[0].start.lever_arm_b, np.eye(3))
+    head = replace(built.flight.heads[0], start=start)
+    flight = replace(built.flight, heads=(head,), trajectories=(told,)).placed({"left": start})
+    features = surveyed(built.features, rng) if case.control else built.features
+    return replace(built, flight=flight), features
+
+
+def surveyed(features: Features, rng: np.random.Generator) -> Features:
+    """With a control point of 1 cm on every level plane."""
+    planes = tuple(
+        replace(
+            plane, control=(ControlPoint(plane.name, plane.centre_t + np.array([0.0, 0.0, 0.01 * rng.normal()]), 0.01),)
+        )
+        if plane.normal_t[2] > 0.999
+        else plane
+        for plane in features.planes
+    )
+    return Features(planes)
+
+
+def offsets_of(case: Case) -> list[Offset]:
+    """Return every parameter's error in its sigmas; of a flight that cannot be adjusted none."""
+    built, features = flight_of(case)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    try:
+        found = adjust(built.flight, features, Wish(case.model), prior, Settings(huber=0.0, family=0.0))
+    except NormalError:
+        return []
+    return normalised(case, built, found)
+
+
+def normalised(case: Case, built: Made, found: Adjusted) -> list[Offset]:
+    """Return errors in sigmas."""
+    offsets = []
+    for name, value, sigma in zip(found.names, found.values.tolist(), found.sigmas.tolist(), strict=True):
+        short = name.partition(".")[2]
+        offsets.append(Offset(case, short, (value - built.truth.value(short)) / sigma, held=False))
+    for one in found.considered:
+        offsets.append(Offset(case, one.name, (one.value - built.truth.value(one.name)) / one.sigma, held=True))
+    return offsets
+
+
+def run(seeds: Sequence[int], minutes: float) -> tuple[list[Offset], int]:
+    """Fly all, or as many as the time allows; offsets, and the number of flights."""
+    begin, offsets = time.monotonic(), []
+    for count, seed in enumerate(seeds):
+        if time.monotonic() - begin > 60.0 * minutes:
+            return offsets, count
+        mine = offsets_of(case_of(seed))
+        offsets += mine
+        for one in mine:
+            if abs(one.normalised) > LIMIT:
+                print(
+                    f"seed {seed}: {one.name}{' (held)' if one.held else ''} {one.normalised:+.1f}: {one.case.words}",
+                    flush=True,
+                )
+    return offsets, len(seeds)
+
+
+def main() -> None:
+    """Fly, and say how many parameters are further than four sigmas from the truth."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--flights", type=int, default=200)
+    parser.add_argument("--first", type=int, default=1, help="first seed")
+    parser.add_argument("--minutes", type=float, default=1e9, help="no flight begins later")
+    given = parser.parse_args()
+    offsets, flights = run(range(given.first, given.first + given.flights), given.minutes)
+    estimated = [one for one in offsets if not one.held]
+    beyond = [one for one in offsets if abs(one.normalised) > LIMIT]
+    squares: dict[str, list[float]] = {}
+    for one in estimated:
+        squares.setdefault(one.name, []).append(one.normalised**2)
+    for name, mine in squares.items():
+        print(f"{name:22} {len(mine):5} estimates  NEES {np.mean(mine):.2f}  largest {np.sqrt(max(mine)):.1f} sigmas")
+    print(
+        f"flights {flights}, parameters {len(offsets)} ({len(estimated)} estimated), "
+        f"beyond {LIMIT:g} sigmas {len(beyond)}"
+    )
+    print(dict(Counter(one.case.design for one in beyond)))
+    print("kept" if len(beyond) <= max(ALLOWED * len(offsets), 0) else f"NOT KEPT: more than one in {1 / ALLOWED:.0f}")
+
+
+if __name__ == "__main__":
+    main()
