@@ -55,8 +55,6 @@ E_GYRO_BIAS, E_ACCEL_BIAS, E_GYRO_SCALE, E_ACCEL_SCALE = 9, 12, 15, 18
 MOVED, CORE = 9, 21  # rows of a transition that are not diagonal; its columns without misalignments
 E_GYRO_LEAN, E_ACCEL_LEAN, LEANS = 21, 24, 6  # where they are estimated
 
-BRIDGED_FORCE_MPS2, BRIDGED_RATE_RADPS = 1.0, 0.05  # how wrong a made-up sample may be
-
 
 class Layout(NamedTuple):
     """Where the optional errors stand, −1: nowhere.
@@ -280,27 +278,31 @@ def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, 
     Args:
         p: (n, n).
         sums: of the step; drive, decay: of it.
-        bridged: (2,) variances of velocity and attitude that bridging adds.
+        bridged: (6, 3) covariances in e of attitude and velocity that made-up samples add; changed.
     """
     span_s = sums[SUM_TIME]
     force = _force_of(sums)
-    turned, pushed = drive.angle * span_s + bridged[1], drive.velocity * span_s + bridged[0]
-    square = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
-    share = turned / 3.0
+    turned, pushed = bridged[:3], bridged[3:]
     for i in range(3):
-        p[i, i] += pushed * span_s * span_s / 3.0
-        p[i, E_VELOCITY + i] += 0.5 * pushed * span_s
-        p[E_VELOCITY + i, i] = p[i, E_VELOCITY + i]
-        p[E_VELOCITY + i, E_VELOCITY + i] += pushed + share * square
-        for j in range(3):
-            p[E_VELOCITY + i, E_VELOCITY + j] -= share * force[i] * force[j]
-        p[E_ATTITUDE + i, E_ATTITUDE + i] += turned
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # −½ [∫ C f]× of the turn
-        p[E_VELOCITY + i, E_ATTITUDE + j] += 0.5 * turned * force[k]
-        p[E_VELOCITY + j, E_ATTITUDE + i] -= 0.5 * turned * force[k]
+        turned[i, i] += drive.angle * span_s
+        pushed[i, i] += drive.velocity * span_s
     for i in range(3):
         for j in range(3):
+            p[i, j] += pushed[i, j] * span_s * span_s / 3.0
+            p[i, E_VELOCITY + j] += 0.5 * pushed[i, j] * span_s
+            p[E_VELOCITY + j, i] = p[i, E_VELOCITY + j]
+            p[E_VELOCITY + i, E_VELOCITY + j] += pushed[i, j]
+            p[E_ATTITUDE + i, E_ATTITUDE + j] += turned[i, j]
+    for j in range(3):  # a turn pushes by −[∫ C f]× of it: half of that with the turn, a third with itself
+        tilted = cross((turned[0, j], turned[1, j], turned[2, j]), force)
+        for i in range(3):
+            p[E_VELOCITY + i, E_ATTITUDE + j] += 0.5 * tilted[i]
             p[E_ATTITUDE + j, E_VELOCITY + i] = p[E_VELOCITY + i, E_ATTITUDE + j]
+            pushed[i, j] = tilted[i]
+    for i in range(3):
+        tilted = cross((pushed[i, 0], pushed[i, 1], pushed[i, 2]), force)
+        for j in range(3):
+            p[E_VELOCITY + i, E_VELOCITY + j] += tilted[j] / 3.0
     for i in range(MOVED, len(p)):
         p[i, i] += drive.variance[i] * (1.0 - decay[i] * decay[i])
 

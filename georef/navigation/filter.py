@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.earth import geodetic_from_e, rot_e_from_l
+from georef.navigation.bridging import Bridges, made_up_variance, new_bridges, primed_bridges
 from georef.navigation.error_model import (
     MOVED,
     Layout,
@@ -81,6 +82,7 @@ class NavigationFilter:
         smoothed: keep what the smoother needs, and all innovations.
         storage: where blocks are kept.
         expected: so many samples will come, if that is known.
+        bridges: what is known of made-up samples before the first comes; None: nothing.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class NavigationFilter:
         smoothed: bool = True,
         storage: Storage = IN_MEMORY,
         expected: int = 0,
+        bridges: Bridges | None = None,
     ) -> None:
         self.setup, self.start = setup, start
         self.layout = layout_of(setup, heights=heights)
@@ -103,6 +106,7 @@ class NavigationFilter:
         self._storage, self._queue = storage, RowQueue(kept=smoothed)
         self._hold_ns = round(hold_s * SECOND_NS)
         self._waiting: Samples | None = None
+        self._bridges = new_bridges() if bridges is None else bridges
         self._counts: Counter[str] = Counter()
         level_sigmas(self._run.x, self._run.p, self._run.sigma)
         write_node(self._run, self._nodes.room(1, 0), self._run.x, 0)
@@ -144,6 +148,7 @@ class NavigationFilter:
     def feed(self, inertial: Inertial) -> None:
         """Give samples, in order; the filter goes on as far as `hold_s` lets it."""
         samples = samples_of(inertial)
+        samples = samples._replace(made_up=made_up_variance(samples, self._bridges))
         self._counts["samples bridged"] += int(np.count_nonzero(samples.bridged))
         if self._waiting is not None:
             samples = Samples._make(np.concatenate(pair) for pair in zip(self._waiting, samples, strict=True))
@@ -212,7 +217,10 @@ def run_filter(
 ) -> FilterRun:
     """Filter a whole flight, in pieces, so that the storage may rest between them."""
     heights = bool((observations["kind"] == Kind.HEIGHT).any())
-    navigation = NavigationFilter(setup, start, heights=heights, storage=storage, expected=len(inertial))
+    bridges = primed_bridges(samples_of(inertial.between(0, PIECE)))
+    navigation = NavigationFilter(
+        setup, start, heights=heights, storage=storage, expected=len(inertial), bridges=bridges
+    )
     navigation.observe(observations)
     for first in range(0, len(inertial), PIECE):
         navigation.feed(inertial.between(first, first + PIECE))
@@ -252,7 +260,7 @@ def _begin(setup: Setup, start: Start, layout: Layout) -> Running:
         total=total,
         total_decay=total_decay,
         sigma=np.zeros(9),
-        bridge=np.zeros(3),
+        bridge=np.zeros((6, 3)),
         refused=np.stack([none, none, none + start.time_ns, none + settled_ns, none, none]),
         lately=np.zeros((6, KINDS)),
         top=np.zeros((MOVED, layout.core)),

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from georef.compiled import kept, kernel
 from georef.kernels.rotations import rot_of
 from georef.kernels.types import Three
+from georef.navigation.bridging import UNKNOWN_FORCE_MPS2, UNKNOWN_RATE_RADPS
 from georef.navigation.error_model import (
-    BRIDGED_FORCE_MPS2,
-    BRIDGED_RATE_RADPS,
     E_ATTITUDE,
     E_POSITION,
     E_VELOCITY,
@@ -112,11 +111,11 @@ def end_step(run: Running, model: Model) -> None:
     transition(run.sums, run.x, run.top)
     decays(model.drive, run.sums[SUM_TIME], run.decay)
     propagate(run.p, run.top, run.decay, run.work)
-    add_noise(run.p, run.sums, model.drive, run.decay, run.bridge[1:])
+    add_noise(run.p, run.sums, model.drive, run.decay, run.bridge)
     accumulate(run.total, run.total_decay, run.top, run.decay, run.work)
     run.sums[: SUM_TIME + 1] = 0.0
     run.sums[SUMS_SIZE:] = 0.0
-    run.bridge[1:] = 0.0
+    run.bridge[:, :] = 0.0
 
 
 @kept
@@ -243,16 +242,17 @@ def take(run: Running, model: Model, nodes: Nodes, m: int) -> None:
 
 
 @kernel
-def bridge_over(run: Running, bridged: bool, span_s: float) -> None:
-    """What a made-up sample adds: wrong by the same all along, so that its variance grows with the square of time."""
-    if not bridged:
-        run.bridge[0] = 0.0
-        return
-    long_s = run.bridge[0] + span_s
-    grown = long_s * long_s - run.bridge[0] * run.bridge[0]
-    run.bridge[0] = long_s
-    run.bridge[1] += BRIDGED_FORCE_MPS2 * BRIDGED_FORCE_MPS2 * grown
-    run.bridge[2] += BRIDGED_RATE_RADPS * BRIDGED_RATE_RADPS * grown
+def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
+    """Add to the step what a made-up sample adds, (6,) by axis of b; over a gap that nobody bridged, what may be."""
+    unseen_turn, unseen_push = (UNKNOWN_RATE_RADPS * gap_s) ** 2, (UNKNOWN_FORCE_MPS2 * gap_s) ** 2
+    x = run.x
+    rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
+    for i in range(3):
+        for j in range(3):
+            for axis in range(3):
+                share = rot[i][axis] * rot[j][axis]
+                run.bridge[i, j] += share * (made_up[axis] + unseen_turn)
+                run.bridge[3 + i, j] += share * (made_up[3 + axis] + unseen_push)
 
 
 @kernel
@@ -299,7 +299,8 @@ def advance(
         gap = share > 1.0
         clock[GAPS] += gap
         coned, sculled = coning_and_sculling(run.before, angle, velocity, span_s)
-        bridge_over(run, samples.bridged[i] or gap, span_s)
+        if samples.bridged[i] or gap:
+            bridge_over(run, samples.made_up[i], span_s if gap else 0.0)
         while next_row < len(rows.time_ns) and rows.time_ns[next_row] <= end_ns:
             at_ns = rows.time_ns[next_row]
             advance_share(x, run.sums, coned, sculled, 1e-9 * (at_ns - clock[NOW]), span_s)

@@ -47,7 +47,7 @@ class Running(NamedTuple):
         sums: (Layout.sums_size,) of the step; before: (7,) the sample before.
         total, total_decay: Φ since the last node.
         sigma: (9,) of position and velocity north, east, down, of roll, pitch, heading.
-        bridge: (3,) length of the bridge so far, variances it adds to this step.
+        bridge: (6, 3) covariances in e of attitude and velocity that made-up samples add to this step.
         refused: (4, kinds); lately: (6, kinds), by the rows above.
         top, work, decay: (9, core), (9, n), (n,) room for a step.
         rows, small, gain, error: (3, n), (8, 3), (n,), (n,) room for an observation.

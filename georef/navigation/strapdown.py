@@ -43,13 +43,14 @@ _SMALL_2 = 1e-3  # rad², below it the series are exact to the last bit
 
 
 class Samples(NamedTuple):
-    """Columns of `Inertial`, as compiled loops take them."""
+    """Columns of `Inertial`, as compiled loops take them; and (n, 6) variances that made-up samples add, by axis."""
 
     time_ns: Int64Array
     interval_s: FloatArray
     angle_b: FloatArray
     velocity_b: FloatArray
     bridged: NDArray[np.bool_]
+    made_up: FloatArray
 
 
 def samples_of(inertial: Inertial) -> Samples:
@@ -60,6 +61,7 @@ def samples_of(inertial: Inertial) -> Samples:
         np.ascontiguousarray(inertial.angle_b, dtype=np.float64),
         np.ascontiguousarray(inertial.velocity_b, dtype=np.float64),
         np.ascontiguousarray(inertial.bridged, dtype=np.bool_),
+        np.zeros((0, 6)),
     )
 
 

@@ -206,7 +206,7 @@ def test_noise_of_a_step_is_that_of_a_walk_drawn_many_times() -> None:
     sums[27] = span_s
     drive = Drive(4e-4, 1e-2, np.zeros(CORE), np.full(CORE, np.inf))
     p = np.zeros((CORE, CORE))
-    add_noise(p, sums, drive, np.ones(CORE), np.zeros(2))
+    add_noise(p, sums, drive, np.ones(CORE), np.zeros((6, 3)))
     np.testing.assert_array_equal(p, p.T)
     dt = span_s / steps
     turn = np.cumsum(rng.standard_normal((20_000, steps, 3)) * np.sqrt(drive.angle * dt), axis=1)
