@@ -1,11 +1,16 @@
 """Whether sigmas are what errors are, over many flights: NEES of position, velocity, attitude; innovations.
 
-python -m benchmarks.navigation_honesty [--seeds 50]
+python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …]]
 
 Made flights of ten minutes at 60 m/s, 50 Hz, fixes at 1 Hz with white errors and with errors that last a minute (70 %
 of the variance), the filter told of it. Truth and inertial samples are the simulator's. The interval is that of χ² at
 99.8 % with as many independent samples as the flights' own scatter shows (`tests.georef.navigation.honesty`). Of
 innovations there is the second moment and the largest correlation of neighbours beside its one sigma.
+
+``--receivers``: instead of that, receivers whose sigmas are true, too small by 3, too large by 3, or not told at all
+(`tests.georef.navigation.receivers`), half of their variance lasting a minute; `solve` is not told which. Beside the
+NEES of what it makes, there is the largest ratio of its errors, RMS over the flights, to those of the smoother that
+knows.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from georef.navigation.inputs import GRADES, Fate, Solution
 from georef.navigation.smoother import forward, smooth
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
 from tests.georef.navigation.honesty import judge, squares
+from tests.georef.navigation.receivers import RECEIVERS, compared
 
 ARM = np.array([0.35, -0.12, -1.1])
 
@@ -39,11 +45,33 @@ def flown(grade: str, share: float, seed: int) -> tuple[Solution, Solution]:
     return forward(run), smooth(run)
 
 
+def with_receivers(names: list[str], seeds: int) -> None:
+    """Fly receivers of all kinds with both units, and print a line each."""
+    heads = "".join(f"{part:>30}" for part in ("position", "velocity", "attitude"))
+    print(f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<30}{heads}   error / best: position, velocity, attitude")
+    for name in names:
+        for grade in ("tactical", "mems"):
+            for words, optimism in (("honest", 1.0), ("optimistic by 3", 3.0), ("pessimistic by 3", 1.0 / 3.0)):
+                found, errors = [], np.zeros((2, 9))
+                for seed in range(2000, 2000 + seeds):
+                    one = compared(flight(), RECEIVERS[name], grade, optimism, seed)
+                    found.append(squares(flight(), one.solved.smoothed, 5.0, 0.5))
+                    errors += one.squares(flight())
+                told = "".join(f"{of.mean:>12.3f} ({of.low:.3f} … {of.high:.3f})" for of in judge(found).values())
+                ratio = np.sqrt(errors[0] / errors[1]).reshape(3, 3).max(axis=1)
+                worst = "".join(f"{value:>8.3f}" for value in ratio)
+                print(f"{f'{name}, {grade}, {words}':<34}{told}  {worst}", flush=True)
+
+
 def main() -> None:
     """Fly and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="flights of each kind")
+    parser.add_argument("--receivers", nargs="*", choices=RECEIVERS, help="these receivers (none named: all)")
     arguments = parser.parse_args()
+    if arguments.receivers is not None:
+        with_receivers(arguments.receivers or list(RECEIVERS), arguments.seeds)
+        return
     print(f"{'':<28}{'part':<10} {'NEES':>6} {'interval':>14} {'independent':>12}")
     for grade in ("tactical", "mems"):
         for share in (0.0, 0.7):

@@ -18,10 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.processing.navigation_sources import CORRELATED_SHARE, CORRELATION_S, SIGMA_FACTOR
+from daemon.processing.navigation_sources import filter_setup
 from georef.navigation.inputs import GRADES, ImuNoise, Setup
 from georef.navigation.solve import solve
-from georef.records import FixType
 from sim.plan_tables import ImuTable
 from tests.georef.navigation.flights import drawn_start
 from tests.georef.navigation.virtual_aircraft import (
@@ -75,13 +74,7 @@ def cases() -> list[Case]:
 
 def setup_of(case: Case) -> Setup:
     """White errors are known; a receiver's are taken as by the program."""
-    setup = Setup(case.noise, np.array([ARM]))
-    if not case.receiver:
-        return setup
-    scale = {int(fix): SIGMA_FACTOR for fix in FixType}
-    return replace(
-        setup, gnss_correlation_s=CORRELATION_S, gnss_correlated_share=CORRELATED_SHARE, gnss_sigma_scale=scale
-    )
+    return filter_setup(case.noise, [np.array(ARM)]) if case.receiver else Setup(case.noise, np.array([ARM]))
 
 
 def flown(craft: Aircraft, case: Case, seeds: range) -> dict[str, Seeds]:

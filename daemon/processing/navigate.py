@@ -15,8 +15,10 @@ from daemon.log.reader import Session
 from daemon.processing.ins_point import point_doubts
 from daemon.processing.mapped_storage import MappedStorage
 from daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from daemon.processing.navigation_sources import noise_of
 from daemon.processing.navigation_times import Stretch
 from georef.navigation.inputs import (
+    GRADES,
     OBSERVATION_DTYPE,
     Kind,
     NavigationError,
@@ -49,11 +51,13 @@ class NavigateWish:
         inputs: of what is read.
         smooth: the smoother runs too; False: as it was in real time.
         attitude_rad: roll, pitch, heading at the start; None: they are found.
+        compare_noise: find out whether the flight asks for another noise of the unit; takes some runs of ten minutes.
     """
 
     inputs: InputWish = field(default_factory=InputWish)
     smooth: bool = True
     attitude_rad: tuple[float, float, float] | None = None
+    compare_noise: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +75,22 @@ class NavigatedLeg:
         return self.solved.smoothed if smooth else self.solved.forward
 
     def noise_found(self) -> dict[str, float]:
-        """Factors on the receiver's own sigmas with which it was navigated."""
-        rows = self.solved.forward.innovations
-        fixes = sorted(set(rows["fix_type"][rows["kind"] == Kind.POSITION].tolist()))
-        scales = {fix: self.setup.gnss_sigma_scale[fix] for fix in fixes if fix in self.setup.gnss_sigma_scale}
-        whiter = {fix: self.setup.gnss_white_scale[fix] for fix in fixes if fix in self.setup.gnss_white_scale}
-        names = {fix: FixType(fix).name.lower().replace("_", " ") for fix in fixes}
-        return {f"positions, {names[fix]}": scale for fix, scale in scales.items()} | {
-            f"positions, {names[fix]}, from epoch to epoch": scales.get(fix, 1.0) * scale
-            for fix, scale in whiter.items()
-        }
+        """Return factors on sigmas, the receiver's own or those assumed of it, with which it was navigated."""
+        rows, setup = self.solved.forward.innovations, self.setup
+        found: dict[str, float] = {}
+        for kind, words, scales, of_vertical in (
+            (Kind.POSITION, "positions", setup.gnss_sigma_scale, setup.gnss_vertical_scale),
+            (Kind.VELOCITY, "velocities", setup.gnss_velocity_scale, setup.gnss_velocity_vertical_scale),
+        ):
+            for fix in sorted(set(rows["fix_type"][rows["kind"] == kind].tolist())):
+                name = f"{words}, {FixType(fix).name.lower().replace('_', ' ')}"
+                if fix in scales:
+                    found[name] = scales[fix]
+                if fix in of_vertical:
+                    found[f"{name}, vertical"] = scales.get(fix, 1.0) * of_vertical[fix]
+        if setup.gnss_heading_scale != 1.0:
+            found["headings"] = setup.gnss_heading_scale
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +189,9 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: 
     from georef.navigation.alignment import align
     from georef.navigation.diagnosis import diagnose
     from georef.navigation.earlier_start import earlier_start
-    from georef.navigation.solve import solve
+    from georef.navigation.solve import solve, stretch_of
     from georef.navigation.stillness import with_still_seconds
+    from georef.navigation.unit_noise import noise_findings
 
     rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
     start = align(leg.inertial, rows, inputs.setup)
@@ -190,6 +201,11 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: 
     solved = solve(leg.inertial, rows, setup, start, storage=storage)
     setup = solved.report.setup
     findings = diagnose(leg.inertial, leg.observations, setup, solved) + inputs.findings
+    if wish.compare_noise and not any(finding.severity == "error" for finding in findings):
+        table, name = inputs.sources.imu.noise, inputs.sources.imu_name
+        grades = {grade: noise_of(table.model_copy(update={"grade": grade})) for grade in GRADES}
+        run = stretch_of(leg.inertial, rows, start)
+        findings += noise_findings(run, setup, table.grade, grades, f"imu.{name}.noise")
     return NavigatedLeg(leg, start, setup, solved, findings)
 
 

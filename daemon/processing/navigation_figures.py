@@ -72,6 +72,7 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
         "lever_arm": _lever_arm(flight),
         "time_offset": _time_offset(flight),
         "noise_found": dict(flight.noise_found),
+        "lasting_share": flight.setup.gnss_correlated_share,
         "counts": {name: int(count) for name, count in sorted(flight.forward.counts.items())},
     }
 

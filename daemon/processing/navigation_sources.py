@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -17,12 +16,12 @@ from daemon.errors import ConfigError, ExitCode, UserError
 from daemon.log.format import LogError, SessionInfo
 from daemon.log_parsers import stored_config
 from daemon.processing.models import gimbal_sources
+from daemon.processing.navigation_observations import HEADING_SHARE, HEADING_STEP_NS, HEADING_TAU_S, white_factor
 from daemon.processing.setup import Options
 from daemon.processing.setup import Setup as PointSetup
 from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
 from drivers.core.registry import UnknownProtocolError, find_driver
 from georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
-from georef.records import FixType
 from georef.stream_clocks import ClockPlan, DevicePlan
 
 if TYPE_CHECKING:
@@ -30,9 +29,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-# Receivers' sigmas of positions are those of the noise from epoch to epoch. As much again lasts for a minute or so:
-# multipath, the atmosphere, the orbits. So half of a variance that is twice theirs is time-correlated.
-CORRELATED_SHARE, CORRELATION_S, SIGMA_FACTOR = 0.5, 60.0, math.sqrt(2.0)
+# Receivers' sigmas of positions are taken for those of all their error. Half of its variance lasts for a minute or so:
+# multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`georef.navigation.noise`).
+CORRELATED_SHARE, CORRELATION_S = 0.5, 60.0
 
 
 class NavigationSources:
@@ -108,6 +107,25 @@ class NavigationSources:
     def imu_is_in_receiver(self) -> bool:
         """An IMU that the receiver itself makes an INS of."""
         return self.imu.transport == f"gnss:{self.gnss_name}"
+
+    @property
+    def noise_by_grade(self) -> dict[str, float]:
+        """Keys of ``[imu.….noise]`` that the configuration does not set, with what their grade gives."""
+        table = self.imu.noise
+        noise = noise_of(table)
+        one = imu_noise(**dict.fromkeys(_NOISE_FIELDS, 1.0))  # each key's unit
+        absent = [key for key in _NOISE_FIELDS if getattr(table, key) is None]
+        found = {key: getattr(noise, field) / getattr(one, field) for key, field in _NOISE_FIELDS.items()}
+        return {key: float(f"{found[key]:.6g}") for key in absent}
+
+    def noise_words(self) -> str:
+        """In a line: which keys of the noise come from a grade, and whether somebody chose it; empty where none."""
+        table, given = self.imu.noise, self.noise_by_grade
+        if not given:
+            return ""
+        chosen = "" if "grade" in table.model_fields_set else ", which nobody chose"
+        told = ", ".join(f"{key} {value:g}" for key, value in given.items())
+        return f"Noise by grade {table.grade}{chosen} (imu.{self.imu_name}.noise sets none of these): {told}"
 
     # ------------------------------------------------------------------ reading
 
@@ -188,7 +206,7 @@ def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s:
         estimate_time_offset_s=time_sigma_s,
         gnss_correlation_s=CORRELATION_S,
         gnss_correlated_share=CORRELATED_SHARE,
-        gnss_sigma_scale={int(fix): SIGMA_FACTOR for fix in FixType},
+        heading_repeats=white_factor(HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S),
     )
 
 
@@ -248,20 +266,22 @@ def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -
     raise UserError(f"the configuration names {what}", ExitCode.USAGE)
 
 
+_NOISE_FIELDS = {
+    "angle_random_walk_deg_per_sqrt_h": "angle_random_walk",
+    "velocity_random_walk_m_per_s_per_sqrt_h": "velocity_random_walk",
+    "gyro_bias_deg_per_h": "gyro_bias",
+    "accel_bias_mg": "accel_bias",
+    "bias_correlation_h": "bias_correlation_s",
+    "gyro_scale_ppm": "gyro_scale",
+    "accel_scale_ppm": "accel_scale",
+    "misalignment_mrad": "misalignment",
+}
+
+
 def noise_of(table: NoiseConfig) -> ImuNoise:
     """What ``[imu.….noise]`` says; what it leaves out is its grade's."""
     said = {key: value for key, value in table.model_dump().items() if key != "grade" and value is not None}
-    keys = {
-        "angle_random_walk_deg_per_sqrt_h": "angle_random_walk",
-        "velocity_random_walk_m_per_s_per_sqrt_h": "velocity_random_walk",
-        "gyro_bias_deg_per_h": "gyro_bias",
-        "accel_bias_mg": "accel_bias",
-        "bias_correlation_h": "bias_correlation_s",
-        "gyro_scale_ppm": "gyro_scale",
-        "accel_scale_ppm": "accel_scale",
-        "misalignment_mrad": "misalignment",
-    }
     grade = GRADES[table.grade]
-    in_si = imu_noise(**(dict.fromkeys(keys, 0.0) | said))
-    chosen = {keys[key]: getattr(in_si, keys[key]) for key in said}
+    in_si = imu_noise(**(dict.fromkeys(_NOISE_FIELDS, 0.0) | said))
+    chosen = {_NOISE_FIELDS[key]: getattr(in_si, _NOISE_FIELDS[key]) for key in said}
     return ImuNoise(**({field.name: getattr(grade, field.name) for field in fields(grade)} | chosen))

@@ -138,6 +138,11 @@ def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
     return measure
 
 
+def _noise_found(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    """Factors on sigmas that the flight asked for."""
+    yield from figures["noise_found"].items()
+
+
 def _sensor(*names: str) -> Measure:
     """Largest estimate of an axis, in sigmas that the configuration gives."""
 
@@ -278,6 +283,14 @@ RULES: tuple[Rule, ...] = (
         None,
         "innovations of {of} are {value:.1f} times smaller than their sigmas say: sigmas here are too careful",
         f"check {NOISE}",
+    ),
+    Rule(
+        "noise found",
+        _noise_found,
+        5.0,
+        None,
+        "errors of {of} are {value:.1f} times what the receiver says, or what is assumed of it; they were taken so",
+        "check lever_arm_m and the time source: a fault there looks like a receiver's noise",
     ),
     Rule(
         "innovations correlated",

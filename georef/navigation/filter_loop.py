@@ -51,7 +51,7 @@ from georef.navigation.filter_types import (
     Running,
     Told,
 )
-from georef.navigation.gate import drifted, judge, leapt, noise_factor, settling
+from georef.navigation.gate import drifted, judge, leapt, noise_factor, settling, still_away
 from georef.navigation.inputs import Fate
 from georef.navigation.kalman import factorise, innovation_covariance, take_component, whiten, whiten_rows
 from georef.navigation.level import attitude_rows, level_axes
@@ -196,6 +196,9 @@ def observe(run: Running, model: Model, rows: Rows, r: int, nodes: Nodes, told: 
     innovation_covariance(run.p, run.rows, noise, m, s)
     lost = drifted(kind, s, noise, m)
     chi2 = tell(told, r, nu, s, m, run.small[7])
+    if still_away(run, model, kind, chi2, m):
+        told.fate[r] = _REJECTED
+        return
     settles = settling(run, model, kind, lost, chi2, m)
     if leapt(run, model, kind, settles, chi2, m):
         told.fate[r] = _REJECTED

@@ -128,10 +128,22 @@ def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: 
 
 
 @kernel
+def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bool:
+    """Tell whether positions that leapt away are still beyond the gate, however badly the state is known by now.
+
+    Without velocities a state of seconds alone is worse than positions say they are, and would be blamed for the leap.
+    """
+    since = run.refused[LEAPT_NS, kind]
+    if kind != _POSITION or since == 0 or chi2 <= model.rules.gate[m]:
+        return False
+    return bool(run.clock[NOW] - since <= PATIENCE * model.reacquire_ns)
+
+
+@kernel
 def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> bool:
     """Whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
 
-    So does a wrong fix. A state that is worse than its covariance leaves the gate slowly, and one that is not known
+    So does a wrong fix. A state that is worse than its covariance leaves the gate slowly, and one that was not known
     much better than the positions is to blame itself. What lasts longer than a wrong fix may is judged like the rest.
     """
     refused, now, gate = run.refused, run.clock[NOW], model.rules.gate[m]

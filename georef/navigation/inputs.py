@@ -180,10 +180,14 @@ GRADES: dict[str, ImuNoise] = {
     "navigation": imu_noise(0.002, 0.005, 0.0035, 0.025, 1.0, 5.0, 100.0),
     "tactical": imu_noise(0.1, 0.03, 1.0, 1.0, 1.0, 300.0, 300.0, 0.1),
     "mems": imu_noise(0.3, 0.07, 36.0, 3.0, 1.0, 1000.0, 1000.0, 0.5),
+    "consumer": imu_noise(0.5, 0.24, 1500.0, 80.0, 1.0, 10_000.0, 10_000.0, 10.0),
 }
 """Classes as data sheets have them: Honeywell HG9900; iMAR IMU-FSAS, Honeywell HG1700; Analog Devices ADIS16488 with
-accelerometers as a Sensonor STIM300's; misalignments are of the size such units have, and of no sheet. Those of the
-first would be below 0.01 mrad, 0.002° of heading after half a turn."""
+accelerometers as a Sensonor STIM300's; InvenSense MPU-6050 (PS-MPU-6000A 3.4: accelerometers ±50 and ±80 mg, 400
+µg/√Hz, scale factors ±3 %, across axes ±2 %, taken for limits; gyroscopes 0.005 °/s/√Hz), the gyroscopes' bias between
+the 360 and 3600 °/h that El-Sheimy and Youssef 2020 and the Xsens MTi-G's sheet have. Other misalignments are of the
+size such units have, and of no sheet. Those of the first would be below 0.01 mrad, 0.002° of heading after half a turn.
+"""
 
 
 def _no_arms() -> FloatArray:
@@ -214,8 +218,11 @@ class Setup:
             drifted, or has just begun, may settle.
         node_s: longest time between nodes of the smoother.
         step_s: longest step of the covariance.
-        gnss_sigma_scale: by fix type, factor on positions' sigmas (as found by an earlier pass).
-        gnss_white_scale: by fix type, a further factor on that part of them which is not time-correlated.
+        gnss_sigma_scale, gnss_velocity_scale: by fix type, factor on positions' and velocities' sigmas, floors included
+            (as found by an earlier pass).
+        gnss_vertical_scale, gnss_velocity_vertical_scale: by fix type, a further factor on those of the vertical.
+        gnss_heading_scale: factor on those of headings.
+        heading_repeats: factor by which headings' sigmas were made larger because their errors last.
     """
 
     noise: ImuNoise
@@ -237,7 +244,11 @@ class Setup:
     node_s: float = 1.0
     step_s: float = 0.1
     gnss_sigma_scale: dict[int, float] = field(default_factory=dict)
-    gnss_white_scale: dict[int, float] = field(default_factory=dict)
+    gnss_velocity_scale: dict[int, float] = field(default_factory=dict)
+    gnss_vertical_scale: dict[int, float] = field(default_factory=dict)
+    gnss_velocity_vertical_scale: dict[int, float] = field(default_factory=dict)
+    gnss_heading_scale: float = 1.0
+    heading_repeats: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ and velocities (components north, east, down). With l the lever arm, C = rot_e_f
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +77,9 @@ class Rules(NamedTuple):
     Attributes:
         arms_b: (k, 3) lever arms; baseline_b: (3,), nan: none.
         share: of GNSS positions' variance that is slow.
-        position_floor_m, position_scale: (fix types,).
-        white_scale: (fix types,) of the part that is not slow.
+        position_floor_m: (fix types,).
+        position_scale, velocity_scale: (fix types, 2) of the horizontal and the vertical, floors included.
+        heading_scale: likewise.
         velocity_floor_mps, attitude_floor_rad: the least sigmas.
         gate: (4,) χ² of the gate by number of components.
         reject: factor on it.
@@ -89,7 +91,8 @@ class Rules(NamedTuple):
     share: float
     position_floor_m: FloatArray
     position_scale: FloatArray
-    white_scale: FloatArray
+    velocity_scale: FloatArray
+    heading_scale: float
     velocity_floor_mps: float
     attitude_floor_rad: float
     gate: FloatArray
@@ -107,14 +110,21 @@ def rules_of(setup: Setup) -> Rules:
         baseline,
         float(setup.gnss_correlated_share),
         np.array(floors),
-        np.array([float(setup.gnss_sigma_scale.get(int(fix), 1.0)) for fix in FixType]),
-        np.array([float(setup.gnss_white_scale.get(int(fix), 1.0)) for fix in FixType]),
+        _scales_of(setup.gnss_sigma_scale, setup.gnss_vertical_scale),
+        _scales_of(setup.gnss_velocity_scale, setup.gnss_velocity_vertical_scale),
+        float(setup.gnss_heading_scale),
         float(setup.velocity_floor_mps),
         float(setup.attitude_floor_rad),
         gate,
         float(setup.reject_factor**2),
         float(setup.noise.angle_random_walk**2),
     )
+
+
+def _scales_of(scale: Mapping[int, float], vertical: Mapping[int, float]) -> FloatArray:
+    """Return (fix types, 2) factors of the horizontal and the vertical."""
+    whole = np.array([float(scale.get(int(fix), 1.0)) for fix in FixType])
+    return np.stack([whole, whole * [float(vertical.get(int(fix), 1.0)) for fix in FixType]], axis=1)
 
 
 @kernel
@@ -176,9 +186,9 @@ def _position(
     put(nu, 0, in_level(axes, plus(three(figures, 0), -1.0, predicted)))
     scale, floor = rules.position_scale[fix], rules.position_floor_m[fix]
     sigma = (
-        max(scale * figures[3], floor),
-        max(scale * figures[4], floor),
-        max(scale * figures[5], floor),
+        scale[0] * max(figures[3], floor),
+        scale[0] * max(figures[4], floor),
+        scale[1] * max(figures[5], floor),
     )
     _set_noise(noise, sigma, figures, 6)
     for i in range(3):
@@ -192,13 +202,11 @@ def _position(
         if layout.time_offset >= 0:
             rows[i, layout.time_offset] = dot(a, plus(moving, offset_s, acceleration))
     if layout.slow >= 0:
-        _add_slow(x, rules, layout, fix, nu, rows, noise)
+        _add_slow(x, rules, layout, nu, rows, noise)
 
 
 @kernel
-def _add_slow(
-    x: FloatArray, rules: Rules, layout: Layout, fix: int, nu: FloatArray, rows: FloatArray, noise: FloatArray
-) -> None:
+def _add_slow(x: FloatArray, rules: Rules, layout: Layout, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
     """The time-correlated share of a position's error."""
     factor = noise.copy()
     if not factorise(factor, 3):
@@ -209,12 +217,12 @@ def _add_slow(
             rows[i, layout.slow + j] = root * factor[i, j]
             nu[i] -= root * factor[i, j] * x[SLOW + j]
         for j in range(3):
-            noise[i, j] *= (1.0 - rules.share) * rules.white_scale[fix] ** 2
+            noise[i, j] *= 1.0 - rules.share
 
 
 @kernel
 def _velocity(
-    x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int,
+    x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int, fix: int,
     figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray,
 ) -> None:  # fmt: skip
     """Of an antenna's velocity."""
@@ -228,7 +236,13 @@ def _velocity(
     turned = plus(swing_e, x[TIME_OFFSET], force_e)
     put(nu, 0, plus(three(figures, 0), -1.0, in_level(axes, predicted)))
     floor = rules.velocity_floor_mps
-    _set_noise(noise, (max(figures[3], floor), max(figures[4], floor), max(figures[5], floor)), figures, 6)
+    scale = rules.velocity_scale[min(fix, len(rules.velocity_scale) - 1)]
+    sigma = (
+        scale[0] * max(figures[3], floor),
+        scale[0] * max(figures[4], floor),
+        scale[1] * max(figures[5], floor),
+    )
+    _set_noise(noise, sigma, figures, 6)
     for i in range(3):
         a = axes[i]
         put(rows[i], E_VELOCITY, a)
@@ -270,8 +284,8 @@ def _heading(
     nu[0] = wrapped(figures[0] - math.atan2(e, n))
     nu[1] = figures[1] - math.atan2(-d, flat)
     nu[2] = np.nan
-    floor = rules.attitude_floor_rad
-    _set_noise(noise, (max(figures[3], floor), max(figures[4], floor), 1.0), figures, 6)
+    floor, scale = rules.attitude_floor_rad, rules.heading_scale
+    _set_noise(noise, (scale * max(figures[3], floor), scale * max(figures[4], floor), 1.0), figures, 6)
 
 
 @kernel
@@ -348,7 +362,7 @@ def predict(
     if kind == _POSITION and 0 < fix < len(rules.position_floor_m):
         _position(x, sums, rules, layout, antenna, fix, figures, nu, rows, noise)
     elif kind == _VELOCITY:
-        _velocity(x, sums, rules, layout, antenna, figures, nu, rows, noise)
+        _velocity(x, sums, rules, layout, antenna, fix, figures, nu, rows, noise)
     elif kind == _HEADING:
         _heading(x, rules, figures, nu, rows, noise)
     elif kind == _ATTITUDE:

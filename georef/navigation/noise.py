@@ -1,49 +1,64 @@
-"""What a run's innovations say of GNSS positions: how large their errors are, and whether they last.
+"""What a flight says of its receiver's noise: how large errors are, by kind and fix type, and which share lasts.
 
-Innovations of a filter are white and as large as it predicts where its noise is right (Mehra 1970). Hypotheses are
-compared by the likelihood of the innovations on a stretch of the flight: sigmas as the receiver says them, sigmas
-scaled, and errors of which a share is a Gauss–Markov process. A hypothesis other than the first needs to be better by
-more than chance gives.
+Innovations of a filter are white and as large as it predicts where its noise is right (Mehra 1970). Two things are
+asked of them.
+
+How large: sigmas of positions and velocities of each fix type, and of headings, are scaled, up or down, until the mean
+square of normalised innovations is 1. A scale other than 1 needs `ENOUGH` observations and ln likelihood better by
+`EVIDENCE`, which n components with the mean square m give as n/2 (m − 1 − ln m).
+
+Which share lasts: positions' errors are a white part and a Gauss–Markov process. Innovations show it through what the
+inertial unit knows better over seconds than the receiver: much at 5 Hz, little at 1 Hz. Shares are compared by the
+likelihood of the innovations, scales matched for each, together with a prior, `PRIOR_SIGMA` of ln (lasting / white
+variance) about the share that was assumed; another share than that needs `EVIDENCE` too. Against the hypothesis of a
+setup that says white, it needs `SIGNIFICANT`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from georef.navigation.inputs import Fate, Kind, Setup
-from georef.records import FixType, StructArray
+from georef.records import StructArray
 
-ENOUGH = 60  # innovations of one fix type
-SIGNIFICANT = 8.0  # difference of ln likelihood
-SCALES = (0.2, 10.0)
-LET_BE = (0.6, 1.6)  # mean square of normalised innovations of a setup that is not rescaled
-MOMENT_SCALES = (0.5, 20.0)
-MOST_SCALES, NEAR = 3, 0.1  # tries of one share, until the mean square is so near to 1
-SHARES = (0.5, 0.8, 0.95)
-TAILS = 10.0  # degrees of freedom of the t distribution that stands for innovations: outliers weigh little
-SOUND = (0.5, 1.7)  # mean square of normalised innovations of a hypothesis that explains them
+BoolArray = NDArray[np.bool_]
+Run = Callable[[Setup], StructArray]
+
+ENOUGH = 120  # components of one source: 60 positions' horizontal ones
+EVIDENCE = 2.0  # of ln likelihood: chance gives it to one in twenty
+SIGNIFICANT = 8.0  # the same, of a share against a setup that says white
+SCALES = (0.02, 30.0)
+NEAR = 0.03  # of 1: mean square that needs no other scale
+ROUNDS = 4  # runs, at most, until scales stay
+STEP = 0.7  # of ln (lasting / white variance) between shares tried
+MIDDLE, PRIOR_SIGMA, REACH = 0.5, 1.0, 7  # share tried first where none is assumed; steps either way, at most
+GREATEST = 50.0  # χ² that counts of an innovation
+OUTLIER = 20.0  # times the median square: an innovation beyond says nothing of the others
+CHI2_MEDIAN = np.array([np.nan, 0.45494, 1.38629, 2.36597])  # of 1, 2, 3 degrees of freedom
 FEW = 0.1  # share of positions far beyond the gate: so few are blunders, more are noise that is larger than said
+OF_GNSS = (Kind.POSITION, Kind.VELOCITY, Kind.HEADING)
+HORIZONTAL, VERTICAL = slice(0, 2), slice(2, 3)
+Source = tuple[int, int, bool]  # kind, fix type (of headings 0), whether it is the vertical
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """GNSS positions' noise.
+    """A share of positions' variance that lasts, with the scales that go with it.
 
     Attributes:
-        scale: factor on sigmas.
-        share: of the variance that is time-correlated.
-        log_likelihood: of the innovations, relative to the receiver's own sigmas, white.
-        second_moment: mean square of normalised innovations with it; a hypothesis stands only where it is near 1.
+        share: 0 … 1.
+        log_likelihood: of the innovations, relative to the share that was assumed.
+        setup: with this share, scales matched.
     """
 
-    scale: float
     share: float
     log_likelihood: float
-    second_moment: float
+    setup: Setup
 
 
 @dataclass(frozen=True)
@@ -51,116 +66,211 @@ class NoiseFound:
     """What was found.
 
     Attributes:
-        tried: hypotheses, the receiver's own sigmas first.
-        best: the one that stands.
-        second_moment: by fix type, mean square of normalised innovations of positions in the first pass.
-        count: by fix type, how many innovations that is of.
+        setup: that goes by it.
+        tried: hypotheses, the assumed share first.
+        second_moment: by source, mean square of normalised innovations of the first run.
+        count: by source, components that this is of.
+        evidence: ln likelihood won by the first scale of each source; of the share `share_evidence`.
     """
 
+    setup: Setup
     tried: tuple[Hypothesis, ...]
-    best: Hypothesis
-    second_moment: dict[int, float]
-    count: dict[int, int]
+    second_moment: dict[Source, float]
+    count: dict[Source, int]
+    evidence: dict[Source, float] = field(default_factory=dict)
+    share_evidence: float = 0.0
 
     @property
-    def changed(self) -> bool:
-        """Whether another hypothesis than the receiver's own sigmas stands."""
-        return self.best.scale != 1.0 or self.best.share != 0.0
+    def share(self) -> float:
+        """Share of the positions' variance that lasts."""
+        return self.setup.gnss_correlated_share
 
 
-def without_blunders(innovations: StructArray, run: StructArray) -> StructArray:
-    """Innovations but for positions of times at which a run with the receiver's own sigmas refused or re-acquired one.
+def not_blunders(run: StructArray) -> BoolArray:
+    """Tell which innovations (n,) are of no time at which a run refused or re-acquired a position.
 
     Seconds of a wrong fix are no noise, and would hide that of the other hours.
     """
     place = run[(run["kind"] == Kind.POSITION) & (run["fate"] <= Fate.REACQUIRED)]
     far = place[np.isin(place["fate"], (Fate.REJECTED, Fate.REACQUIRED))]
     if len(far) > FEW * len(place):
-        return innovations
-    kept: StructArray = innovations[~np.isin(innovations["time_ns"], far["time_ns"])]
+        return np.ones(len(run), np.bool_)
+    kept: BoolArray = ~np.isin(run["time_ns"], far["time_ns"])
     return kept
 
 
-def second_moments(innovations: StructArray) -> tuple[dict[int, float], dict[int, int]]:
-    """Mean square of normalised innovations of positions that were not refused, and how many, by fix type."""
-    told = innovations[(innovations["kind"] == Kind.POSITION) & (innovations["fate"] <= Fate.REACQUIRED)]
-    moments, counts = {}, {}
-    for fix in np.unique(told["fix_type"]).tolist():
-        normalised = told["normalised"][told["fix_type"] == fix]
-        moments[fix], counts[fix] = float(np.nanmean(normalised**2)), len(normalised)
+def second_moments(innovations: StructArray) -> tuple[dict[Source, float], dict[Source, int]]:
+    """Mean square of normalised innovations, outliers left out, and of how many components it is, by source."""
+    rows = innovations[_usable(innovations)]
+    fix = np.where(rows["kind"] == Kind.HEADING, 0, rows["fix_type"])
+    moments: dict[Source, float] = {}
+    counts: dict[Source, int] = {}
+    for kind, one in sorted(set(zip(rows["kind"].tolist(), fix.tolist(), strict=True))):
+        mine = rows[(rows["kind"] == kind) & (fix == one)]
+        sound = mine[_not_outlying(mine)]
+        parts = ((False, slice(0, 3)),) if kind == Kind.HEADING else ((False, HORIZONTAL), (True, VERTICAL))
+        for vertical, part in parts:
+            squares = sound["normalised"][:, part] ** 2
+            known = int(np.isfinite(squares).sum())
+            if known:
+                moments[kind, one, vertical] = float(np.nansum(squares) / known)
+                counts[kind, one, vertical] = known
     return moments, counts
 
 
+def _usable(innovations: StructArray) -> BoolArray:
+    """Tell which innovations (n,) are of GNSS and have a size."""
+    known = (innovations["fate"] <= Fate.REACQUIRED) & (innovations["dimension"] > 0)
+    usable: BoolArray = known & np.isfinite(innovations["chi2"]) & np.isin(innovations["kind"], OF_GNSS)
+    return usable
+
+
+def _not_outlying(rows: StructArray) -> BoolArray:
+    """Tell which innovations (n,) of one source are not far beyond all others."""
+    median = np.median(rows["chi2"] / CHI2_MEDIAN[rows["dimension"]]) if len(rows) else 0.0
+    sound: BoolArray = rows["chi2"] <= OUTLIER * median
+    return sound
+
+
 def log_likelihood(innovations: StructArray) -> float:
-    """Of positions' innovations, −½ Σ (ln |S| + (k + m) ln(1 + χ² / k)), of a t distribution of k = `TAILS`."""
-    told = innovations[(innovations["kind"] == Kind.POSITION) & (innovations["fate"] <= Fate.REACQUIRED)]
-    weight = TAILS + told["dimension"]
-    return float(-0.5 * (told["log_det"] + weight * np.log1p(told["chi2"] / TAILS)).sum())
+    """Return −½ Σ (ln |S| + χ²) of innovations; a χ² beyond `GREATEST` counts as that."""
+    return float(-0.5 * (innovations["log_det"] + np.minimum(innovations["chi2"], GREATEST)).sum())
 
 
-def by_moments(setup: Setup, innovations: StructArray) -> Setup:
-    """The setup, with positions' sigmas by fix type such that innovations are as large as predicted; itself: they are.
+def rescaled(setup: Setup, innovations: StructArray) -> tuple[Setup, dict[Source, float]]:
+    """Return the setup with scales that the innovations of a run with it ask for, and what each wins of ln likelihood.
 
-    For a setup that says how much of the errors lasts, which innovations hardly show. Where they are larger, all of it
-    is; where they are smaller, only the part that does not last: what lasts is as the receiver's sigmas have it.
+    The setup itself, and nothing, where they ask for none.
     """
-    moments, counts = second_moments(without_blunders(innovations, innovations))
-    off = {
-        fix: math.sqrt(moment)
-        for fix, moment in moments.items()
-        if counts[fix] >= ENOUGH and not LET_BE[0] <= moment <= LET_BE[1]
-    }
-    if not off:
-        return setup
-    known = setup.gnss_sigma_scale
-    larger = {fix: min(known.get(fix, 1.0) * factor, MOMENT_SCALES[1]) for fix, factor in off.items() if factor > 1.0}
-    whiter = {fix: max(factor, MOMENT_SCALES[0]) for fix, factor in off.items() if factor < 1.0}
-    return replace(setup, gnss_sigma_scale=known | larger, gnss_white_scale=setup.gnss_white_scale | whiter)
+    moments, counts = second_moments(innovations)
+    factors: dict[Source, float] = {}
+    won: dict[Source, float] = {}
+    for source, moment in moments.items():
+        if source[0] == Kind.HEADING:
+            moment *= setup.heading_repeats**2
+        gain = 0.5 * counts[source] * (moment - 1.0 - math.log(moment)) if moment > 0.0 else 0.0
+        enough = counts[source] >= ENOUGH and abs(moment - 1.0) >= NEAR and gain >= EVIDENCE
+        factors[source] = math.sqrt(moment) if enough else 1.0
+        if enough:
+            won[source] = gain
+    return (_with_factors(setup, factors), won) if won else (setup, won)
 
 
-def find_noise(innovations: StructArray, stretch: Callable[[Setup], StructArray], setup: Setup) -> NoiseFound:
-    """Compare hypotheses.
+def _with_factors(setup: Setup, factors: Mapping[Source, float]) -> Setup:
+    """Return the setup with its scales multiplied."""
+    position, velocity = dict(setup.gnss_sigma_scale), dict(setup.gnss_velocity_scale)
+    up, rising = dict(setup.gnss_vertical_scale), dict(setup.gnss_velocity_vertical_scale)
+    heading = setup.gnss_heading_scale
+    for (kind, fix, vertical), factor in factors.items():
+        if kind == Kind.HEADING:
+            heading = _bounded(heading * factor)
+            continue
+        scales, of_vertical = (position, up) if kind == Kind.POSITION else (velocity, rising)
+        if vertical:
+            of_vertical[fix] = of_vertical.get(fix, 1.0) * factor / factors.get((kind, fix, False), 1.0)
+        else:
+            scales[fix] = _bounded(scales.get(fix, 1.0) * factor)
+    return replace(
+        setup,
+        gnss_sigma_scale=position,
+        gnss_velocity_scale=velocity,
+        gnss_vertical_scale=up,
+        gnss_velocity_vertical_scale=rising,
+        gnss_heading_scale=heading,
+    )
+
+
+def _bounded(scale: float) -> float:
+    return min(max(scale, SCALES[0]), SCALES[1])
+
+
+def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFound:
+    """Find the receiver's noise.
 
     Args:
         innovations: of a whole run with `setup`.
-        stretch: innovations of a run over the stretch with another setup.
-        setup: of the run, sigmas as the receiver says them and white.
+        stretch: gives the innovations of a run over a part of the flight with another setup, a row an observation.
+        setup: of the run.
     """
-    moments, counts = second_moments(without_blunders(innovations, innovations))
-    first = Hypothesis(1.0, 0.0, 0.0, _mean(moments, counts))
-    if sum(counts.values()) < ENOUGH:
-        return NoiseFound((first,), first, moments, counts)
-    base = log_likelihood(without_blunders(stretch(setup), innovations))
+    sound = innovations[not_blunders(innovations)]
+    moments, counts = second_moments(sound)
+    if sum(count for (kind, *_), count in counts.items() if kind == Kind.POSITION) < ENOUGH:
+        return NoiseFound(setup, (Hypothesis(setup.gnss_correlated_share, 0.0, setup),), moments, counts)
+    begun, evidence = rescaled(setup, sound)
+    judged = Judged(stretch)
+    first = judged.matched(begun)
+    if setup.gnss_correlated_share > 0.0:
+        tried, best = _shares(judged, first)
+        needed = EVIDENCE
+    else:
+        tried, best = _shares(judged, judged.matched(_with_share(first.setup, MIDDLE)))
+        tried, needed = [first, *tried], SIGNIFICANT
+    gain = best.log_likelihood - first.log_likelihood
+    if gain < needed:
+        best, gain = first, 0.0
+    told = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
+    return NoiseFound(best.setup, told, moments, counts, evidence, gain)
 
-    def tried(scale: float, share: float) -> Hypothesis:
-        """With the scale, or one nearer to what innovations then say."""
-        for _ in range(MOST_SCALES):
-            scale = min(max(scale, SCALES[0]), SCALES[1])
-            found = without_blunders(stretch(scaled(setup, scale, share)), innovations)
-            one = Hypothesis(scale, share, log_likelihood(found) - base, _mean(*second_moments(found)))
-            if abs(one.second_moment - 1.0) < NEAR:
+
+class Judged:
+    """Setups judged by the same innovations: those that are sound in the first run.
+
+    Args:
+        stretch: gives the innovations of a run over a part of the flight with a setup, a row an observation.
+    """
+
+    def __init__(self, stretch: Run) -> None:
+        self._stretch = stretch
+        self._kept: BoolArray | None = None
+
+    def matched(self, setup: Setup) -> Hypothesis:
+        """Return a setup with the scales that go with its share."""
+        for left in reversed(range(ROUNDS)):
+            found = self._stretch(setup)
+            if self._kept is None:
+                self._kept = not_blunders(found) & _usable(found)
+                self._kept[self._kept] = _not_outlying(found[self._kept])
+            found = found[self._kept]
+            other, won = rescaled(setup, found)
+            if not won or not left:
                 break
-            scale *= math.sqrt(one.second_moment)
-        return one
-
-    white = tried(math.sqrt(first.second_moment), 0.0)
-    slow = [tried(white.scale / math.sqrt(1.0 - share), share) for share in SHARES]
-    if first.second_moment < 1.0 - NEAR:
-        slow.append(tried(1.0, 1.0 - first.second_moment))
-    best = first
-    for one in sorted([white, *slow], key=lambda one: one.share):
-        sound = SOUND[0] < one.second_moment < SOUND[1]
-        if sound and one.log_likelihood > best.log_likelihood + SIGNIFICANT:
-            best = one
-    return NoiseFound((first, white, *slow), best, moments, counts)
+            setup = other
+        return Hypothesis(setup.gnss_correlated_share, log_likelihood(found), setup)
 
 
-def scaled(setup: Setup, scale: float, share: float) -> Setup:
-    """A setup with GNSS positions' sigmas scaled, a share of their variance time-correlated."""
-    scales = {int(fix): scale * setup.gnss_sigma_scale.get(int(fix), 1.0) for fix in FixType}
+def _with_share(setup: Setup, share: float) -> Setup:
+    """Return a setup with another share that lasts, and as large a white part."""
+    white = math.sqrt((1.0 - setup.gnss_correlated_share) / (1.0 - share))
+    scales = _all_scales(setup.gnss_sigma_scale, white)
     return replace(setup, gnss_correlated_share=share, gnss_sigma_scale=scales)
 
 
-def _mean(moments: dict[int, float], counts: dict[int, int]) -> float:
-    """Over all fix types; 1 where there is none."""
-    return sum(moments[fix] * counts[fix] for fix in moments) / max(sum(counts.values()), 1) if moments else 1.0
+def _all_scales(scales: Mapping[int, float], factor: float) -> dict[int, float]:
+    """Return scales of all fix types, each multiplied."""
+    return {fix: factor * scales.get(fix, 1.0) for fix in range(16)}
+
+
+def _shares(judged: Judged, middle: Hypothesis) -> tuple[list[Hypothesis], Hypothesis]:
+    """Climb from an assumed share to the likeliest; all that were tried, and that one, on a parabola through three."""
+    centre = math.log(middle.share / (1.0 - middle.share))
+    known = {0: middle}
+
+    def worth(place: int) -> float:
+        """Ln likelihood and prior of a share so many steps from the middle."""
+        if place not in known:
+            share = 1.0 / (1.0 + math.exp(-(centre + STEP * place)))
+            near = known[place - 1 if place > 0 else place + 1]
+            known[place] = judged.matched(_with_share(near.setup, share))
+        return known[place].log_likelihood - 0.5 * (STEP * place / PRIOR_SIGMA) ** 2
+
+    at, way = 0, 1 if worth(1) > worth(-1) else -1
+    while abs(at) < REACH and worth(at + way) > worth(at):
+        at += way
+    if abs(at) >= REACH:
+        return list(known.values()), known[at]
+    below, here, above = worth(at - 1), worth(at), worth(at + 1)
+    bend = 2.0 * here - below - above
+    off = 0.5 * (above - below) / bend if bend > 0.0 else 0.0
+    share = 1.0 / (1.0 + math.exp(-(centre + STEP * (at + off))))
+    peak = known[at].log_likelihood + 0.25 * off * (above - below)
+    return list(known.values()), Hypothesis(share, peak, _with_share(known[at].setup, share))

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.cross_covariance import ErrorChain, error_chain
 from georef.navigation.filter import FilterRun, run_filter
-from georef.navigation.inputs import Inertial, Kind, Setup, Solution, Start
-from georef.navigation.noise import NoiseFound, by_moments, find_noise, scaled
+from georef.navigation.inputs import Inertial, Setup, Solution, Start
+from georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
 from georef.navigation.smoother import SmoothedNodes, forward, smooth_nodes, solution_of
 from georef.navigation.stores import IN_MEMORY, Storage
 from georef.navigation.strapdown import ATTITUDE, TIME_OFFSET
@@ -29,10 +29,10 @@ FloatArray = NDArray[np.float64]
 
 MOST_PASSES = 3
 STRETCH_S = 600.0  # of the flight, on which hypotheses of noise are compared
+MOST_RESCALED = 2  # times that the whole flight may correct the scales which the stretch told
 LINEAR_SHARE = 0.1  # of the sigma: what an angle's square may be
 OFFSET_LEFT_S = 5e-4
 WEAK = 0.5  # of the prior sigma: an estimate that keeps so much has learnt little
-OF_GNSS = (Kind.POSITION, Kind.VELOCITY, Kind.HEADING)
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Report:
     Attributes:
         passes: how many.
         start_change_rad: (passes,) how far the smoothed attitude at the start was from the assumed one.
-        noise: of GNSS positions; None: not asked for, or given.
+        noise: of GNSS; None: not asked for.
         time_offset_s: of GNSS, all passes together; 0 where not estimated.
         weak: estimates that the flight says little of, by name.
         setup: that the flight was smoothed with.
@@ -91,16 +91,21 @@ def solve(
     Args:
         inertial, observations: of it, observations in any order.
         setup, start: of the first pass.
-        noise_from_flight: look whether GNSS positions are as good as said, and go by what is found: a factor on their
-            sigmas, and, where the setup does not say it, which share of their errors lasts.
+        noise_from_flight: look how good GNSS is, and go by what is found: factors on the sigmas of positions and
+            velocities by fix type and of headings, and which share of the positions' errors lasts; see `noise`.
         storage: where the runs and the solutions are kept.
     """
     run = run_filter(inertial, observations, setup, start, storage=storage)
-    as_said, found = setup, None
+    found = None
     if noise_from_flight:
-        setup, found = _by_the_flight(inertial, observations, setup, start, run)
-    if setup is not as_said:
-        run = run_filter(inertial, observations, setup, start, storage=storage)
+        found = _noise(inertial, observations, setup, start, run)
+        for _ in range(1 + MOST_RESCALED):
+            if setup is found.setup:
+                break
+            setup = found.setup
+            run = run_filter(inertial, observations, setup, start, storage=storage)
+            found = replace(found, setup=rescaled(setup, run.innovations[not_blunders(run.innovations)])[0])
+        found = replace(found, setup=setup)
     flown, nodes = forward(run), smooth_nodes(run)
     changes, offset_s = [_change(nodes)], 0.0
     while (_bent(nodes) or abs(nodes.state[0, TIME_OFFSET]) > OFFSET_LEFT_S) and len(changes) < MOST_PASSES:
@@ -116,20 +121,13 @@ def solve(
     return Solved(flown, smoothed, report, run)
 
 
-def _by_the_flight(
-    inertial: Inertial, observations: StructArray, setup: Setup, start: Start, run: FilterRun
-) -> tuple[Setup, NoiseFound | None]:
-    """The setup, or one that goes by the noise of GNSS positions that a run with it showed; and what was tried."""
-    if setup.gnss_correlated_share > 0.0:
-        return by_moments(setup, run.innovations), None
-    if setup.gnss_sigma_scale:
-        return setup, None
-    found = _noise(inertial, observations, setup, start, run)
-    return (scaled(setup, found.best.scale, found.best.share) if found.changed else setup), found
-
-
 def _noise(inertial: Inertial, observations: StructArray, setup: Setup, start: Start, run: FilterRun) -> NoiseFound:
-    """Hypotheses compared on the first `STRETCH_S` seconds."""
+    """Find the noise on the first `STRETCH_S` seconds."""
+    return find_noise(run.innovations, stretch_of(inertial, observations, start), setup)
+
+
+def stretch_of(inertial: Inertial, observations: StructArray, start: Start) -> Run:
+    """Return what gives the innovations of the first `STRETCH_S` seconds with a setup, a row an observation."""
     end_ns = start.time_ns + round(STRETCH_S * SECOND_NS)
     part = inertial.between(0, int(np.searchsorted(inertial.time_ns, end_ns)))
     rows = observations[observations["time_ns"] < end_ns]
@@ -137,7 +135,7 @@ def _noise(inertial: Inertial, observations: StructArray, setup: Setup, start: S
     def stretch(asked: Setup) -> StructArray:
         return run_filter(part, rows, asked, start).innovations
 
-    return find_noise(run.innovations, stretch, setup)
+    return stretch
 
 
 def _attitude(nodes: SmoothedNodes) -> FloatArray:

@@ -101,6 +101,7 @@ PLACES: dict[str, Callable[[Figures, float], Any]] = {
     "unusable": lambda f, v: f["observations"]["velocity"].update(seen=1.0, unusable=v),
     "innovations large": lambda f, v: f["observations"]["position"].update(sigma_factor=v),
     "innovations small": lambda f, v: f["observations"]["position"].update(sigma_factor=1.0 / v),
+    "noise found": lambda f, v: f.update(noise_found={"positions, rtk fixed": v}),
     "innovations correlated": lambda f, v: f["observations"]["position"].update(correlation=v),
     "separation": lambda f, v: f["separation"].update(attitude=v),
     "separation at worst": lambda f, v: f["separation_worst"].update(position={"value": v, "at_s": 700.0}),

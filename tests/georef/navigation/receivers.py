@@ -1,0 +1,78 @@
+"""Receivers that tell their sigmas truly, too small, too large, or not; and the smoother that knows their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from georef.navigation.filter import run_filter
+from georef.navigation.inputs import GRADES, Kind, Setup, Solution
+from georef.navigation.smoother import smooth
+from georef.navigation.solve import Solved, solve
+from georef.records import StructArray
+from tests.georef.navigation.flights import Fixes, Truth, drawn_start, errors, noised
+from tests.georef.navigation.vehicles import ns
+
+FloatArray = NDArray[np.float64]
+ARM = np.array([0.35, -0.12, -1.1])
+SHARE, TAU_S = 0.5, 60.0  # of the positions' variance that lasts
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """What it measures and what it says of it.
+
+    Attributes:
+        fixes: true errors.
+        position_m, velocity_mps: sigmas that stand for those which it does not tell; None: it tells them.
+    """
+
+    fixes: Fixes
+    position_m: tuple[float, float, float] | None = None
+    velocity_mps: tuple[float, float, float] | None = None
+
+    def told(self, rows: StructArray, optimism: float) -> StructArray:
+        """Return its observations with the sigmas that are assumed of it: its own ones too small by a factor.
+
+        Of positions that have no sigma by itself, the true errors are as much larger than is usually assumed.
+        """
+        rows = rows.copy()
+        place, speed = rows["kind"] == Kind.POSITION, rows["kind"] == Kind.VELOCITY
+        rows["sigma"][place] = np.array(self.position_m or self.fixes.sigma_m) / optimism
+        rows["sigma"][speed] = self.velocity_mps or np.full(3, self.fixes.velocity_mps / optimism)
+        return rows
+
+
+RECEIVERS = {
+    "NovAtel": Receiver(Fixes((0.01, 0.01, 0.02), SHARE, TAU_S, 5.0, 0.02), velocity_mps=(0.03, 0.03, 0.06)),
+    "UBX": Receiver(Fixes((0.014, 0.014, 0.02), SHARE, TAU_S, 5.0, 0.03)),
+    "NMEA": Receiver(Fixes((0.01, 0.01, 0.02), SHARE, TAU_S, 1.0), position_m=(0.02, 0.02, 0.04)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One flight: by its own account of the noise, and by the smoother that is told the true one."""
+
+    solved: Solved
+    best: Solution
+
+    def squares(self, truth: Truth) -> tuple[FloatArray, FloatArray]:
+        """(9,) mean squares of errors: solved, best."""
+        found = []
+        for one in (self.solved.smoothed, self.best):
+            t = truth.edges[np.searchsorted(ns(truth.edges), one.time_ns)]
+            found.append((errors(truth, t, one.position_e, one.velocity_e, one.q_e_from_b) ** 2).mean(axis=0))
+        return found[0], found[1]
+
+
+def compared(truth: Truth, receiver: Receiver, grade: str, optimism: float, seed: int) -> Compared:
+    """Fly one flight of a receiver whose sigmas are too small by a factor."""
+    inertial, rows = noised(truth, GRADES[grade], receiver.fixes, ARM, seed)
+    start = drawn_start(truth, seed)
+    setup = Setup(GRADES[grade], ARM[None], gnss_correlated_share=SHARE, gnss_correlation_s=TAU_S)
+    knowing = replace(setup, position_floor_m=1e-3, velocity_floor_mps=1e-3)
+    best = smooth(run_filter(inertial, rows, knowing, start))
+    return Compared(solve(inertial, receiver.told(rows, optimism), setup, start), best)

@@ -1,0 +1,97 @@
+"""What a flight says of its receiver's noise: scales up and down by kind, fix type and axis; the share that lasts.
+
+Fifty flights of each kind are `python -m benchmarks.navigation_honesty --receivers`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
+from georef.navigation.noise import EVIDENCE, rescaled, second_moments
+from georef.records import FixType, StructArray
+from tests.georef.navigation.flights import Truth, fly, survey
+from tests.georef.navigation.receivers import RECEIVERS, SHARE, compared
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FIXED, FLOAT = int(FixType.RTK_FIXED), int(FixType.RTK_FLOAT)
+
+
+def innovations(
+    kind: Kind, fix: int, times: tuple[float, float, float], count: int = 900, seed: int = 4
+) -> StructArray:
+    """White ones, so many times as large as predicted."""
+    rows = np.zeros(count, INNOVATION_DTYPE)
+    rows["kind"], rows["fate"], rows["fix_type"], rows["dimension"] = kind, Fate.TAKEN, fix, 3
+    rows["time_ns"] = np.arange(count)
+    rows["normalised"] = times * np.random.default_rng(seed).standard_normal((count, 3))
+    rows["chi2"] = (rows["normalised"] ** 2).sum(axis=1)
+    return rows
+
+
+def test_sigmas_are_scaled_up_and_down_by_kind_fix_type_and_axis() -> None:
+    rows = np.concatenate(
+        [
+            innovations(Kind.POSITION, FIXED, (3.0, 3.0, 1.5)),
+            innovations(Kind.POSITION, FLOAT, (0.4, 0.4, 0.4)),
+            innovations(Kind.VELOCITY, FIXED, (0.15, 0.15, 0.3)),
+        ]
+    )
+    found, won = rescaled(Setup(GRADES["tactical"], gnss_sigma_scale={FIXED: 2.0}), rows)
+    assert found.gnss_sigma_scale == pytest.approx({FIXED: 6.0, FLOAT: 0.4}, rel=0.06)
+    assert found.gnss_vertical_scale == pytest.approx({FIXED: 0.5, FLOAT: 1.0}, rel=0.06)
+    assert found.gnss_velocity_scale == pytest.approx({FIXED: 0.15}, rel=0.06)
+    assert found.gnss_velocity_vertical_scale == pytest.approx({FIXED: 2.0}, rel=0.06)
+    assert min(won.values()) > EVIDENCE
+
+
+def test_what_chance_may_give_scales_nothing() -> None:
+    """Innovations as large as predicted; and fewer than sixty, whatever they are."""
+    setup = Setup(GRADES["tactical"])
+    few = innovations(Kind.VELOCITY, FIXED, (3.0, 3.0, 3.0), count=59)
+    rows = np.concatenate([innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0)), few])
+    assert rescaled(setup, rows) == (setup, {})
+
+
+def test_an_outlier_says_nothing_of_the_others() -> None:
+    rows = innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0))
+    rows["normalised"][100], rows["chi2"][100] = 60.0, 3 * 3600.0
+    assert second_moments(rows)[0][int(Kind.POSITION), FIXED, False] == pytest.approx(1.0, abs=0.1)
+
+
+def test_headings_are_compared_with_the_sigma_that_the_receiver_told() -> None:
+    """Theirs was made three times as large because neighbours repeat each other: innovations of a third are as told."""
+    setup = Setup(GRADES["tactical"], heading_repeats=3.0)
+    third, half = 1.0 / 3.0, 0.5
+    assert rescaled(setup, innovations(Kind.HEADING, FIXED, (third,) * 3))[0].gnss_heading_scale == 1.0
+    found, _ = rescaled(setup, innovations(Kind.HEADING, FIXED, (half,) * 3))
+    assert found.gnss_heading_scale == pytest.approx(1.5, rel=0.06)
+
+
+@cache
+def flight() -> Truth:
+    return fly(survey(), 240.0, 50.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("optimism", [1.0, 3.0, 1.0 / 3.0], ids=["honest", "optimistic", "pessimistic"])
+@pytest.mark.parametrize("name", RECEIVERS)
+def test_a_flight_is_navigated_as_if_its_noise_were_known(name: str, optimism: float) -> None:
+    """Errors are those of the smoother that is told the true noise, within a tenth over two flights; sigmas likewise.
+
+    The share that lasts is found to 0.12 where it is looked for often enough, and else assumed.
+    """
+    squares, sigmas = np.zeros((2, 9)), np.zeros((2, 3, 3))
+    for seed in range(2):
+        one = compared(flight(), RECEIVERS[name], "tactical", optimism, seed)
+        squares += one.squares(flight())
+        for row, found in enumerate((one.solved.smoothed, one.best)):
+            of = (found.position_sigma_l, found.velocity_sigma_l, found.attitude_sigma_rad)
+            sigmas[row] += [np.square(column).mean(axis=0) for column in of]
+        assert abs(one.solved.report.setup.gnss_correlated_share - SHARE) < 0.25
+    assert (np.sqrt(squares[0] / squares[1]) < 1.1).all()
+    np.testing.assert_allclose(np.sqrt(sigmas[0] / sigmas[1]), 1.0, atol=0.2)
