@@ -10,8 +10,11 @@ greatest Allan deviation of the drifting part of a bias, which is what data shee
 - mems: gyroscopes of an Analog Devices ADIS16488 (in run 6 °/h, 0.3 °/√h, axes to 0.05°), accelerometers of a Sensonor
   STIM300 (in run 0.05 mg, 0.07 m/s/√h); biases at turn-on and scale factors are those of a unit calibrated over
   temperature, not the sheets' repeatability over years.
+- consumer: InvenSense MPU-6050 (PS-MPU-6000A 3.4: accelerometers ±50 and ±80 mg, 400 µg/√Hz, scale factors ±3 %, across
+  axes ±2 %, taken for limits; gyroscopes 0.005 °/s/√Hz); the gyroscopes' bias lies between the 0.1 °/s (El-Sheimy and
+  Youssef 2020, Satellite Navigation 1:2) and 1 °/s (Xsens MTi-G) of such units.
 
-What is named above is of the makers' sheets; the instabilities of the first two grades, all misalignments and the
+What is named above is of the makers' sheets; the instabilities of the other grades, all other misalignments and the
 biases and scale factors of the third are of the size such units have, and of no sheet.
 """
 
@@ -62,6 +65,18 @@ GRADES = {
         gyro_scale_ppm=1000.0,
         accel_scale_ppm=1000.0,
         misalignment_mrad=0.5,
+    ),
+    "consumer": ImuNoiseTable(
+        angle_random_walk_deg_per_sqrt_h=0.5,
+        velocity_random_walk_m_per_s_per_sqrt_h=0.24,
+        gyro_bias_deg_per_h=1500.0,
+        accel_bias_mg=80.0,
+        gyro_bias_instability_deg_per_h=20.0,
+        accel_bias_instability_mg=0.2,
+        bias_correlation_h=1.0,
+        gyro_scale_ppm=10_000.0,
+        accel_scale_ppm=10_000.0,
+        misalignment_mrad=10.0,
     ),
     "perfect": ImuNoiseTable(
         angle_random_walk_deg_per_sqrt_h=0.0,

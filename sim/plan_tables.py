@@ -169,7 +169,7 @@ class ImuNoiseTable(Section):
 class ImuTable(Section):
     """``[imu.<name>]``: an IMU on CAN, described by a DBC of its own."""
 
-    grade: Literal["navigation", "tactical", "mems", "perfect"] = Field(
+    grade: Literal["navigation", "tactical", "mems", "consumer", "perfect"] = Field(
         "tactical", description="of its sensors; noise overrides it"
     )
     rate_hz: int = Field(200, ge=10, le=2000, description="of samples")

@@ -74,7 +74,7 @@ def command(
     wish = TrajectoryWish(
         logs,
         output,
-        NavigateWish(inputs, smooth=smooth, attitude_rad=attitude),
+        NavigateWish(inputs, smooth=smooth, attitude_rad=attitude, compare_noise=True),
         csv=csv,
         events=events,
         page=not no_page,
@@ -116,6 +116,8 @@ def _print(record: dict[str, Any], files: list[Path]) -> None:
             left = ", ".join(f"{count:,} {why.replace('_', ' ')}" for why, count in counts.items() if why != "taken")
             if left:
                 print(f"not as they came, {what}: {left}")
+        if session["imu"]["noise_words"]:
+            print(one_line(session["imu"]["noise_words"]))
         for leg in session["legs"]:
             print(f"start: {leg['start']['words']}")
             for finding in leg["findings"]:

@@ -129,7 +129,9 @@ class SignalsConfig(Section):
 class NoiseConfig(Section):
     """``[imu.<name>.noise]``: for the navigation filter; single keys override the grade."""
 
-    grade: Literal["navigation", "tactical", "mems"] = Field("tactical", description="gives what is absent below")
+    grade: Literal["navigation", "tactical", "mems", "consumer"] = Field(
+        "tactical", description="gives what is absent below"
+    )
     angle_random_walk_deg_per_sqrt_h: float | None = Field(None, ge=0.0, le=100.0, description="default: the grade's")
     velocity_random_walk_m_per_s_per_sqrt_h: float | None = Field(
         None, ge=0.0, le=100.0, description="default: the grade's"

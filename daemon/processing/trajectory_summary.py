@@ -58,13 +58,14 @@ class Page:
 def pages_of(flights: Sequence[Navigated]) -> Iterator[Page]:
     """A page a leg, in order."""
     for flight in flights:
-        notes = (*flight.doubts, *flight.holes)
+        noise = flight.inputs.sources.noise_words()
+        notes = (*((noise,) if noise else ()), *flight.doubts, *flight.holes)
         for number, leg in enumerate(flight.legs, start=1):
             title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
             smoothed = leg.solved.smoothed if flight.smooth else None
-            start, noise = start_words(leg.start), leg.noise_found()
+            start, found = start_words(leg.start), leg.noise_found()
             page = Flight(
-                title, leg.solved.forward, smoothed, leg.setup, start, noise, notes, missing_s=flight.missing_s
+                title, leg.solved.forward, smoothed, leg.setup, start, found, notes, missing_s=flight.missing_s
             )
             yield Page(page, leg.findings)
 
@@ -148,6 +149,9 @@ def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, 
             "sample": inputs.sources.imu.sample,
             "stamp": inputs.sources.imu.stamp,
             "rotation_b_imu": inputs.sources.rot_b_from_imu.tolist(),
+            "grade": inputs.sources.imu.noise.grade,
+            "noise_by_grade": inputs.sources.noise_by_grade,
+            "noise_words": inputs.sources.noise_words(),
         },
         "gnss": {
             "source": inputs.sources.gnss_source,

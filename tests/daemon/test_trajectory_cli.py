@@ -154,7 +154,9 @@ class TestSmoothed:
 
     def test_its_page_says_the_same(self, made: Path) -> None:
         page = (made / "a.html").read_text()
-        assert summary(made)["sessions"][0]["session"] in page
+        session = summary(made)["sessions"][0]
+        assert session["session"] in page
+        assert session["imu"]["noise_by_grade"] == {}  # the virtual aircraft's configuration has every key
         assert "data:image/png" in page
 
     def test_marks_are_where_the_aircraft_was(self, flown: Flown, made: Path) -> None:
@@ -235,10 +237,17 @@ class TestOtherwise:
         assert "body y reads +1 g" in told
         assert "rotation_b_imu" in told
 
-    def test_an_attitude_given_by_hand_starts_it(self, flown: Flown, tmp_path: Path) -> None:
-        flown.changed("alone.toml", **{"secondary_lever_arm_m": "# "})
-        arguments = ["-o", str(tmp_path / "a.sbet"), "--no-page", "--config", str(flown.folder / "alone.toml")]
+    def test_an_attitude_given_by_hand_starts_it(
+        self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """And a key of the noise that nobody set is named with its grade, on the page too."""
+        flown.changed("alone.toml", **{"secondary_lever_arm_m": "# ", "accel_scale_ppm": "# "})
+        capsys.readouterr()
+        arguments = ["-o", str(tmp_path / "a.sbet"), "--config", str(flown.folder / "alone.toml")]
         assert run_app(["trajectory", str(flown.log), *arguments, "--start", "-1.3,2.0,90.3", "--imu", "main"]) == 0
+        words = "(imu.main.noise sets none of these): accel_scale_ppm 300"
+        assert words in capsys.readouterr().out
+        assert words in (tmp_path / "a.html").read_text()
         (leg,) = summary(tmp_path)["sessions"][0]["legs"]
         assert leg["start"]["method"] == "given"
         _, attitude = errors(read(tmp_path, flown), flown.truth())

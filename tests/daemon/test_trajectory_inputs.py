@@ -16,6 +16,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from daemon.config import Config
+from daemon.config.tables import NoiseConfig
 from daemon.errors import ConfigError, UserError
 from daemon.log_parsers import stored_config
 from daemon.processing import navigation_doubts
@@ -30,7 +31,7 @@ from daemon.processing.navigation_observations import (
     ins_observations,
     white_factor,
 )
-from daemon.processing.navigation_sources import noise_of
+from daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
 from daemon.processing.navigation_times import counted_arrivals, imu_times
 from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
 from drivers.core.parser import DeviceSettings
@@ -462,6 +463,23 @@ def test_noise_is_the_grades_where_the_configuration_says_nothing(flown: Flown) 
     assert noise.misalignment == pytest.approx(2.5e-4)
     for name in ("angle_random_walk", "accel_bias", "bias_correlation_s", "gyro_scale"):
         assert getattr(noise, name) == getattr(GRADES["mems"], name)
+
+
+def test_keys_of_the_noise_that_a_grade_gives_are_named(flown: Flown) -> None:
+    """By their own units; none where all are set; and it is said where nobody chose the grade."""
+    sources = NavigationSources(flown.config, {})
+    keys = set(NoiseConfig.model_fields) - {"grade"}
+    table = {"imu": {"main": sources.imu.model_copy(update={"noise": NoiseConfig(gyro_bias_deg_per_h=2.0)})}}
+    bare = NavigationSources(without_scanners(flown.config, **table), {})
+    assert set(bare.noise_by_grade) == keys - {"gyro_bias_deg_per_h"}
+    assert bare.noise_by_grade["accel_bias_mg"] == 1.0
+    assert bare.noise_by_grade["misalignment_mrad"] == 0.1
+    assert bare.noise_by_grade["bias_correlation_h"] == 1.0
+    assert bare.noise_words().startswith("Noise by grade tactical, which nobody chose (imu.main.noise sets none of")
+    every = NoiseConfig.model_validate({"grade": "mems"} | dict.fromkeys(keys, 1.0))
+    table = {"imu": {"main": sources.imu.model_copy(update={"noise": every})}}
+    whole = NavigationSources(without_scanners(flown.config, **table), {})
+    assert (whole.noise_by_grade, whole.noise_words()) == ({}, "")
 
 
 WAYPOINT = """Project:     rover

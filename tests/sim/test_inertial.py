@@ -313,7 +313,7 @@ def test_samples_begin_with_the_flight_and_end_with_it() -> None:
 
 
 def test_grades_get_worse_and_single_keys_override_them() -> None:
-    order = ["perfect", "navigation", "tactical", "mems"]
+    order = ["perfect", "navigation", "tactical", "mems", "consumer"]
     for key in set(ImuNoiseTable.model_fields) - {"bias_correlation_h"}:
         values = [getattr(GRADES[grade], key) for grade in order]
         assert values == sorted(values), key
@@ -325,7 +325,10 @@ def test_grades_get_worse_and_single_keys_override_them() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('grade = "best"', r"^imu\.main\.grade: got 'best', want 'navigation', 'tactical', 'mems' or 'perfect'$"),
+        (
+            'grade = "best"',
+            r"^imu\.main\.grade: got 'best', want 'navigation', 'tactical', 'mems', 'consumer' or 'perfect'$",
+        ),
         ("noise = { gyro_bias = 1.0 }", r"^imu\.main\.noise\.gyro_bias: no such key$"),
         ("noise = { accel_bias_mg = -1.0 }", r"^imu\.main\.noise\.accel_bias_mg: got -1\.0, want greater"),
     ],
