@@ -99,7 +99,7 @@ class TestRefusals:
             (text_of(flight="speed_mps = nan"), "flight.speed_mps", "got nan, want"),
             (text_of(flight="origin_deg = [47.5]"), "flight.origin_deg", "at least 2 items"),
             (text_of(flight='turbulence = "stormy"'), "flight.turbulence", "got 'stormy', want 'none', 'light'"),
-            (text_of(more='[imu.main]\ngrade = "consumer"'), "imu.main.grade", "got 'consumer', want 'navigation'"),
+            (text_of(more='[imu.main]\ngrade = "toy"'), "imu.main.grade", "got 'toy', want 'navigation'"),
             (text_of(more='[gnss.rover]\ngrade = "dgps"'), "gnss.rover.grade", "got 'dgps', want 'rtk'"),
             (text_of(more='[scanner.left]\nkind = "galvo"'), "scanner.left.kind", "got 'galvo', want 'oscillating'"),
             (
