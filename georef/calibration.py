@@ -137,6 +137,17 @@ class Calibration:
     header: Mapping[str, Any] = field(default_factory=dict)
     held_sigmas: FloatArray = field(default_factory=lambda: np.zeros(len(PARAMETERS)))
 
+    @property
+    def is_nominal(self) -> bool:
+        """Return whether nobody estimated or judged it: its method is nominal, and the file says no verdict."""
+        return self.method == "nominal" and "verdict" not in self.header
+
+    def with_plausible_sigmas(self) -> Calibration:
+        """Return a nominal calibration with plausible sigmas of what nobody measured; others as they are."""
+        if not self.is_nominal or self.all_sigmas.any():
+            return self
+        return replace(self, held_sigmas=np.array([parameter.plausible for parameter in PARAMETERS]))
+
     def value(self, name: str) -> float:
         """A parameter by its name in SI units, as ``omega_rad``."""
         return float(self.parameters[INDEX[name]])

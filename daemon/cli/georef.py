@@ -9,7 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.cli.options import ForceCrs, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import (
+    AcceptVerdict,
+    ForceCrs,
+    ForceTrajectory,
+    TrajectoryDatum,
+    TrajectoryPoint,
+    TrajectoryWeek,
+)
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -49,6 +56,7 @@ def command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left there.")] = False,
     force_trajectory: ForceTrajectory = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="The sidecar to stdout, for scripts.")] = False,
 ) -> None:
     """Georeference logs: one LAZ file a strip, the trajectory, and a JSON file that says what they are made of.
@@ -81,6 +89,7 @@ def command(
         strips=strips,
         rules=StripRules(min_strip_s=min_strip),
         workers=workers or os.cpu_count() or 1,
+        accept_verdict=accept_verdict,
         scheduler=scheduler,
         sigmas=not no_sigma,
         copc=copc,
@@ -121,12 +130,17 @@ def _scanner_of(text: str, file: Path) -> str:
 
 
 def _tell(record: dict[str, Any], sidecar: Path, *, as_json: bool) -> None:
+    from daemon.processing.carried_verdict import first_lines, refusal
+
     if as_json:
         print(json.dumps(record, indent=2))
     else:
+        print(*(f"{one_line(line)}\n" for line in first_lines(record["verdict"])), sep="", end="")
         _print(record, sidecar)
-    if not record["complete"]:
-        raise UserError(f"{sidecar}: partial: " + "; ".join(map(one_line, record["holes"][:5])))
+    partial = [] if record["complete"] else ["partial: " + "; ".join(map(one_line, record["holes"][:5]))]
+    unusable = refusal(record["verdict"])
+    if partial or unusable:
+        raise UserError(f"{sidecar}: " + "; ".join([*partial, *([one_line(unusable)] if unusable else [])]))
 
 
 def _print(record: dict[str, Any], sidecar: Path) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daemon.cli.options import AcceptVerdict
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.places import DEFAULT_CONFIG, log_directory
 from daemon.processing.installed import require_installed
@@ -45,6 +46,7 @@ def command(
     points: Annotated[
         Path | None, typer.Option(metavar="FILE", help="All points as one array (.npy), for comparisons.")
     ] = None,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="The status as JSON, one object a line.")] = False,
 ) -> None:
     """Georeference what is being recorded, and show it.
@@ -57,11 +59,21 @@ def command(
     _check(where, output, replay=replay)
     paths = where or [DEFAULT_CONFIG]
     if replay:
-        _replay(paths, output or Path(), points, as_json=as_json)
+        _told(_replay(paths, output or Path(), points, accept_verdict=accept_verdict, as_json=as_json))
         return
-    found = _follow(paths[0], points, from_start=from_start, as_json=as_json)
+    found = _follow(paths[0], points, from_start=from_start, accept_verdict=accept_verdict, as_json=as_json)
     if "no end" in found["state"]:
         raise typer.Exit(int(ExitCode.PROBLEM))
+    _told(found)
+
+
+def _told(found: dict[str, Any]) -> None:
+    """UserError where the points were made with what is not to be used."""
+    from daemon.processing.carried_verdict import refusal
+
+    unusable = refusal(found.get("verdict") or {})
+    if unusable:
+        raise UserError(one_line(unusable))
 
 
 def _check(where: list[Path] | None, output: Path | None, *, replay: bool) -> None:
@@ -90,7 +102,9 @@ def _stop_signals() -> Iterator[list[int]]:
 # ---------------------------------------------------------------------------------------------- a recording
 
 
-def _follow(where: Path, points: Path | None, *, from_start: bool, as_json: bool) -> dict[str, Any]:
+def _follow(
+    where: Path, points: Path | None, *, from_start: bool, accept_verdict: bool, as_json: bool
+) -> dict[str, Any]:
     """Until it ends or is stopped; while loops compile, which looks at no list of signals, a signal ends it at once."""
     from rich.console import Console
 
@@ -113,9 +127,16 @@ def _follow(where: Path, points: Path | None, *, from_start: bool, as_json: bool
             print(one_line(warmed.text()), file=sys.stderr, flush=True)
         manager.notify(READY="1", STATUS="waiting for a recording to begin")
         live = LiveConfig() if config is None else config.tables.live
-        return Live(directory, live, tell, from_start=from_start, points=points, prepare=get_ready).run(
-            lambda: bool(stop)
+        following = Live(
+            directory,
+            live,
+            tell,
+            from_start=from_start,
+            points=points,
+            prepare=get_ready,
+            accept_verdict=accept_verdict,
         )
+        return following.run(lambda: bool(stop))
 
 
 def _tell_of_compiling() -> None:
@@ -184,7 +205,9 @@ def page(found: dict[str, Any]) -> Group:
 # ---------------------------------------------------------------------------------------------- finished logs
 
 
-def _replay(paths: list[Path], output: Path, points: Path | None, *, as_json: bool) -> None:
+def _replay(
+    paths: list[Path], output: Path, points: Path | None, *, accept_verdict: bool, as_json: bool
+) -> dict[str, Any]:
     from daemon.config import load_config
     from daemon.log.format import LogError
     from daemon.log.reader import open_logs
@@ -206,5 +229,6 @@ def _replay(paths: list[Path], output: Path, points: Path | None, *, as_json: bo
     options = Options(uncertainty=False)
     setup = Setup.of_log(sessions[0].attachments(), options) if config is None else Setup.of_config(config, options)
     live: LiveConfig = setup.config.tables.live
-    found = replay(sessions[0], setup, output, live, points)
+    found = replay(sessions[0], setup, output, live, points, accept_verdict=accept_verdict)
     print(json.dumps(found, indent=2) if as_json else found["sentence"])
+    return found

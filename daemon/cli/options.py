@@ -19,3 +19,6 @@ ForceTrajectory = Annotated[
 ForceCrs = Annotated[
     bool, typer.Option("--force-crs", help="Take a CRS outside its area of use, or 0.5 % off in scale.")
 ]
+AcceptVerdict = Annotated[
+    bool, typer.Option("--accept-verdict", help="Exit 0 although trajectory or calibration are judged not to be used.")
+]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.cli.options import ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -65,6 +65,7 @@ def command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what an adjustment left there.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Compare strips: point to plane and gridded, what the differences look like, and what specifications say.
@@ -96,6 +97,7 @@ def command(
         config=None if config is None else load_config(config),
         strips=strips,
         workers=workers or os.cpu_count() or 1,
+        accept_verdict=accept_verdict,
     )
     if adjust is not None:
         _refuse_besides(("--before", before), ("--output", output), ("--level", level), ("--cell", cell))

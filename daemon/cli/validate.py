@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -52,6 +52,7 @@ def command(
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     force_trajectory: ForceTrajectory = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Validate a calibration by ISO/TS 19159-2, 6.8: six methods, each with numbers, a test and a sentence.
@@ -85,6 +86,7 @@ def command(
             config=None if config is None else load_config(config),
             strips=strips,
             workers=workers or os.cpu_count() or 1,
+            accept_verdict=accept_verdict,
         ),
         control=control,
         histories=past or (),

@@ -12,6 +12,13 @@ import numpy as np
 from daemon.errors import ConfigError, ExitCode, UserError
 from daemon.log.reader import Session, open_logs
 from daemon.processing import refusals
+from daemon.processing.carried_verdict import (
+    Carried,
+    calibration_verdicts,
+    file_verdicts,
+    navigated_verdicts,
+    verdict_entry,
+)
 from daemon.processing.feed import LogClocks, read_clocks
 from daemon.processing.flown import TrajectoryWish, choose_trajectory
 from daemon.processing.head_clocks import find_stamps, stamp_lines
@@ -49,6 +56,7 @@ class Wish:
         scale: of the coordinates, in the coordinate system's units.
         overwrite: products of an earlier run are replaced.
         write_dropped: returns that are left out are written too, flagged or in a list.
+        accept_verdict: what is judged not to be used is no problem.
     """
 
     logs: Sequence[Path]
@@ -65,6 +73,7 @@ class Wish:
     scale: float = 0.001
     overwrite: bool = False
     write_dropped: bool = False
+    accept_verdict: bool = False
 
     def record(self) -> dict[str, Any]:
         """For the sidecar: what it was, but for what does not matter to the points."""
@@ -97,6 +106,8 @@ class Flight:
         navigated: what the trajectory was smoothed from; None: it comes from elsewhere.
         strips: spans of log time, and the number of the first.
         lost: units that the recorder lost, by source.
+        verdicts: on its calibrations and its trajectory, those that are not good; `trajectory_verdicts` of them on the
+            latter, and `source` where that is from: ``navigated``, ``ins`` or ``file``.
         troubles: with time or trajectory, a line each.
         holes: what will be missing, a line each.
     """
@@ -115,6 +126,9 @@ class Flight:
     lost: dict[str, int] = field(default_factory=dict)
     troubles: list[str] = field(default_factory=list)
     holes: list[str] = field(default_factory=list)
+    verdicts: list[Carried] = field(default_factory=list)
+    trajectory_verdicts: list[Carried] = field(default_factory=list)
+    source: str = ""
 
     @property
     def log(self) -> Path:
@@ -222,6 +236,7 @@ def _choose(wish: Wish, flight: Flight) -> None:
     chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
     flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
     flight.troubles += chosen.doubts
+    _judge(wish, flight)
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)
     places_e = within.position_e[:: max(1, len(within) // 100)]
@@ -231,6 +246,23 @@ def _choose(wish: Wish, flight: Flight) -> None:
         lines = refusals.of_log(flight.log, [misfit], wish.options)
         raise UserError(f"{lines[0]}; --force-crs takes it as it is", ExitCode.USAGE)
     flight.troubles += [misfit] if misfit else []
+
+
+def _judge(wish: Wish, flight: Flight) -> None:
+    """The verdicts that what is made of the flight has to carry."""
+    if wish.trajectory.file is not None:
+        flight.trajectory_verdicts, flight.source = file_verdicts(wish.trajectory.file, flight.span)
+    elif flight.navigated is not None:
+        flight.trajectory_verdicts, flight.source = list(navigated_verdicts(flight.navigated)), "navigated"
+    else:
+        flight.source = "ins"
+    flight.verdicts = [*flight.trajectory_verdicts, *calibration_verdicts(flight.setup, flight.source)]
+
+
+def verdict_of(wish: Wish, flights: Sequence[Flight]) -> dict[str, Any]:
+    """Return the verdict on a run, as its record says it: each reason once."""
+    carried = list(dict.fromkeys(one for flight in flights for one in flight.verdicts))
+    return verdict_entry(carried, accepted=wish.accept_verdict)
 
 
 def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:

@@ -18,6 +18,7 @@ from daemon.errors import ExitCode, UserError, one_line
 from daemon.log.chunks import LogBatch
 from daemon.log.format import SessionInfo
 from daemon.log.reader import Session
+from daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
 from daemon.processing.feed import LogFeed, Placed
 from daemon.processing.live_follow import LiveFollower, Skipped
 from daemon.processing.live_points import PointsFile
@@ -64,6 +65,7 @@ class LiveSession:
 
     Attributes:
         now_ns: host time as far as the log has been read; `live` reads the clock instead.
+        verdict: on the calibrations, as the status says it.
     """
 
     def __init__(
@@ -75,9 +77,11 @@ class LiveSession:
         points: Path | None,
         *,
         beside_recorder: bool = False,
+        accept_verdict: bool = False,
     ) -> None:
         """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
         self.info = info
+        self.verdict = verdict_entry(list(calibration_verdicts(setup)), accepted=accept_verdict)
         self.now_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
@@ -146,6 +150,7 @@ class Live:
         live: what is written.
         tell: takes the status each second, with its ``sentence``.
         prepare: called with the recording's setup before the first of its messages is taken, to compile what it needs.
+        accept_verdict: a calibration that is not to be used is taken.
     """
 
     def __init__(
@@ -157,7 +162,9 @@ class Live:
         from_start: bool = False,
         points: Path | None = None,
         prepare: Callable[[Setup], None] | None = None,
+        accept_verdict: bool = False,
     ) -> None:
+        self._accept_verdict = accept_verdict
         self._directory, self._live, self._tell, self._points = directory, live, tell, points
         self._prepare = prepare
         self._follower = LiveFollower(directory, from_start=from_start)
@@ -194,7 +201,13 @@ class Live:
             if self._prepare is not None:
                 self._prepare(setup)
             self._session = made_session(
-                setup, part.info, self._directory / FOLDER, self._live, self._points, beside_recorder=True
+                setup,
+                part.info,
+                self._directory / FOLDER,
+                self._live,
+                self._points,
+                beside_recorder=True,
+                accept_verdict=self._accept_verdict,
             )
         self._session.take(item, live=True)
 
@@ -219,7 +232,8 @@ class Live:
         found: Told = {"state": state, "directory": str(self._directory), **self._about()}
         if self._session is not None:
             now_ns = self._session.host_now_ns(live=True)
-            found |= {"time_ns": now_ns} | self._session.status.plain(self._follower, now_ns)
+            found |= {"time_ns": now_ns, "verdict": self._session.verdict}
+            found |= self._session.status.plain(self._follower, now_ns)
             if self._session.points is not None and self._session.points.trouble:
                 found["points_file"] = self._session.points.trouble
         found["sentence"] = one_line(sentence(found))
@@ -244,10 +258,13 @@ def made_session(
     points: Path | None,
     *,
     beside_recorder: bool = False,
+    accept_verdict: bool = False,
 ) -> LiveSession:
     """A session; UserError where its folder cannot be written to."""
     try:
-        session = LiveSession(setup, info, folder, live, points, beside_recorder=beside_recorder)
+        session = LiveSession(
+            setup, info, folder, live, points, beside_recorder=beside_recorder, accept_verdict=accept_verdict
+        )
         session.look_for_room()
         return session
     except OSError as error:
@@ -263,6 +280,8 @@ def replay(
     points: Path | None,
     tell: Callable[[int], None] | None = None,
     batches: Iterable[LogBatch] | None = None,
+    *,
+    accept_verdict: bool = False,
 ) -> Told:
     """The same over a finished session, as fast as it goes; the last status, which also stands in ``folder``.
 
@@ -271,11 +290,12 @@ def replay(
         points: where all points go; None: nowhere.
         tell: takes the log time reached.
         batches: instead of the session's own, cut otherwise.
+        accept_verdict: a calibration that is not to be used is taken.
 
     Raises:
         UserError: nothing can be written.
     """
-    run = made_session(setup, session.info, folder, live, points)
+    run = made_session(setup, session.info, folder, live, points, accept_verdict=accept_verdict)
     try:
         for batch in session.batches() if batches is None else batches:
             run.take(batch, live=False)
@@ -284,7 +304,8 @@ def replay(
         run.close(live=False)
         about = {"session_id": session.session_id, "part": session.parts[-1].number}
         run.products.save_coverage(about)
-        found: Told = {"state": "replayed", **about, "time_ns": run.now_ns} | run.status.plain(None, run.now_ns)
+        found: Told = {"state": "replayed", **about, "time_ns": run.now_ns, "verdict": run.verdict}
+        found |= run.status.plain(None, run.now_ns)
         found["damaged_chunks"] = len(session.damage)
         found["sentence"] = one_line(sentence(found))
         write_status(folder, found)

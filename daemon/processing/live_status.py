@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.log.chunks import LogBatch
+from daemon.processing.carried_verdict import first_lines
 from daemon.processing.live_follow import BEHIND_NS, LiveFollower
 from daemon.processing.live_products import LiveProducts, replace_file
 from daemon.processing.setup import Setup
@@ -164,7 +165,12 @@ def sentence(found: dict[str, Any]) -> str:
     if "points" not in found:
         return str(found["state"])
     rate = sum(found["points_per_s"].values())
-    parts = [f"{found['state']} {found['session_id']}", f"{sum(found['points'].values()):,} points, {rate:,} a second"]
+    unusable = first_lines(found.get("verdict") or {})[:1]
+    parts = [
+        *unusable,
+        f"{found['state']} {found['session_id']}",
+        f"{sum(found['points'].values()):,} points, {rate:,} a second",
+    ]
     worst_s = _behind_s(found)
     if worst_s is not None:
         late = "LATE: " if worst_s > LATE_S else ""

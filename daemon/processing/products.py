@@ -25,7 +25,7 @@ import numpy as np
 from daemon.errors import ExitCode, UserError
 from daemon.log.durable import sync_file, try_sync_directory
 from daemon.processing import refusals
-from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights
+from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights, verdict_of
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from daemon.processing.quicklook_sidecar import read_sidecar, sessions_in
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
@@ -230,6 +230,7 @@ def _make(
     done = [path for made in files.values() for path in made if path is not None]
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
     record = run_record(flights, results, files)
+    record["verdict"] = verdict_of(wish, flights)
     record |= {"logs": logs, "files": [path.name for path in trajectories], "options": wish.record()}
     into_place([*done, *trajectories])
     sidecar = wish.output / f"{name}.json"

@@ -378,7 +378,7 @@ class Setup:
             return make_georeferencer(
                 self.config,
                 name,
-                self.calibrations[name],
+                self.calibrations[name].with_plausible_sigmas(),
                 parser,
                 self._files(name, self.config.scanner[name]).get("geometry"),
                 self.mapping,

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = "swath.georef"
 FORMAT_VERSION = 1
+CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # of a calibration's header
 IN_FILES = Fate.GEOREFERENCED.name.lower()
 UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
 _HASH_BLOCK = 1 << 20
@@ -43,7 +44,8 @@ def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
     """A calibration with all its parameters, in the units of its file."""
     parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
-    return {"id": calibration.id, "method": calibration.method, "parameters": parameters}
+    said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
+    return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
 
 
 def settings_entry(setup: Setup) -> dict[str, Any]:
@@ -166,6 +168,8 @@ def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any
         "returns_gps_ns": list(flight.span),
         "trajectory": {
             "name": trajectory.name,
+            "source": flight.source,
+            "verdict": [{"level": one.level.words, "what": one.sentence} for one in flight.trajectory_verdicts],
             "epochs": len(trajectory),
             "solutions": flight.solutions,
             "first_gps_ns": first_ns,

@@ -28,6 +28,7 @@ from calib.strip_cells import (
 )
 from calib.trajectory_errors import TrajectoryPrior
 from daemon.errors import ExitCode, UserError
+from daemon.processing.carried_verdict import Carried
 from daemon.processing.quicklook import Look, StripFacts, look_at
 from daemon.processing.quicklook_grids import Surface, cell_for, frame_of
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
@@ -60,6 +61,7 @@ class Strips:
         seen: where from; None: no trajectory is known.
         prior: joint covariance of the trajectory's errors; None: it is not known.
         notes: what the user should know.
+        carried: verdicts on what the points were made with, those that are not good.
     """
 
     what: str
@@ -69,6 +71,7 @@ class Strips:
     seen: SeenFrom | None
     prior: TrajectoryPrior | None = None
     notes: list[str] = field(default_factory=list)
+    carried: list[Carried] = field(default_factory=list)
 
 
 def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Strips:

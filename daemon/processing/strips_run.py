@@ -15,6 +15,7 @@ from calib.strip_cells import StripRules
 from calib.strips import Numbers, PairReport, StripReport, report_of
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibration_flight import read_flight, smoothed_prior
+from daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, verdict_entry
 from daemon.processing.flights import Wish
 from daemon.processing.json_values import finite
 from daemon.processing.strip_agreement import Agreement, difference_of
@@ -75,13 +76,14 @@ def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
         now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
         then = _judged(_read(wish.before, wish, folder / "before", told), wish, told) if wish.before else None
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
+    record["verdict"] = verdict_entry(now.strips.carried, accepted=wish.logs.accept_verdict)
     pictures = _draw(wish, now, then)
     if wish.output is not None:
         record["pictures"] = [str(path) for path in pictures]
         path = wish.output / RECORD
         path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    lines = [*now.lines(then), *map(str, pictures)]
-    return Compared(record, lines, now.problem(wish.level))
+    lines = [*first_lines(record["verdict"]), *now.lines(then), *map(str, pictures)]
+    return Compared(record, lines, "; ".join(filter(None, (refusal(record["verdict"]), now.problem(wish.level)))))
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
@@ -115,13 +117,16 @@ def _kind(path: Path) -> str:
 
 def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> Strips:
     if not is_of_logs(paths):
-        return strips_of_files(paths, wish.rules, told)
+        strips = strips_of_files(paths, wish.rules, told)
+        strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
+        return strips
     folder.mkdir(parents=True, exist_ok=True)
     kept = read_flight(replace(wish.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
     mapping = kept.logged[0].setup.mapping
     strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
     strips.notes.extend(kept.holes)
+    strips.carried.extend(dict.fromkeys(one for flight in kept.logged for one in flight.verdicts))
     return strips
 
 

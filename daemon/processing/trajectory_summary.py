@@ -128,8 +128,15 @@ def summary_of_run(
     )
     return head | {
         "events": None if events is None else dict(sorted(events.fates.items())),
+        "verdict": _worst(verdicts),
         "sessions": [_session(flight, judged) for flight in flights],
     }
+
+
+def _worst(verdicts: Sequence[Any]) -> dict[str, Any]:
+    """Return the verdict on the whole: that of the worst leg, with what of it `swath georef` and others repeat."""
+    worst = max(verdicts, key=lambda verdict: verdict.level)
+    return {"level": worst.level.name.lower(), "sentence": worst.sentence}
 
 
 def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, Any]:
@@ -140,6 +147,7 @@ def _session(flight: Navigated, judged: Iterator[tuple[Any, Any]]) -> dict[str, 
         "start": utc_text(inputs.session.info.realtime_ns),
         "recorder": inputs.session.info.software,
         "origin": inputs.session.info.origin or "recording",
+        "installation": inputs.sources.config.profile.installation,
         "imu": {
             "source": inputs.sources.imu_source,
             "samples": dict(sorted(inputs.samples.items())),

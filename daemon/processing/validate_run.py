@@ -26,6 +26,7 @@ from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, prior_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from daemon.processing.carried_verdict import Carried, first_lines, refusal, verdict_entry
 from daemon.processing.flights import Wish
 from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
@@ -82,6 +83,7 @@ class _Found:
     logs: list[tuple[str, str]] = field(default_factory=list)
     documents: Mapping[str, Document] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    carried: list[Carried] = field(default_factory=list)
 
 
 def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
@@ -139,6 +141,7 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
 def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -> None:
     kept = read_flight(wish.logs, folder, told)
     refuse_installations(kept.logged)
+    found.carried += dict.fromkeys(one for flight in kept.logged for one in flight.verdicts)
     _refuse_others(wish, found, kept)
     flight = kept.flight
     points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])
@@ -235,8 +238,9 @@ def _anew(
 
 def _written(wish: ValidateWish, found: _Found) -> Validated:
     record: dict[str, Any] = {"calibrations": {name: one.id for name, one in found.calibrations.items()}}
-    lines: list[str] = []
-    wrong: list[str] = []
+    record["verdict"] = verdict_entry(found.carried, accepted=wish.logs.accept_verdict)
+    lines: list[str] = first_lines(record["verdict"])
+    wrong: list[str] = list(filter(None, [refusal(record["verdict"])]))
     if found.validation is not None:
         record["validation"] = _record(found.validation)
         lines += [method.sentence for method in found.validation.methods] + [found.validation.sentence]

@@ -113,7 +113,18 @@ def test_points_in_the_map_differ_by_projs_last_places_only(
 
 @pytest.mark.parametrize("scale_m", [1e-3, FINE_SCALE_M])
 def test_files_of_points_are_within_a_unit_of_their_scale(flight: Path, tmp_path: Path, scale_m: float) -> None:
-    words = ("daemon.cli.main", "georef", flight, "-o", "{}", "--scale", f"{scale_m:f}", "--workers", "1")
+    words = (
+        "daemon.cli.main",
+        "georef",
+        flight,
+        "--accept-verdict",
+        "-o",
+        "{}",
+        "--scale",
+        f"{scale_m:f}",
+        "--workers",
+        "1",
+    )
     both = on_both(tmp_path, *words)
     (path,) = both.host.glob("*.laz")
     host, arm64 = laspy.read(path), laspy.read(both.arm64 / path.name)

@@ -401,3 +401,24 @@ class TestRefusals:
         log.write_bytes(renamed)
         line = refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", str(log)))
         assert "two recordings of one time" in line
+
+
+def test_points_of_a_nominal_calibration_end_with_a_first_line_and_exit_code_1(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = flown.arguments(tmp_path / "points")
+    arguments[arguments.index("--calibration") + 1] = str(flown.folder / "left.nominal.toml")
+    capsys.readouterr()
+    assert run_app(arguments) == 1
+    said = capsys.readouterr()
+    first = said.out.splitlines()[0]
+    assert first.startswith("not to be used: calibration ")
+    assert "is nominal: points may lie 2.5 m off for 100 m of range" in first
+    assert "--accept-verdict" in said.err
+    told = record(tmp_path / "points")
+    assert told["complete"]
+    assert told["verdict"]["level"] == "not to be used"
+    las = laspy.read(next((tmp_path / "points").glob("*.laz")))
+    assert np.median(las["sigma_northing"]) > 1.0  # a degree at 100 m and more
+    assert run_app([*arguments, "--overwrite", "--accept-verdict"]) == 0
+    assert record(tmp_path / "points")["verdict"]["accepted"]

@@ -327,7 +327,7 @@ class TestCommand:
         for path in flown.paths:
             (logs / path.name).symlink_to(path.absolute())
         (logs / "empty.mcap").touch()  # as a power cut leaves one
-        done = swath("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json")
+        done = swath("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json", "--accept-verdict")
         assert done.returncode == 0, done.stderr
         assert f"passed over: {logs}/empty.mcap: " in done.stderr
         found = json.loads(done.stdout)

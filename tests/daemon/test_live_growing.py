@@ -43,9 +43,10 @@ def running(*words: str | Path, output: IO[str] | int = subprocess.DEVNULL) -> I
 def config_of(wires: Path, folder: Path) -> str:
     """The configuration that reads a flight's wires, and its files beside it."""
     wait_until((wires / "pps-main").exists, "the last of the wires")
-    for path in [*wires.glob("*.nominal.toml"), wires / "main.dbc"]:
+    for path in [*wires.glob("*.true.toml"), wires / "main.dbc"]:
         (folder / path.name).write_bytes(path.read_bytes())
     text = (wires / "swath.toml").read_text().replace('"novatel"', '"novatel"\ndatum = "same"')
+    text = text.replace(".nominal.toml", ".true.toml")
     head = session_table(folder / "logs", name='"growing"', split_minutes=PART_MINUTES)
     return text.replace(text[: text.index("[pps.main]")], head)
 

@@ -39,7 +39,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a live run over the beginning of a virtual flight."""
     folder = tmp_path_factory.mktemp("foxglove")
     swath("sim", "fly", "small", "--seconds", "14", "-o", folder / "flight")
-    swath("live", "--replay", folder / "flight", "-o", folder / "live", "--json")
+    swath("live", "--replay", folder / "flight", "-o", folder / "live", "--json", "--accept-verdict")
     return folder / "live"
 
 

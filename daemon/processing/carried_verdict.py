@@ -1,0 +1,195 @@
+"""The verdict that travels: what was judged of a trajectory or a calibration is told of everything made with it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daemon.processing.navigation_figures import figures_of
+from daemon.processing.navigation_series import Flight, separation_of
+from daemon.processing.navigation_verdict import Level, judge
+from georef.calibration import INDEX
+
+if TYPE_CHECKING:
+    from daemon.processing.navigate import Navigated
+    from daemon.processing.setup import Setup
+    from georef.calibration import Calibration
+
+LEVELS = {level.words: level for level in Level}
+OF_TRAJECTORY, OF_POINTS = "swath.trajectory", "swath.georef"  # formats of summaries and sidecars
+SOURCES = {"smoothed": "navigated", "realtime": "navigated", "as-is": "ins"}  # by a trajectory's summary
+MADE_WITH = {"navigated": "a trajectory navigated from IMU and GNSS", "ins": "the device's own INS", "file": "a file"}
+TRAJECTORY_ENDS = ("_trajectory.csv", "_trajectory.sbet")
+RANGE_M = 100.0  # for which the error of a nominal calibration is told
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A verdict on something that products are made with.
+
+    Attributes:
+        level: not good.
+        sentence: of what it is, and why; without the level's words.
+    """
+
+    level: Level
+    sentence: str
+
+    @property
+    def line(self) -> str:
+        """Return it with its level, as a first line says it."""
+        return f"{self.level.words}: {self.sentence}"
+
+
+def verdict_entry(carried: Sequence[Carried], *, accepted: bool) -> dict[str, Any]:
+    """Return what a sidecar or a record says."""
+    level = max((one.level for one in carried), default=Level.GOOD)
+    reasons = [{"level": one.level.words, "what": one.sentence} for one in carried]
+    return {"level": level.words, "reasons": reasons, "accepted": accepted and level is Level.UNUSABLE}
+
+
+def first_lines(entry: Mapping[str, Any]) -> list[str]:
+    """Return a line for each reason of an entry, the worst first."""
+    reasons = sorted(entry.get("reasons", []), key=lambda one: -LEVELS.get(one["level"], Level.GOOD))
+    return [f"{one['level']}: {one['what']}" for one in reasons]
+
+
+def refusal(entry: Mapping[str, Any]) -> str:
+    """Return the line that makes a command's exit code 1; empty: it is good enough, or accepted."""
+    if entry.get("level") != Level.UNUSABLE.words or entry.get("accepted"):
+        return ""
+    return f"{first_lines(entry)[0]}; --accept-verdict takes it all the same"
+
+
+# ---------------------------------------------------------------------- calibrations
+
+
+def calibration_verdicts(setup: Setup, source: str = "") -> Iterator[Carried]:
+    """Yield what is to be said of a setup's calibrations.
+
+    Args:
+        setup: of a log.
+        source: of its trajectory, ``navigated``, ``ins`` or ``file``; empty: not known.
+    """
+    flown = setup.config.profile.installation
+    for name, calibration in setup.calibrations.items():
+        header = calibration.header
+        level, reasons = LEVELS.get(str(header.get("verdict", "")), Level.GOOD), header.get("verdict_reasons")
+        why = f": {reasons[0]}" if isinstance(reasons, list) and reasons else ""
+        if calibration.is_nominal:
+            yield Carried(Level.UNUSABLE, nominal_words(name, calibration))
+        elif level is not Level.GOOD:
+            yield Carried(level, f"calibration {calibration.id} of {name}{why}")
+        made = str(header.get("installation", ""))
+        if made and flown and made != flown:
+            yield Carried(
+                Level.UNUSABLE,
+                f'calibration {calibration.id} of {name}: is of installation "{made}", the log of "{flown}"; want '
+                "that of this mounting",
+            )
+        before = str(header.get("trajectory", ""))
+        if {before, source} == {"navigated", "ins"}:
+            yield Carried(
+                Level.CARE,
+                f"calibration {calibration.id} of {name}: was made with {MADE_WITH[before]}, here is "
+                f"{MADE_WITH[source]}, whose alignment is another; want the same (swath trajectory, --trajectory)",
+            )
+
+
+def nominal_words(name: str, calibration: Calibration) -> str:
+    """Return what a calibration that nobody estimated is good for."""
+    sigmas = calibration.with_plausible_sigmas().all_sigmas
+    off_m = RANGE_M * math.hypot(sigmas[INDEX["omega_rad"]], sigmas[INDEX["phi_rad"]])
+    return (
+        f"calibration {calibration.id} of {name} is nominal: points may lie {off_m:.1f} m off for {RANGE_M:g} m of "
+        "range (one sigma); calibrate (swath calibrate), or give --calibration FILE"
+    )
+
+
+# ---------------------------------------------------------------------- trajectories
+
+
+def navigated_verdicts(flight: Navigated) -> Iterator[Carried]:
+    """Yield the verdict on each leg of what was navigated here."""
+    for number, leg in enumerate(flight.legs, start=1):
+        title = flight.session_id if len(flight.legs) == 1 else f"{flight.session_id}, leg {number}"
+        smoothed = leg.solved.smoothed if flight.smooth else None
+        seen = Flight(title, leg.solved.forward, smoothed, leg.setup, "", leg.noise_found())
+        verdict = judge(figures_of(seen, separation_of(seen)), leg.findings)
+        if verdict.level is not Level.GOOD:
+            yield Carried(verdict.level, f"navigated trajectory of {title}: {_reason(verdict.as_dict())}")
+
+
+def file_verdicts(file: Path, span_ns: tuple[int, int]) -> tuple[list[Carried], str]:
+    """Return what the summary or the sidecar beside a trajectory's file says of it for a span of GPS time.
+
+    Also where the trajectory came from: ``navigated``, ``ins``, or ``file`` where nothing beside it says.
+    """
+    for beside in _beside(file):
+        record = _read(beside)
+        if record.get("format") == OF_TRAJECTORY:
+            legs = [leg for session in record.get("sessions", []) for leg in session.get("legs", [])]
+            return list(_of_legs(file, legs, span_ns)), SOURCES.get(str(record.get("solution")), "file")
+        if record.get("format") == OF_POINTS:
+            return _of_sidecar(file, record, span_ns)
+    return [], "file"
+
+
+def _beside(file: Path) -> list[Path]:
+    named = [file.with_suffix(".json")]
+    named += [
+        file.with_name(file.name.removesuffix(end) + ".json") for end in TRAJECTORY_ENDS if file.name.endswith(end)
+    ]
+    return named
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _of_legs(file: Path, legs: Sequence[Mapping[str, Any]], span_ns: tuple[int, int]) -> Iterator[Carried]:
+    for leg in legs:
+        verdict = leg.get("verdict") or {}
+        level = Level.__members__.get(str(verdict.get("level", "")).upper(), Level.GOOD)
+        there = leg.get("first_gps_ns", 0) <= span_ns[1] and leg.get("last_gps_ns", 1 << 62) >= span_ns[0]
+        if there and level is not Level.GOOD:
+            yield Carried(level, f"trajectory {file}: {_reason(verdict)}")
+
+
+def _of_sidecar(file: Path, record: Mapping[str, Any], span_ns: tuple[int, int]) -> tuple[list[Carried], str]:
+    """Return the trajectory's verdict by the sidecar of points that were made with it."""
+    carried: list[Carried] = []
+    source = "file"
+    for flight in record.get("flights", []):
+        told = flight.get("trajectory", {})
+        if told.get("first_gps_ns", 0) <= span_ns[1] and told.get("last_gps_ns", 1 << 62) >= span_ns[0]:
+            source = str(told.get("source", source))
+            carried += [
+                Carried(LEVELS[one["level"]], f"trajectory {file}: {one['what']}")
+                for one in told.get("verdict", [])
+                if one.get("level") in LEVELS
+            ]
+    return carried, source if source in MADE_WITH else "file"
+
+
+def _reason(verdict: Mapping[str, Any]) -> str:
+    """Return the worst reason and what to do about it."""
+    reasons = verdict.get("reasons") or [{"what": verdict.get("sentence", "")}]
+    change = reasons[0].get("change")
+    return f"{reasons[0]['what']}" + (f"; {change}" if change else "")
+
+
+def points_verdicts(sidecars: Sequence[Mapping[str, Any]]) -> list[Carried]:
+    """Return what the sidecars beside points say of them, each reason once; files of others say nothing."""
+    told = [sidecar.get("verdict") for sidecar in sidecars if sidecar.get("format") == OF_POINTS]
+    reasons = [one for verdict in told if isinstance(verdict, dict) for one in verdict.get("reasons", [])]
+    found = [Carried(LEVELS[one["level"]], str(one["what"])) for one in reasons if one.get("level") in LEVELS]
+    return list(dict.fromkeys(found))
