@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +21,8 @@ from daemon.cli import validate
 from daemon.errors import ExitCode, UserError
 from daemon.processing import validate_run
 from daemon.processing.calibration_flight import KeptFlight
+from daemon.processing.carried_verdict import Carried
+from daemon.processing.navigation_verdict import Level
 from georef.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.calib.cast_flight import Cast, cast_flight
 
@@ -118,12 +120,31 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
             log=path,
             navigated=None,
             setup=SimpleNamespace(config=SimpleNamespace(profile=profile)),
+            verdicts=[],
             session=SimpleNamespace(parts=[SimpleNamespace(path=path)]),
         )
         return KeptFlight(flight, [logged], [])
 
     monkeypatch.setattr(validate_run, "read_flight", read)
     return path
+
+
+def test_a_trajectory_that_is_not_to_be_used_is_the_first_line_and_a_problem(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = cast(Any, validate_run).read_flight
+
+    def judged(*given: Any) -> KeptFlight:
+        kept: KeptFlight = plain(*given)
+        cast(Any, kept.logged[0]).verdicts.append(Carried(Level.UNUSABLE, "navigated trajectory: lever arm"))
+        return kept
+
+    monkeypatch.setattr(validate_run, "read_flight", judged)
+    arguments = (str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log))
+    with pytest.raises(UserError, match=r"^not to be used: navigated trajectory: lever arm; --accept-verdict"):
+        run(*arguments)
+    assert capsys.readouterr().out.splitlines()[0] == "not to be used: navigated trajectory: lever arm"
+    run(*arguments, "--accept-verdict")
 
 
 def test_a_true_calibration_holds(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
