@@ -152,11 +152,23 @@ def _judge_place(
         return
     reason = next(_reasons(given, apart, undulation_m, setup), "")
     by_datum = reason.startswith("its datum") and given.datum_is_said and apart.metres < REFUSED_M
+    unsaid = apart.metres < REFUSED_M and _arm_is_unsaid(setup, source)
+    if unsaid:
+        key = f"{source.replace('/', '.')}.lever_arm_m"
+        reason = (
+            f"{key} is not configured, so that the antenna is taken to be at the body's origin; want it, to compare"
+        )
     line = f"{given.file}: {_figures(apart, source, log)}"
     if not reason and not refused and apart.sigmas < WARNED_SIGMAS:
         reason = "such fixes may be wrong by that, or the trajectory is"
     line += f": {reason or _unknown(apart, setup)}"
-    (found.refused if refused and not by_datum else found.warnings).append(line)
+    (found.refused if refused and not by_datum and not unsaid else found.warnings).append(line)
+
+
+def _arm_is_unsaid(setup: Setup, source: str) -> bool:
+    """Return True if nobody said where a receiver's antenna is: a trajectory cannot be refused for its lever arm."""
+    table = setup.config.gnss[source.removeprefix("gnss/")]
+    return "lever_arm_m" not in table.model_fields_set
 
 
 def _figures(apart: Apart, source: str, log: Path) -> str:

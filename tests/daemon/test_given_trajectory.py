@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from daemon.config import Config
+from daemon.config.tables import GnssConfig
 from daemon.processing.feed import LogClocks, read_clocks
 from daemon.processing.given_trajectory import Belonging, Given, judge_given, points_of
 from daemon.processing.setup import Options, Setup
@@ -185,6 +188,20 @@ def test_another_point_than_said_is_named(log: Log) -> None:
     assert "want --trajectory-at body" in log.refused(sure, "antenna")
     mirrored = sure.at_body([-0.8, 0.5, 2.4])
     assert "lever arm has another sign" in log.refused(mirrored)
+
+
+def test_an_antenna_whose_place_nobody_said_is_no_reason_to_refuse(log: Log) -> None:
+    """1.2 m apart, at 20 sigmas and more, because lever_arm_m is not in the configuration: a warning that names it."""
+    table = log.setup.config.gnss["rover"]
+    unsaid = GnssConfig(transport=table.transport, protocol=table.protocol, pps=table.pps)
+    config = log.setup.config
+    setup = copy.copy(log.setup)
+    setup.config = Config(config.tables.model_copy(update={"gnss": {"rover": unsaid}}), config.path, config.text)
+    sure = replace(log.truth, position_sigma_l=np.full((len(log.truth), 3), 0.01))
+    found = replace(log, setup=setup).judged(sure)
+    assert found.refused == []
+    (line,) = found.warnings
+    assert "gnss.rover.lever_arm_m is not configured" in line
 
 
 def test_time_that_is_off_is_named_by_the_way_flown(log: Log) -> None:
