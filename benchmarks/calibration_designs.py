@@ -168,7 +168,7 @@ def offsets_of(case: Case) -> list[Offset]:
 
 def normalised(case: Case, built: Made, found: Adjusted) -> list[Offset]:
     """Return errors in sigmas."""
-    offsets = []
+    offsets: list[Offset] = []
     for name, value, sigma in zip(found.names, found.values.tolist(), found.sigmas.tolist(), strict=True):
         short = name.partition(".")[2]
         offsets.append(Offset(case, short, (value - built.truth.value(short)) / sigma, held=False))
@@ -179,7 +179,8 @@ def normalised(case: Case, built: Made, found: Adjusted) -> list[Offset]:
 
 def run(seeds: Sequence[int], minutes: float) -> tuple[list[Offset], int]:
     """Fly all, or as many as the time allows; offsets, and the number of flights."""
-    begin, offsets = time.monotonic(), []
+    offsets: list[Offset] = []
+    begin = time.monotonic()
     for count, seed in enumerate(seeds):
         if time.monotonic() - begin > 60.0 * minutes:
             return offsets, count
