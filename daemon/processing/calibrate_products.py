@@ -59,12 +59,15 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     tell("strips before and after", 0, 1)
     before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
     inputs = _inputs(wish, done)
-    headers = {name: _header(wish, done, name, inputs) for name in done.adjusted.calibrations}
+    headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
     tell("checks", 0, 1)
     findings = (*done.findings, *strips_say(done), *validation_says(done))
     report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
     verdict = judge(report)
-    headers = {name: _judged(header, done, name, verdict) for name, header in headers.items()}
+    source = _trajectory_of(wish, done)
+    headers = {
+        name: replace(_judged(header, done, name, verdict), trajectory=source) for name, header in headers.items()
+    }
     try:
         texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
     except CalibrationFileError as error:
@@ -141,7 +144,7 @@ def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
     return [(path.name, sha256_of(path)) for path in paths]
 
 
-def _header(wish: CalibrateWish, done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
+def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
     now = dt.datetime.now(dt.UTC).replace(microsecond=0)
     found = done.adjusted.calibrations[name]
     digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
@@ -159,7 +162,6 @@ def _header(wish: CalibrateWish, done: Calibrated, name: str, inputs: list[tuple
         logs=logs,
         variance_factor=done.adjusted.variance_factor,
         redundancy=done.adjusted.redundancy,
-        trajectory=_trajectory_of(wish, done),
     )
 
 
