@@ -127,7 +127,7 @@ class _Arms:
 
     @classmethod
     def of(cls, points_t: FloatArray, strip: int, time_ns: Int64Array, seen: SeenFrom) -> _Arms:
-        """Of points (n, 3) at GPS times (n,)."""
+        """Return those of points (n, 3) at GPS times (n,)."""
         poses = seen.trajectories[seen.flown[strip]].poses(time_ns)
         rot_t_from_b = seen.frame.rot_t_from_e @ rot_from_quaternion(poses.q_e_from_b)
         arm_t = points_t - seen.frame.t_from_e(poses.position_e)

@@ -89,7 +89,7 @@ class Signatures:
 
     @property
     def lines(self) -> list[str]:
-        """The verdicts for people: a line an effect, or one line where strips are too far apart."""
+        """Return the verdicts for people: a line an effect, or one line where strips are too far apart."""
         return list(dict.fromkeys(one.words for one in self.found))
 
 

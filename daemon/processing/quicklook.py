@@ -183,7 +183,7 @@ def _corners(sources: Sequence[Source], units: Units) -> tuple[FloatArray, Float
 
 
 def _picture_side_m(sources: Sequence[Source], units: Units, corners: tuple[FloatArray, FloatArray]) -> float:
-    """Side of the cells of the pictures, by some of the files' points."""
+    """Return the side of the pictures' cells in metres, by some of the files' points."""
     full = [source for source in sources if source.point_count]
     sampled = full[:: -(-len(full) // SAMPLED_FILES)]
     size_m = np.maximum((corners[1] - corners[0])[:2], 1.0)

@@ -348,7 +348,7 @@ def _planes(moments: FloatArray, cell_m: float) -> _Planes:
 
 
 def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
-    """Sums of two by two cells (rows, columns)."""
+    """Return sums of two by two cells (rows, columns)."""
     rows, columns = (-(-size // 2) for size in counts.shape)
     even = np.zeros((2 * rows, 2 * columns), counts.dtype)
     even[: counts.shape[0], : counts.shape[1]] = counts
@@ -449,12 +449,12 @@ class Overlap:
 
     @property
     def compared_cells(self) -> int:
-        """Number of cells in which any two strips were compared."""
+        """Return the number of cells in which any two strips were compared."""
         return int(np.isfinite(self.worst_m).sum())
 
     @property
     def places(self) -> int:
-        """Number of places apart from each other: blocks of cells with compared ones, of neighbouring blocks one."""
+        """Return the number of places apart from each other: blocks with compared cells, of neighbouring blocks one."""
         rows, columns = (size // PLACE for size in self.worst_m.shape)
         cells = np.isfinite(self.worst_m).reshape(rows, PLACE, columns, PLACE).sum(axis=(1, 3))
         found = 0

@@ -92,7 +92,7 @@ class Agreement:
 
     @property
     def best(self) -> str | None:
-        """The strictest USGS level that is kept; None: none is, or there is no verdict."""
+        """Return the strictest USGS level that is kept; None: none is, or there is no verdict."""
         return best_of(self.judged)
 
     @property
@@ -173,7 +173,7 @@ class FlightStrips:
 
     @property
     def rms_m(self) -> float:
-        """RMSDz of all pairs; nan: nothing was compared."""
+        """Return RMSDz of all pairs; nan: nothing was compared."""
         return math.nan if self.agreement.numbers is None else float(self.agreement.numbers["rms_m"])
 
     def pairs(self) -> dict[tuple[str, str], PairDifference]:
@@ -309,7 +309,7 @@ def _words(strips: FlightStrips) -> str:
 
 
 def _largest(grid: NDArray[np.float32], times: int) -> FloatArray:
-    """Of blocks of so many cells a side the value of largest size; nan: there is none."""
+    """Return for blocks of so many cells a side the value of largest size; nan: there is none."""
     rows, columns = (-(-size // times) * times for size in grid.shape)
     padded = np.full((rows, columns), np.nan)
     padded[: grid.shape[0], : grid.shape[1]] = grid

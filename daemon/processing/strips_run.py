@@ -87,7 +87,7 @@ def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
 
 
 def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
-    """Rules by which so many cells of such a side are looked into; None: by the strips' density."""
+    """Return rules for so many cells of a side in metres; None: the side goes by the strips' density."""
     return StripRules(cell_m=cell_m, most_cells=most_cells)
 
 
@@ -153,11 +153,11 @@ class Judgement:
 
     @property
     def agreement(self) -> Agreement:
-        """By which strips are judged."""
+        """Return how well strips agree, by which they are judged."""
         return self.strips.look.agreement
 
     def wrong(self) -> list[str]:
-        """Sentences of effects that are in the strips and matter, or that strips are too far apart to tell."""
+        """Return sentences of effects that are in the strips and matter, or that strips are too far apart to tell."""
         found = () if self.signatures is None else self.signatures.found
         return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
 
@@ -171,7 +171,7 @@ class Judgement:
         return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
 
     def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
-        """Of `Overlap.rows`, by names of strips."""
+        """Return the rows of the overlap by names of strips."""
         names = self.strips.look.names
         return {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
 
@@ -255,7 +255,7 @@ def _row(name: str, *values: str) -> str:
 
 
 def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None) -> str:
-    """A row of the table, centimetres: of heights, then of returns above planes."""
+    """Return a row of the table, centimetres: of heights, then of returns above planes."""
     values = ["–"] * 5
     if heights is not None:
         told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
@@ -268,7 +268,7 @@ def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None
 
 
 def _to_plane(pair: PairReport | None) -> dict[str, Any]:
-    """Point to plane for JSON; ``dz``: its vertical part, on slopes below 10°."""
+    """Return point to plane for JSON; ``dz`` is its vertical part, on slopes below 10°."""
     if pair is None:
         return dict.fromkeys(("point_to_plane", "dz", "noise_m", "systematic_m"))
     return {
@@ -280,7 +280,7 @@ def _to_plane(pair: PairReport | None) -> dict[str, Any]:
 
 
 def _gridded(row: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Heights of planes, the measure that is judged."""
+    """Return the heights of planes for JSON, the measure that is judged."""
     if row is None:
         return None
     kept = {key: value for key, value in row.items() if key not in ("first", "second")}
