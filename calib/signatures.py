@@ -36,11 +36,12 @@ TELLS = 1.5  # or so many times what the trajectory's attitude leaves to the bes
 NOT_APART = 5.0  # times that another effect's sigma may grow
 ROUGH_M = 0.3  # RMS of the differences: planes of one cell are not the same surface any more, and effects not linear
 MOST_ROWS = 12_000
-MOST_KNOTS, KNOT_S = 150, 5.0  # of a trajectory of which no joint covariance is known
+MOST_KNOTS, KNOT_S = 300, 1.0  # of a trajectory of which no joint covariance is known
 POSITION_SIGMA_M, ATTITUDE_SIGMA_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
 # Of a trajectory's told sigmas: half of the variance of roll and pitch lasts for the whole flight, as accelerometers'
-# biases tilt it, and a fifth of the heading's. A smoothed tactical flight has 0.1 to 0.45 of it between any two strips.
-ASSUMED = Taus(position_s=100.0, lasting_tilt=0.5, lasting_heading=0.2)
+# biases tilt it, and a fifth of the heading's; the rest fades as fast as a tactical unit's gyroscopes walk. A smoothed
+# flight with such a unit has up to 0.46 of its pitch between any two strips, and up to 0.24 of its roll.
+ASSUMED = Taus(position_s=60.0, roll_pitch_s=10.0, heading_s=20.0, lasting_tilt=0.5, lasting_heading=0.2)
 
 
 @dataclass(frozen=True, slots=True)
