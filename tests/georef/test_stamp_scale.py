@@ -18,7 +18,8 @@ HOUR = 3600 * NS
 
 def truth_ns(seconds: float = 60.0, step_s: float = 0.02) -> Int64Array:
     """GPS times of pulses."""
-    return START_S * NS + np.rint(np.arange(10.0, seconds, step_s) * NS).astype(np.int64)
+    times: Int64Array = START_S * NS + np.rint(np.arange(10.0, seconds, step_s) * NS).astype(np.int64)
+    return times
 
 
 def latencies(count: int, least_ms: float = 0.3, typical_ms: float = 0.8) -> Int64Array:
@@ -91,7 +92,8 @@ def test_a_counter_since_power_on_runs_free() -> None:
 def hour_stamps(gps: Int64Array, off_ns: int = 0, drift_ppm: float = 0.0) -> Int64Array:
     """Time past the UTC hour."""
     drifted = np.rint((gps - gps[0]) * drift_ppm * 1e-6).astype(np.int64)
-    return (gps - LEAP * NS + off_ns + drifted) % HOUR
+    past: Int64Array = (gps - LEAP * NS + off_ns + drifted) % HOUR
+    return past
 
 
 def test_stamps_of_a_locked_head_are_found_to_be_the_hours_of_utc() -> None:
