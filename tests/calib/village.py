@@ -79,6 +79,12 @@ LINES = (
     ("high_west", (320, -60), (-320, -60), 1150),
     ("high_south", (-80, 320), (-80, -320), 1150),
 )
+# Options of `swath calibrate` that say how well the village's scanner is known beyond boresight and range offset
+KNOWN = (
+    *("--fix", "range_scale_ppm,scan_angle_scale_ppm,scan_plane_tilt_deg,time_offset_us"),
+    *("--prior", "range_scale_ppm=1", "--prior", "scan_angle_scale_ppm=2"),
+    *("--prior", "scan_plane_tilt_deg=0.0002", "--prior", "time_offset_us=5"),
+)
 TRUE = {"omega_deg": 0.25, "phi_deg": -0.4, "kappa_deg": 0.6, "range_offset_m": 0.12}
 
 

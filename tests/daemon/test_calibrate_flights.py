@@ -8,7 +8,7 @@ import pytest
 
 from daemon.cli.main import run_app
 from georef.calibration import INDEX, PARAMETERS, Calibration, read_calibration
-from tests.calib.village import TRUE, Made, village
+from tests.calib.village import KNOWN, TRUE, Made, village
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(3000)]
 
@@ -32,7 +32,7 @@ range_offset_m = -0.08
 def calibrated(made: Made, output: Path, model: str) -> None:
     folder = made.flown.folder
     given = ("--trajectory", str(folder / "true_trajectory.csv"), "--trajectory-datum", "same")
-    control = ("--control", str(folder / "control.csv"), "--model", model)
+    control = ("--control", str(folder / "control.csv"), "--model", model, *(KNOWN if model == "basic" else ()))
     assert run_app(["calibrate", str(made.flown.log), "-o", str(output), *given, *control, "--workers", "2"]) == 0
 
 
