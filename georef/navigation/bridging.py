@@ -33,7 +33,7 @@ GAP = 1.5  # intervals: a sample that comes later does not join the one before
 
 # Columns of `Bridges.ring`: sums of angle and velocity so far, rates and forces, time so far
 SUM, RATE, TIME, COLUMNS = 0, 6, 12, 13
-# Elements of `Bridges.count`: unbroken samples on end, made-up ones on end, end of the last
+# Elements of `Bridges.counters`: unbroken samples on end, made-up ones on end, end of the last
 WHOLE, RUN, END_NS = 0, 1, 2
 
 
@@ -42,14 +42,14 @@ class Bridges(NamedTuple):
 
     Attributes:
         ring: (RING, COLUMNS) the latest unbroken samples.
-        count: (3,) see above.
+        counters: (3,) see above.
         square: (LEVELS, 6) mean squares of what the sum of a run differs by, angles (rad²) then velocities (m²/s²).
         seen: (LEVELS,) runs that these are of.
         spent: (7,) variance that the present run has added, and its length in seconds.
     """
 
     ring: FloatArray
-    count: Int64Array
+    counters: Int64Array
     square: FloatArray
     seen: FloatArray
     spent: FloatArray
@@ -99,17 +99,16 @@ def _variance_of(bridges: Bridges, run: int, axis: int, long_s: float) -> float:
         known += 1
     if known == 0:
         unknown = UNKNOWN_RATE_RADPS if axis < 3 else UNKNOWN_FORCE_MPS2
-        return (unknown * long_s) ** 2
+        return float((unknown * long_s) ** 2)
     below = min(int(math.log2(run) + 1e-9), known - 1)
     over = run / float(1 << below)
     here = bridges.square[below, axis]
     if below + 1 >= known:
-        return here * over * over
+        return float(here * over * over)
     there = bridges.square[below + 1, axis]
     if not (here > 0.0 and there > 0.0):
-        return max(here, there)
-    value: float = here * over ** math.log2(there / here)
-    return value
+        return float(max(here, there))
+    return float(here * over ** math.log2(there / here))
 
 
 @kept
@@ -120,7 +119,7 @@ def made_up_variance(samples: Samples, bridges: Bridges) -> FloatArray:
         samples: the next n of a stream, in any pieces.
         bridges: of the stream, changed.
     """
-    count, spent, n = bridges.count, bridges.spent, len(samples.time_ns)
+    count, spent, n = bridges.counters, bridges.spent, len(samples.time_ns)
     out = np.zeros((n, 6))
     for i in range(n):
         span_s = samples.interval_s[i]
