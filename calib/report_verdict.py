@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -84,7 +84,7 @@ class Rule:
                     break
 
 
-def overall_rms_m(pairs: dict[Pair, Difference]) -> float | None:
+def overall_rms_m(pairs: Mapping[Pair, Difference]) -> float | None:
     """Root mean square over all cells of all pairs; None: nothing was compared."""
     cells = sum(one.count for one in pairs.values())
     return math.sqrt(sum(one.count * one.rms_m**2 for one in pairs.values()) / cells) if cells else None
