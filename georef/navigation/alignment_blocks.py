@@ -59,10 +59,12 @@ class Felt:
     sum_by_gyro: FloatArray
     sum_by_accel: FloatArray
 
-    def taken(self, gyro: FloatArray, accel: FloatArray) -> Felt:
-        """The same of sensors whose values are multiplied by (3, 3), but for what happens within a block."""
-        pushed = self.force_b * (np.diff(self.time_ns) / SECOND_NS)[:, None]
-        return _integrals(self.time_ns, self.angle_b @ gyro.T, pushed @ accel.T)
+    def pushed(self, gyro: FloatArray) -> FloatArray:
+        """Return ∫ D f from each edge to the last, (n + 1, 3), of gyroscopes multiplied by (3, 3)."""
+        forward = _prefix(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], _turned_by(self.angle_b @ gyro.T)]))
+        rot = rot_from_quaternion(quaternions.product(quaternions.conjugate(forward[-1]), forward[:-1]))
+        push = self.force_b * (np.diff(self.time_ns) / SECOND_NS)[:, None]
+        return _back(np.einsum("nij,nj->ni", rot, push))
 
     def at(self, time_ns: Int64Array) -> FeltAt:
         """Interpolated at times (m,) within the edges."""

@@ -62,6 +62,7 @@ class Fitted:
         cost: weighted sum of squares, that of the course and of the sensors' sigmas included.
         misfit: reduced χ² of GNSS's residuals.
         left: (m, 3) these residuals, velocities then positions.
+        gyro_scale: (3,) scale factors of the gyroscopes.
     """
 
     rot_l_from_b: FloatArray
@@ -72,6 +73,7 @@ class Fitted:
     cost: float
     misfit: float
     left: FloatArray
+    gyro_scale: FloatArray
 
     def sigma(self, part: slice) -> FloatArray:
         """(3,) of attitude, velocity or place; wider where the residuals are larger than their sigmas say."""
@@ -169,12 +171,6 @@ class Problem:
             best = without
         return best
 
-    def unlikeness(self) -> float:
-        """Mean square of what the best turn leaves between changes of velocity seen and felt, (m/s)²: quick to have."""
-        seen, felt = self._changes()
-        left = seen - felt @ _turned_onto(seen, felt).T
-        return float((left**2).sum(axis=1).mean())
-
     @cached_property
     def _noise(self) -> list[tuple[FloatArray, FloatArray]]:
         return noise_covariances(self._speed, self._place, *self._observed)
@@ -212,7 +208,8 @@ class Problem:
         there = rot_e_from_l(*geodetic_from_e(position_e)[:2]).T @ self._frame.rot_e_from_l  # l of the body's own place
         velocity_l = there @ (state[VELOCITY] - earth_l)
         left = np.concatenate(self._left(rot, state))
-        return Fitted(there @ rot, position_e, velocity_l, state[ARM], covariance, cost, misfit, left)
+        scale = state[GYRO][3:]
+        return Fitted(there @ rot, position_e, velocity_l, state[ARM], covariance, cost, misfit, left, scale)
 
     def _covariance(self, design: FloatArray) -> FloatArray:
         """(24, 24) of the unknowns, inverted in units of what is known of them before."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -17,17 +18,18 @@ from georef.navigation.diagnosis_data import MOSTLY, force, gaps, receiver, time
 from georef.navigation.diagnosis_data import Finding as Finding
 from georef.navigation.diagnosis_motion import (
     FAILS,
-    Axes,
-    Sensor,
+    FITS,
+    Mounting,
     Window,
     body_axes,
     heading_offset,
     lever_arm,
+    median_misfit,
+    mounting_of,
     other_signs,
-    sensor_axes,
     windows,
 )
-from georef.navigation.diagnosis_time import TimeOffset, time_offset
+from georef.navigation.diagnosis_time import SIGMAS, TimeOffset, time_offset, velocities
 from georef.navigation.inputs import Fate, Inertial, Kind, Setup, Solution
 from georef.records import StructArray
 from georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
@@ -39,6 +41,10 @@ SWAPPED_RAD, TURNED_RAD = np.radians([135.0, 10.0])
 ORIGIN_SHARE = 0.25  # of the lever arm: so near the origin positions are the body's
 ARM_OFF_M = 1.0
 AXES = "xyz"
+SHIFTED = 0.5  # times the misfit: what taking off a time offset must leave at most
+ALONE = 5.0  # sigmas of an offset that no fit can confirm
+SHOWS = 0.5  # of the innovations that an offset would make: what the filter shows at least if there is one
+AGREES_S = 0.05  # a smaller offset is not looked at
 
 
 class HasSolution(Protocol):
@@ -70,32 +76,87 @@ def diagnose(
         if "positions_and_velocities" in codes:
             observations = observations[observations["kind"] != Kind.VELOCITY]
         if not codes & {"gnss_bad", "force_size"}:
-            findings += _motion(inertial, observations, setup)
+            findings += _motion(inertial, observations, setup, solved)
         findings += _rejected(solved)
     return sorted(findings, key=lambda finding: finding.severity != "error")
 
 
-def _motion(inertial: Inertial, observations: StructArray, setup: Setup) -> Iterator[Finding]:
-    """Do IMU and GNSS go together: in time, axes, headings, lever arm?"""
-    offset = time_offset(inertial, observations)
-    if offset is not None and offset.is_wrong:
-        yield _offset_finding(offset, int(inertial.time_ns[0]))
+def _motion(
+    inertial: Inertial, observations: StructArray, setup: Setup, solved: HasSolution | None
+) -> Iterator[Finding]:
+    """Do IMU and GNSS go together: in axes, time, headings, lever arm?
+
+    Axes come first: with wrong ones no time is right. A time offset is told where it mends what does not fit.
+    """
+    taken_s = 0.0
+    if solved is not None and setup.estimate_time_offset_s > 0.0 and len(solved.smoothed.time_offset_s):
+        taken_s = float(solved.smoothed.time_offset_s[-1])  # by the filter, whose times these are then
         observations = observations.copy()
-        observations["time_ns"] -= round(offset.seconds * SECOND_NS)
+        observations["time_ns"] += round(taken_s * SECOND_NS)
     chosen = windows(inertial, observations, setup)
-    sensor = sensor_axes(chosen, setup)
-    unmatched = _sensor_finding(*sensor) if sensor is not None else _matched(chosen)
-    if unmatched is not None:
+    mounting = mounting_of(chosen, setup)
+    if mounting is None or mounting.is_as_it_is:
+        offset = time_offset(inertial, observations)
+        if offset is not None and abs(offset.seconds) > max(AGREES_S, SIGMAS * offset.sigma):
+            moved = observations.copy()
+            moved["time_ns"] -= round(offset.seconds * SECOND_NS)
+            there = windows(inertial, moved, setup)
+            other = mounting_of(there, setup)
+            left = median_misfit(there) if other is None or other.is_as_it_is else other.left
+            clear = abs(offset.seconds) > ALONE * offset.sigma
+            mends = left < SHIFTED * median_misfit(chosen) if chosen else clear
+            if mends and offset.is_wrong and not _filter_denies(offset, observations, solved):
+                whole = replace(offset, seconds=offset.seconds - taken_s)
+                yield _offset_finding(whole, int(inertial.time_ns[0]))
+                observations, chosen, mounting = moved, there, other
+            elif offset.contradiction and median_misfit(chosen) > FITS:
+                yield _doubted_offset(offset)
+    body = body_axes(chosen, setup, mounting)
+    if mounting is None or mounting.is_as_it_is:
+        unmatched = _matched(chosen) if mounting is None else None
+    else:
+        unmatched = _sensor_finding(mounting, body)
+    turned = _axes_finding(body) if body is not None else None
+    wrong = unmatched or turned or _gravity(inertial)
+    if wrong is not None:
+        yield wrong
+        return
+    arms = [*_headings(chosen, setup), *_arms(chosen, setup)]
+    yield from arms
+    unmatched = _matched(chosen)
+    if unmatched is not None and not arms:
         yield unmatched
-        return
-    axes = body_axes(chosen)
-    turned = _axes_finding(axes) if axes is not None else None
-    turned = turned or _gravity(inertial)
-    if turned is not None:
-        yield turned
-        return
-    yield from _headings(chosen, setup)
-    yield from _arms(chosen, setup)
+
+
+def _filter_denies(offset: TimeOffset, observations: StructArray, solved: HasSolution | None) -> bool:
+    """Return whether the filter knows better: its innovations show nothing of what the offset would make of them."""
+    if solved is None:
+        return False
+    rows = solved.smoothed.innovations
+    rows = rows[~np.isin(rows["fate"], (Fate.OUTSIDE, Fate.UNUSABLE))]
+    time_ns, velocity_l = velocities(observations)
+    step_s = np.diff(time_ns) / SECOND_NS
+    if len(step_s) < 10:
+        return False
+    change = np.linalg.norm(np.diff(velocity_l[:, :2], axis=0), axis=1) / np.maximum(step_s, 1e-3)
+    expected = abs(offset.seconds) * float(
+        np.sqrt(np.mean(change[step_s < 2.5] ** 2))
+    )  # m/s between GNSS and the filter
+    for kind, per_s in ((Kind.VELOCITY, 1.0), (Kind.POSITION, float(np.median(step_s)))):
+        left = rows[rows["kind"] == kind]["value"][:, :2]
+        if len(left) >= 10:
+            return bool(np.sqrt(np.nanmean((left**2).sum(axis=1))) < SHOWS * expected * per_s)
+    return False
+
+
+def _doubted_offset(offset: TimeOffset) -> Finding:
+    return Finding(
+        "time_unclear",
+        "warning",
+        f"comparisons of the motion disagree about the time between GNSS and IMU: by the {offset.compared} "
+        f"{1000.0 * offset.seconds:+.0f} ± {1000.0 * offset.sigma:.0f} ms, {offset.contradiction}; nothing is taken "
+        "for an offset: check how the IMU is stamped (pps, sample, stamp)",
+    )
 
 
 def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
@@ -114,47 +175,86 @@ def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
     )
 
 
-def _sensor_finding(sensor: Sensor, axes: Axes) -> Finding:
-    name, other, key = (
-        ("gyroscopes", "accelerometers", "angular_rate")
-        if sensor == "gyro"
-        else ("accelerometers", "gyroscopes", "specific_force")
-    )
-    scale = float(np.abs(axes.matrix).max())
-    taken = ", ".join(_axis(row) for row in axes.matrix)
-    how = f"taken as ({taken}) for body x, y, z they fit"
-    what = f"put {key}'s signals into that order and sign"
-    if not np.isclose(scale, 1.0):
-        how, what = f"{scale:.4g} times as large they fit", f"{key} has the wrong unit: degrees are taken for radians"
-        if scale > 1.0:
-            what = f"{key} has the wrong unit: radians are taken for degrees"
+def _sensor_finding(mounting: Mounting, body: FloatArray | None) -> Finding:
+    """What of the sensors is taken wrongly, with the remedy; by the way the vehicle goes where that is known."""
+    turn = np.eye(3) if body is None else body
+    gyro, accel = turn @ mounting.gyro, turn @ mounting.accel
+    times = f"{np.sqrt(mounting.gain):.0f} times better"
+    if mounting.rivals:
+        ways = " or ".join(
+            f"gyroscopes ({_taken(turn @ one)}) with accelerometers ({_taken(turn @ other)})"
+            for one, other in ((mounting.gyro, mounting.accel), *mounting.rivals)
+        )
+        return Finding(
+            "axes_unclear",
+            "error",
+            f"the gyroscopes do not go with the accelerometers and GNSS, and the motion tells not which way is right: "
+            f"for body x, y, z {ways} fit alike; fly banked turns and pull up between them, or look at the mounting",
+        )
+    unit = "degrees are taken for radians" if mounting.unit < 1.0 else "radians are taken for degrees"
+    if mounting.unit != 1.0 and _is_one(gyro) and _is_one(accel):
+        return Finding(
+            "gyro_unit",
+            "error",
+            f"the gyroscopes do not go with the accelerometers and GNSS: {mounting.unit:.4g} times as large they fit "
+            f"{times}; angular_rate has the wrong unit: {unit}",
+        )
+    also = "" if mounting.unit == 1.0 else f"; angular_rate has the wrong unit too: {unit}"
+    if np.array_equal(gyro, accel):
+        return Finding(
+            "axes_mirrored",
+            "error",
+            f"both triads are mirrored, which no rotation_b_imu mends: taken as ({_taken(gyro)}) for body x, y, z "
+            f"they fit {times}; put specific_force's and angular_rate's signals into that order and sign{also}",
+        )
+    if _is_one(accel) or _is_one(gyro) or body is None:
+        name, other, key, matrix = ("gyroscopes", "accelerometers", "angular_rate", gyro)
+        if _is_one(gyro):
+            name, other, key, matrix = ("accelerometers", "gyroscopes", "specific_force", accel)
+        mirrored = "" if body is not None or _is_one(accel) else ", specific_force's negated"
+        return Finding(
+            f"{name[:4] if name[0] == 'g' else name[:5]}_axes",
+            "error",
+            f"the {name} do not go with the {other} and GNSS: taken as ({_taken(matrix)}) for body x, y, z they fit "
+            f"{times}; put {key}'s signals into that order and sign{mirrored}{also}",
+        )
     return Finding(
-        f"{sensor}_axes" if np.isclose(scale, 1.0) else f"{sensor}_unit",
+        "sensor_axes",
         "error",
-        f"the {name} do not go with the {other} and GNSS: {how} {np.sqrt(axes.gain):.0f} times better; {what}",
+        f"gyroscopes and accelerometers are taken wrongly, each in its way: as ({_taken(gyro)}) and ({_taken(accel)}) "
+        f"for body x, y, z they fit {times}; put angular_rate's signals into the first order and sign, "
+        f"specific_force's into the second{also}",
     )
+
+
+def _is_one(matrix: FloatArray) -> bool:
+    return bool(np.array_equal(matrix, np.eye(3)))
+
+
+def _taken(matrix: FloatArray) -> str:
+    return ", ".join(_axis(row) for row in matrix)
 
 
 def _matched(chosen: list[Window]) -> Finding | None:
-    misfit = [window.fitted.misfit for window in chosen]
-    if not misfit or np.median(misfit) < FAILS:
+    misfit = median_misfit(chosen)
+    if misfit < FAILS:
         return None
     return Finding(
         "not_one_motion",
         "error",
-        f"GNSS does not move as the IMU feels (residuals {np.sqrt(np.median(misfit)):.0f} times their sigma): they may "
+        f"GNSS does not move as the IMU feels (residuals {np.sqrt(misfit):.0f} times their sigma): they may "
         "be on different vehicles, or a sensor's axes, units or times are wrong; check which receiver it is",
     )
 
 
-def _axes_finding(axes: Axes) -> Finding | None:
-    if np.array_equal(axes.matrix, np.eye(3)):
+def _axes_finding(matrix: FloatArray) -> Finding | None:
+    if _is_one(matrix):
         return None
-    rows = "[" + ", ".join("[" + ", ".join(f"{value:.0f}" for value in row + 0.0) + "]" for row in axes.matrix) + "]"
-    read = np.array([0.0, 0.0, -1.0]) @ axes.matrix
+    rows = "[" + ", ".join("[" + ", ".join(f"{value:.0f}" for value in row + 0.0) + "]" for row in matrix) + "]"
+    read = np.array([0.0, 0.0, -1.0]) @ matrix
     axis = int(np.argmax(np.abs(read)))
     gravity = f"body {AXES[axis]} reads {read[axis]:+.0f} g" if axis != 2 or read[2] > 0.0 else "z does point down"
-    ahead = _axis(axes.matrix[0])
+    ahead = _axis(matrix[0])
     return Finding(
         "axes",
         "error",

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from georef.navigation.alignment_blocks import Blocks, Felt
-from georef.navigation.alignment_fit import ARM, TILT, Fitted, Problem
+from georef.navigation.alignment_fit import ARM, GYRO, TILT, Fitted, Problem
 from georef.navigation.diagnosis_time import velocities
 from georef.navigation.inputs import Inertial, Kind, Setup
 from georef.records import Int64Array, StructArray
@@ -24,18 +23,21 @@ from georef.rotations import rot_z
 from georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
-Sensor = Literal["gyro", "accel"]
-
 WINDOW_NS = 40 * SECOND_NS
 MOST_WINDOWS = 6
 THINNED_NS = 9 * SECOND_NS // 10
 FEWEST = 8  # positions in a window
 FITS, FAILS = 20.0, 60.0  # reduced χ² of a fit that is right, of one that is not
 BETTER = 10.0  # times less χ² than the axes as they are
+ALIKE = 3.0  # times the best's χ²: what fits so well cannot be told from it
+SHORTLIST = 4  # pairs that are fitted, of those whose changes of velocity agree best
+FREE_SCALE, MOST_SCALE = 0.5, 0.1  # of the gyroscopes: its prior sigma where a unit is doubted, and its error then
 COURSE_MPS = 5.0
 ALONG = 0.85  # of 1: how well the body's axes must lie along the vehicle's, turned by right angles
-ARM_SIGMA_M = 5.0
+ARM_SIGMA_M, NEAR_ARM = 5.0, 1.5  # prior sigma where it is looked for; times the arm where only its axes may differ
+G_MPS2 = 9.80665
 NO_INDEX = np.zeros(0, np.int64)
+SCALE = slice(GYRO.start + 3, GYRO.stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +57,30 @@ class Window:
     fitted: Fitted
 
 
-@dataclass(frozen=True, slots=True)
-class Axes:
-    """Which of the sensor's axes a body axis takes: b = matrix · as it is now."""
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """How the sensors' signals must be taken so that gyroscopes, accelerometers and GNSS describe one motion.
 
-    matrix: FloatArray
-    gain: float  # how much better, or how well
+    Attributes:
+        gyro, accel: (3, 3) signed permutations, good = matrix · as it is. Without the way the vehicle goes they are
+            known up to a turn that both share.
+        unit: factor on the gyroscopes' signals.
+        gain: how many times less misfit that leaves.
+        left: what misfit it leaves.
+        rivals: other ways, gyro and accel, that fit as well; empty: there are none.
+    """
+
+    gyro: FloatArray
+    accel: FloatArray
+    unit: float
+    gain: float
+    left: float
+    rivals: tuple[tuple[FloatArray, FloatArray], ...] = ()
+
+    @property
+    def is_as_it_is(self) -> bool:
+        """True if the sensors go together as they are taken: what does not fit is elsewhere."""
+        return self.unit == 1.0 and np.array_equal(self.gyro, np.eye(3)) and np.array_equal(self.accel, np.eye(3))
 
 
 def windows(inertial: Inertial, observations: StructArray, setup: Setup) -> list[Window]:
@@ -78,56 +98,88 @@ def windows(inertial: Inertial, observations: StructArray, setup: Setup) -> list
     return found
 
 
-def sensor_axes(chosen: list[Window], setup: Setup) -> tuple[Sensor, Axes] | None:
-    """Another order, other signs or another unit of one sensor's axes with which gyroscopes and accelerometers agree.
+def median_misfit(chosen: list[Window]) -> float:
+    """Return the usual reduced χ² of the windows; 0 without any."""
+    return float(np.median([window.fitted.misfit for window in chosen])) if chosen else 0.0
 
-    Of the gyroscopes 48 ways to take the axes and two units are tried, of the accelerometers the 24 mirrored ways:
-    turned accelerometers are the same as gyroscopes turned back.
+
+def mounting_of(chosen: list[Window], setup: Setup) -> Mounting | None:
+    """Find the order, signs or unit of the sensors' axes with which gyroscopes and accelerometers agree.
+
+    Both triads can be taken in 48 ways each; what turns both is no matter of theirs, so that 96 pairs are left: 48 of
+    the gyroscopes, with the accelerometers as they are or all negated. A wrong unit is looked for only where no pair
+    fits, and told only where the gyroscopes' scale, estimated with it, is 1 within its uncertainty.
 
     Returns:
-        None where the axes as they are do, or no others do.
+        None where everything fits as it is, or no way of taking the axes does.
     """
-    misfit = np.array([window.fitted.misfit for window in chosen])
-    if not len(chosen) or np.median(misfit) < FAILS:
+    if median_misfit(chosen) < FITS:
         return None
-    worst = [chosen[k] for k in np.argsort(misfit, kind="stable")[::-1][:2]]
-    units = [np.eye(3) * np.pi / 180.0, np.eye(3) * 180.0 / np.pi]
-    tries: list[tuple[Sensor, list[FloatArray]]] = [
-        ("gyro", [*_signed_permutations(), *units]),
-        ("accel", [matrix for matrix in _signed_permutations() if np.linalg.det(matrix) < 0.0]),
-    ]
-    for sensor, matrices in tries:
-        values = [_problem(worst[0], sensor, matrix, setup).unlikeness() for matrix in matrices]
-        matrix = matrices[int(np.argmin(values))]
-        problems = [_problem(window, sensor, matrix, setup) for window in worst]
-        left = [problem.fit(problem.first_guess()).misfit for problem in problems]
-        gains = [window.fitted.misfit / value for window, value in zip(worst, left, strict=True)]
-        if max(left) < FITS and min(gains) > BETTER:
-            return sensor, Axes(matrix, min(gains))
+    worst = sorted(chosen, key=lambda window: window.fitted.misfit)[::-1][:2]
+    pairs = [(gyro, sign * np.eye(3)) for sign in (1.0, -1.0) for gyro in _signed_permutations()]
+    before = np.inf
+    for unit in (1.0, np.pi / 180.0, 180.0 / np.pi):
+        unlike = sum(_unlikeness(window, _taken(window, unit)) for window in worst)
+        best = np.argsort(np.ravel(unlike), kind="stable")[:SHORTLIST].tolist()
+        likely = [pairs[number] for number in dict.fromkeys([0, *best])]  # the first is as it is
+        asked = setup if unit == 1.0 else replace(setup, noise=replace(setup.noise, gyro_scale=FREE_SCALE))
+        fitted = [(pair, *_fits(worst, unit, pair, asked)) for pair in likely]
+        if unit == 1.0:
+            if fitted[0][1] < FITS:
+                return Mounting(pairs[0][0], pairs[0][1], 1.0, 1.0, fitted[0][1])
+            before = fitted[0][1]
+        fitted.sort(key=lambda each: each[1])
+        pair, left, scale_is_one = fitted[0]
+        if left < FITS and before > BETTER * left and (unit == 1.0 or scale_is_one):
+            rivals = tuple(other for other, its, _ in fitted[1:] if its < ALIKE * max(left, 1.0))
+            return Mounting(pair[0], pair[1], unit, before / max(left, 1e-9), left, rivals)
+        before = min(before, left)  # a unit has to explain more than any order of the axes
     return None
 
 
-def body_axes(chosen: list[Window]) -> Axes | None:
-    """The turn by right angles (24) that takes the body's axes to the vehicle's; the identity where they are right.
+def _fits(worst: list[Window], unit: float, pair: tuple[FloatArray, FloatArray], setup: Setup) -> tuple[float, bool]:
+    """Return the larger misfit of a pair in windows, and whether the gyroscopes' scale comes out as 1 there."""
+    left, is_one = 0.0, False
+    for window in worst:
+        fitted = _fit(_taken(window, unit * pair[0], pair[1]), window.rows, setup, free_arm=True)
+        left = max(left, fitted.misfit)
+        sigma = fitted.sigma(SCALE)
+        best = int(np.argmin(sigma))  # of the axis that turned most
+        known = float(sigma[best]) < MOST_SCALE
+        is_one |= known and abs(float(fitted.gyro_scale[best])) < max(3.0 * float(sigma[best]), MOST_SCALE)
+    return left, is_one
+
+
+def body_axes(chosen: list[Window], setup: Setup, mounting: Mounting | None = None) -> FloatArray | None:
+    """Return the turn by right angles (24) that takes the body's axes to the vehicle's; the identity where they are so.
+
+    Args:
+        chosen: windows.
+        setup: lever arms and noise.
+        mounting: how the sensors are taken; None: as they are.
 
     Returns:
         None where the vehicle did not go fast enough, or its axes lie between.
     """
     total, count = np.zeros((3, 3)), 0
     for window in chosen:
+        felt, fitted = window.felt, window.fitted
+        if mounting is not None:
+            felt = _taken(window, mounting.unit * mounting.gyro, mounting.accel)
+            fitted = _fit(felt, window.rows, setup, free_arm=True)
         time_ns, velocity_l = velocities(window.rows)
         fast = np.hypot(velocity_l[:, 0], velocity_l[:, 1]) > COURSE_MPS
-        if window.fitted.misfit > FAILS or not fast.any():
+        if fitted.misfit > FAILS or not fast.any():
             continue
-        turn = window.felt.at(time_ns[fast]).rot
+        turn = felt.at(time_ns[fast]).rot
         track = rot_z(np.arctan2(velocity_l[fast, 1], velocity_l[fast, 0]))
-        total += (np.swapaxes(track, 1, 2) @ (window.fitted.rot_l_from_b @ turn)).sum(axis=0)
+        total += (np.swapaxes(track, 1, 2) @ (fitted.rot_l_from_b @ turn)).sum(axis=0)
         count += int(fast.sum())
     if count < FEWEST:
         return None
     scores = [(float(np.trace(matrix.T @ total)) / (3 * count), matrix) for matrix in _signed_permutations(proper=True)]
     score, matrix = max(scores, key=lambda each: each[0])
-    return Axes(matrix, score) if score > ALONG else None
+    return matrix if score > ALONG else None
 
 
 def heading_offset(chosen: list[Window], setup: Setup) -> tuple[float, float] | None:
@@ -167,12 +219,12 @@ def lever_arm(chosen: list[Window], setup: Setup) -> tuple[FloatArray, FloatArra
     """Lever arm (3,) of antenna 0 that positions and velocities fit best, m in b, and its sigma (3,)."""
     information, weighted = np.zeros((3, 3)), np.zeros(3)
     for window in chosen:
-        if window.fitted.misfit > FAILS:
-            continue
         rows = window.rows[(window.rows["antenna"] == 0) & _is_motion(window.rows)]
         if (rows["kind"] == Kind.POSITION).sum() < FEWEST:
             continue
         free = Problem(window.felt, rows, setup, NO_INDEX, ARM_SIGMA_M).fit(window.fitted.rot_l_from_b)
+        if free.misfit > FAILS:
+            continue
         weight = np.linalg.inv(free.covariance[ARM, ARM] * max(free.misfit, 1.0))
         information += weight
         weighted += weight @ (setup.lever_arms_b[0] + free.arm_b)
@@ -182,20 +234,45 @@ def lever_arm(chosen: list[Window], setup: Setup) -> tuple[FloatArray, FloatArra
     return np.asarray(covariance @ weighted, dtype=np.float64), np.sqrt(np.diag(covariance))
 
 
-def _problem(window: Window, sensor: Sensor, matrix: FloatArray, setup: Setup) -> Problem:
-    """With one sensor's values taken otherwise."""
-    rows, felt = window.rows[_is_motion(window.rows)], window.felt
-    if np.abs(matrix).max() != 1.0:  # turns of another size differ within blocks
-        blocks = Blocks()
-        blocks.feed(replace(window.inertial, angle_b=window.inertial.angle_b @ matrix.T))
-        other = blocks.felt(int(felt.time_ns[0]), int(felt.time_ns[-1]))
-        return Problem(felt if other is None else other, rows, setup, NO_INDEX)
-    gyro, accel = (matrix, np.eye(3)) if sensor == "gyro" else (np.eye(3), matrix)
-    return Problem(felt.taken(gyro, accel), rows, setup, NO_INDEX)
+def _taken(window: Window, gyro: FloatArray | float, accel: FloatArray | float = 1.0) -> Felt:
+    """Return what was felt with the sensors taken otherwise: summed anew, for axes matter within blocks too."""
+    own = window.inertial
+    blocks = Blocks()
+    angle_b = own.angle_b @ (gyro * np.eye(3) if isinstance(gyro, float) else gyro).T
+    velocity_b = own.velocity_b @ (accel * np.eye(3) if isinstance(accel, float) else accel).T
+    blocks.feed(replace(own, angle_b=angle_b, velocity_b=velocity_b))
+    other = blocks.felt(int(window.felt.time_ns[0]), int(window.felt.time_ns[-1]))
+    return window.felt if other is None else other
 
 
-def _fit(felt: Felt, rows: StructArray, setup: Setup) -> Fitted:
-    problem = Problem(felt, rows[_is_motion(rows)], setup, NO_INDEX)
+def _unlikeness(window: Window, felt: Felt) -> FloatArray:
+    """Return (2, 48) how little changes of velocity seen and felt agree, for accelerometers as they are and negated.
+
+    The best turn of one onto the other is taken out (Kabsch 1976), gravity is that of a flat earth, and the lever arm
+    is left out: good enough to choose what is fitted.
+    """
+    time_ns, velocity_l = velocities(window.rows)
+    inside = (time_ns >= felt.time_ns[0]) & (time_ns <= felt.time_ns[-1])
+    time_ns, velocity_l = time_ns[inside], velocity_l[inside]
+    step_s = np.diff(time_ns)[:, None] / SECOND_NS
+    seen = np.diff(velocity_l, axis=0) - step_s * [0.0, 0.0, G_MPS2]
+    since, edges = (time_ns - felt.time_ns[0]).astype(np.float64), (felt.time_ns - felt.time_ns[0]).astype(np.float64)
+    alpha = np.stack([felt.pushed(gyro) for gyro in _signed_permutations()])
+    there = np.stack([[np.interp(since, edges, column) for column in one.T] for one in alpha])  # (48, 3, m)
+    pushed = -np.diff(there, axis=2)
+    both = np.einsum("nk,gjn->gkj", seen, pushed)
+    size = (seen**2).sum() + (pushed**2).sum(axis=(1, 2))
+    singular = np.linalg.svd(both, compute_uv=False)
+    mirrored = np.sign(np.linalg.det(both))
+    agree = np.stack([singular[:, :2].sum(axis=1) + sign * mirrored * singular[:, 2] for sign in (1.0, -1.0)])
+    left: FloatArray = (size - 2.0 * agree) / max(len(seen), 1)
+    return left
+
+
+def _fit(felt: Felt, rows: StructArray, setup: Setup, *, free_arm: bool = False) -> Fitted:
+    """Return the fit; with a free lever arm where the axes are in question, for in other axes it is another."""
+    arm_m = NEAR_ARM * float(np.linalg.norm(setup.lever_arms_b[0])) + MOST_SCALE if free_arm else 0.0
+    problem = Problem(felt, rows[_is_motion(rows)], setup, NO_INDEX, arm_m)
     return problem.fit(problem.first_guess())
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.diagnosis import Finding, diagnose
-from georef.navigation.diagnosis_time import time_offset
+from georef.navigation.diagnosis_time import TimeOffset, time_offset
 from georef.navigation.inputs import INNOVATION_DTYPE, Fate, Inertial, Kind, Setup, sort_observations
 from georef.records import FixType, StructArray
 from tests.georef.navigation.vehicles import BEGIN_NS, Recording, car, observed, reference, uav
@@ -292,6 +292,54 @@ class Innovations:
 @dataclass(frozen=True)
 class Solved:
     smoothed: Any
+
+
+@dataclass(frozen=True)
+class Timed:
+    innovations: StructArray
+    time_offset_s: FloatArray
+
+
+def velocity_innovations(rows: StructArray, size_mps: float) -> StructArray:
+    """One an observed velocity, each component that large."""
+    found = np.zeros(int((rows["kind"] == Kind.VELOCITY).sum()), INNOVATION_DTYPE)
+    found["kind"], found["value"] = Kind.VELOCITY, size_mps
+    return found
+
+
+@pytest.mark.parametrize(("size_mps", "told"), [(0.02, False), (2.0, True)])
+def test_a_filter_that_goes_with_gnss_denies_an_offset(size_mps: float, told: bool) -> None:
+    """0.3 s would show in the velocities of the turns as more than a metre a second."""
+    sound = survey()
+    parts = moved(0.3)((sound.inertial, sound.rows, sound.setup))
+    solved = Solved(Timed(velocity_innovations(parts[1], size_mps), np.zeros(0)))
+    assert ("time_offset" in [finding.code for finding in diagnose(*parts, solved)]) == told
+
+
+@pytest.mark.parametrize(("taken_out_s", "told"), [(-0.3, []), (0.0, ["time_offset"])])
+def test_an_offset_that_the_filter_has_taken_out_is_not_told_again(taken_out_s: float, told: list[str]) -> None:
+    sound = survey()
+    inertial, rows, setup = moved(0.3)((sound.inertial, sound.rows, sound.setup))
+    timed = Timed(velocity_innovations(rows, 2.0), np.array([taken_out_s]))
+    found = diagnose(inertial, rows, replace(setup, estimate_time_offset_s=1.0), Solved(timed))
+    assert [finding.code for finding in found] == told
+
+
+def test_comparisons_that_contradict_each_other_claim_nothing() -> None:
+    """As on a car's recording: 0.757 said −340 ± 13 ms, and 0.987 said −10 ms."""
+    lone = TimeOffset(-0.34, 0.05, 0.757, 0.70, "force")
+    assert lone.is_wrong
+    assert not replace(lone, contradiction="by the turn -10 ± 50 ms").is_wrong
+    assert not replace(lone, sigma=0.12).is_wrong
+
+
+def test_the_sigma_of_an_offset_is_honest() -> None:
+    """Of stretches of 250 s the offsets scatter no more than their sigmas say; the worst is within four."""
+    whole = reference("mems")
+    begin = float(whole.inertial.time_ns[0] - BEGIN_NS) / 1e9
+    parts = [whole.cut(begin + at, begin + at + 250.0) for at in (100.0, 350.0)]
+    found = [time_offset(part.inertial, part.rows) for part in parts]
+    assert all(each is not None and abs(each.seconds) < 4.0 * each.sigma for each in found), found
 
 
 def test_what_the_filter_refused_is_said() -> None:

@@ -1,0 +1,123 @@
+"""Sensors that are turned, swapped or mirrored: of all 48 ways each is found, with the remedy that mends it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.navigation.diagnosis import diagnose
+from georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
+from georef.records import StructArray
+from tests.georef.navigation.flights import Fixes, fly, noised, setup_for, survey
+from tests.georef.navigation.vehicles import car, uav
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+ARM_B = np.array([0.3, -0.1, -1.1])
+SENSORS = ("gyro", "accel", "both")
+
+
+def ways() -> list[FloatArray]:
+    """The 24 turns and 24 mirrored turns by right angles."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[np.arange(3), order] = signs
+            found.append(matrix)
+    return found
+
+
+@cache
+def flight() -> tuple[Inertial, StructArray, Setup]:
+    """Lines of 20 s with turns between them, at 50 Hz; fixes of 1 cm and 3 cm/s once a second."""
+    noise = GRADES["tactical"]
+    inertial, rows = noised(fly(survey(60.0, 20.0), 100.0, 50.0), noise, Fixes(velocity_mps=0.03), ARM_B, seed=3)
+    return inertial, sort_observations(rows), setup_for(noise, ARM_B)
+
+
+def mounted(sensor: str, matrix: FloatArray, unit: float = 1.0) -> tuple[Inertial, StructArray, Setup]:
+    """The flight with a triad, or both, taken otherwise."""
+    inertial, rows, setup = flight()
+    gyro = matrix if sensor != "accel" else np.eye(3)
+    accel = matrix if sensor != "gyro" else np.eye(3)
+    angle_b, velocity_b = unit * inertial.angle_b @ gyro.T, inertial.velocity_b @ accel.T
+    return replace(inertial, angle_b=angle_b, velocity_b=velocity_b), rows, setup
+
+
+def remedy(text: str) -> FloatArray:
+    """The matrix that a finding says: rows of rotation_b_imu, or the signals for body x, y, z."""
+    said = re.search(r"by (\[\[.*\]\])", text)
+    if said is not None:
+        return np.array([[float(value) for value in row.split(",")] for row in re.findall(r"\[([^\[\]]+)\]", said[1])])
+    taken = re.search(r"taken as \(([^)]*)\)", text)
+    assert taken is not None, text
+    matrix = np.zeros((3, 3))
+    for row, axis in enumerate(taken[1].split(", ")):
+        matrix[row, "xyz".index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
+    return matrix
+
+
+def check(sensor: str, matrix: FloatArray) -> None:
+    """One finding, whose remedy undoes what was done."""
+    found = diagnose(*mounted(sensor, matrix))
+    if np.array_equal(matrix, np.eye(3)):
+        assert found == []
+        return
+    (finding,) = found
+    turned = "axes" if np.linalg.det(matrix) > 0.0 else "axes_mirrored"
+    assert finding.code == {"gyro": "gyro_axes", "accel": "accel_axes", "both": turned}[sensor], finding.text
+    assert finding.severity == "error"
+    assert np.array_equal(remedy(finding.text) @ matrix, np.eye(3)), finding.text
+
+
+@pytest.mark.parametrize(
+    ("sensor", "number"), [("gyro", 13), ("accel", 2), ("both", 0), ("both", 7), ("both", 30), ("gyro", 46)]
+)
+def test_some_ways_of_taking_the_axes_are_found(sensor: str, number: int) -> None:
+    check(sensor, ways()[number])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(48))
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_each_of_the_48_ways_of_taking_the_axes_is_found(sensor: str, number: int) -> None:
+    check(sensor, ways()[number])
+
+
+def test_degrees_for_radians_are_found_by_the_gain() -> None:
+    (finding,) = diagnose(*mounted("gyro", np.eye(3), unit=180.0 / np.pi))
+    assert finding.code == "gyro_unit"
+    assert "degrees are taken for radians" in finding.text
+
+
+@pytest.mark.parametrize("unit", [0.6, 1.7, 20.0])
+def test_another_gain_is_no_unit(unit: float) -> None:
+    """A gain that is no unit's is told as what does not fit, and not as a wrong unit."""
+    assert all("unit: " not in finding.text for finding in diagnose(*mounted("gyro", np.eye(3), unit=unit)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recording", [car, uav], ids=["car", "uav"])
+def test_real_recordings_cut_and_turned_give_no_offset_and_no_unit(recording: object) -> None:
+    """Minutes of them, also with turned axes: what is said is the axes, never a time or a unit."""
+    assert callable(recording)
+    whole = recording()
+    begin, end = (float(edge) for edge in (whole.inertial.time_ns[[0, -1]] - 2300 * 604_800 * 10**9) / 1e9)
+    for first in np.arange(begin, end - 120.0, 120.0):
+        part = whole.cut(float(first), float(first) + 120.0)
+        for matrix in (np.eye(3), np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])):
+            turned = replace(
+                part.inertial,
+                angle_b=part.inertial.angle_b @ matrix.T,
+                velocity_b=part.inertial.velocity_b @ matrix.T,
+            )
+            codes = {finding.code for finding in diagnose(turned, part.rows, part.setup)}
+            assert not codes & {"time_offset", "time_unclear", "gyro_unit"}, (first, codes)
