@@ -122,10 +122,17 @@ def _print(record: dict[str, Any], files: list[Path]) -> None:
             print(f"start: {leg['start']['words']}")
             for finding in leg["findings"]:
                 print(f"{finding['severity']}: {one_line(finding['text'])}")
-            print(one_line(leg["verdict"]["sentence"]))
+            _print_verdict(leg["verdict"])
     for line in record["warnings"]:
         print(f"warning: {one_line(line)}")
     if record.get("events") is not None:
         told = ", ".join(f"{count:,} {fate}" for fate, count in record["events"].items())
         print(f"event marks: {told or 'none in the log'}")
     print(f"{'complete' if record['complete'] else 'partial'}: {', '.join(one_line(str(path)) for path in files)}")
+
+
+def _print_verdict(verdict: dict[str, Any]) -> None:
+    """Print a verdict's sentence, and each reason beyond the one that it names, with what to change."""
+    print(one_line(verdict["sentence"]))
+    for reason in verdict["reasons"][1:]:
+        print(one_line(f"also: {reason['what']}" + (f": {reason['change']}" if reason["change"] else "")))

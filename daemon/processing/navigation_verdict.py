@@ -422,5 +422,5 @@ def _sentence(level: Level, figures: Figures, reasons: list[Reason]) -> str:
         return f"{word}: {accuracy_words(figures)}."
     told = [reason.what for reason in reasons if reason.level is level]
     more = len(reasons) - 1
-    tail = f"; {more} more {'reason' if more == 1 else 'reasons'} below" if more else ""
+    tail = f"; {more} more {'reason' if more == 1 else 'reasons'}" if more else ""
     return f"{word}: {told[0]}{tail}."

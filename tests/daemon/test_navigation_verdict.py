@@ -254,4 +254,4 @@ def test_findings_are_reasons_and_come_first(figures: Figures, severity: Any, wo
     changed["positions"]["longest_outage_s"] = 300.0
     verdict = judge(changed, [Finding("gravity", severity, "axis y reads 1 g: turn rotation_b_imu")])
     assert [reason.name for reason in verdict.reasons] == ["gravity", "outage"]
-    assert verdict.sentence == f"{words}: axis y reads 1 g: turn rotation_b_imu; 1 more reason below."
+    assert verdict.sentence == f"{words}: axis y reads 1 g: turn rotation_b_imu; 1 more reason."

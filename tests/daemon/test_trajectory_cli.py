@@ -233,9 +233,13 @@ class TestOtherwise:
         capsys.readouterr()
         arguments = ["-o", str(tmp_path / "a.sbet"), "--no-page", "--config", str(flown.folder / "turned.toml")]
         assert run_app(["trajectory", str(flown.log), *arguments]) == 1
-        told = capsys.readouterr().err
-        assert "body y reads +1 g" in told
-        assert "rotation_b_imu" in told
+        printed = capsys.readouterr()
+        assert "body y reads +1 g" in printed.err
+        assert "rotation_b_imu" in printed.err
+        (leg,) = summary(tmp_path)["sessions"][0]["legs"]
+        reasons = [line for line in printed.out.splitlines() if line.startswith("also: ")]
+        assert len(reasons) == len(leg["verdict"]["reasons"]) - 1 > 0
+        assert all(reason["what"] in line for reason, line in zip(leg["verdict"]["reasons"][1:], reasons, strict=True))
 
     def test_an_attitude_given_by_hand_starts_it(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
