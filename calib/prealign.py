@@ -35,6 +35,7 @@ _CONTROL_SPACINGS, _CONTROL_POINTS = 1.3, 3  # around a control point, returns w
 _RANGE_HEIGHTS, _RANGE_LEAST_M = 0.0075, 0.2
 _OVERSAMPLED = 4  # as many returns as are wanted are looked at for those where swaths overlap
 _OVERLAP_WIDTHS = 0.1  # side of the cells by which overlap is found, in widths of a swath
+_BACK = 0.5  # share of a step that the next one takes back where steps go to and fro
 _HELD = 1e-9  # rad, or m, by which what is held may move
 _STEP_MOST_RAD = np.radians(2.0)
 _NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
@@ -130,12 +131,14 @@ def prealigned(
         coarser = smooth_m / levels[-1]
         fewer = [at[:: max(1, int(0.5 * coarser))] for at in samples]
         motions = [_motion(flight, *one, found) for one in zip(flight.swaths, fewer, strict=True)]
+        share, last = 1.0, np.zeros_like(step)
         for _ in range(settings.rounds):
             placed = [_placed(flight, *one, found) for one in zip(flight.swaths, fewer, motions, strict=True)]
-            improved = _improved(flight, placed, found, began, smooth_m, settings, control)
+            improved = _improved(flight, placed, found, began, smooth_m, settings, control, share)
             if improved is None:  # a coarse level on a narrow overlap: a finer one may still do
                 break
             found, step, sigma = improved
+            share, last = share * _damping(last, step), step
             if np.abs(step[:, :3]).max() < coarser * settings.settled_rad:
                 break
     if improved is None:
@@ -236,10 +239,11 @@ def _improved(
     smooth_m: float,
     settings: PrealignSettings,
     control: _Control | None,
+    share: float,
 ) -> tuple[dict[str, Calibration], FloatArray, FloatArray] | None:
     """Return better calibrations, and by how much each head's parameters changed, (h, 4), with their sigmas (h, 4).
 
-    None: too few cells are in two swaths.
+    None: too few cells are in two swaths. Of each change only the share is made.
     """
     if any(not len(points) for points, _ in placed):
         raise PrealignError(f"prealignment: {_NO_POINTS}")
@@ -265,12 +269,21 @@ def _improved(
     prior = np.where(held, _HELD, sigmas) ** -2.0
     step = -np.linalg.solve(normal + np.diag(prior), right + prior * away).reshape(-1, len(NAMES))
     sigma = np.sqrt(np.diag(np.linalg.inv(normal + np.diag(prior)))).reshape(-1, len(NAMES))
-    step *= min(1.0, _STEP_MOST_RAD / max(float(np.abs(step[:, :3]).max()), 1e-12))
+    step *= share * min(1.0, _STEP_MOST_RAD / max(float(np.abs(step[:, :3]).max()), 1e-12))
     better = {
         name: found[name].changed(**{p: found[name].value(p) + float(by) for p, by in zip(NAMES, one, strict=True)})
         for name, one in zip(names, step, strict=True)
     }
     return {**found, **better}, step, sigma
+
+
+def _damping(last: FloatArray, step: FloatArray) -> float:
+    """Return by what the next step's share is to be smaller: half where this one went back most of the last one.
+
+    On a fine level few edges decide, other ones before a step than after it, and full steps go to and fro.
+    """
+    back = -float(np.sum(last[:, :3] * step[:, :3]))
+    return 0.5 if back > _BACK * float(np.sum(last[:, :3] ** 2)) > 0.0 else 1.0
 
 
 def _motion(flight: Flight, swath: Swath, at: Int64Array, found: Mapping[str, Calibration]) -> FloatArray:

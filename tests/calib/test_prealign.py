@@ -11,7 +11,7 @@ from calib.flight import Flight
 from calib.height_grids import Lattice, surface
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneSettings
-from calib.prealign import NAMES, PrealignError, PrealignSettings, prealign
+from calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
 from calib.scale import scale_of
 from georef.calibration import Calibration
 from tests.calib.cast_flight import Cast, Line, cast_flight
@@ -217,3 +217,13 @@ def test_a_surface_changes_as_moved_points_make_it() -> None:
         change = other.height_m[b] - one.height_m[a]
         assert len(a) > 1000
         assert np.std(change - by * one.change[a, index]) < 0.12 * np.sqrt(np.mean(change**2))
+
+
+def test_steps_that_go_to_and_fro_are_halved() -> None:
+    """A fine level with few edges: x → −0.9 x for ever with whole steps; at rest within five with damped ones."""
+    away, share, last = np.array([[0.0, 0.0, 1e-3, 0.0]]), 1.0, np.zeros((1, 4))
+    for _ in range(5):
+        step = -1.95 * share * away
+        away, share, last = away + step, share * _damping(last, step), step
+    assert np.abs(away).max() < 1e-5
+    assert _damping(np.full((1, 4), 1e-3), np.full((1, 4), -1e-4)) == 1.0

@@ -10,6 +10,7 @@ import pytest
 from georef.earth import e_from_geodetic, rot_e_from_l
 from georef.navigation.error_model import layout_of
 from georef.navigation.filter import NavigationFilter, run_filter, start_covariance, start_state
+from georef.navigation.gate import PATIENCE
 from georef.navigation.gravity import EARTH_RATE_RADPS, gravity_e
 from georef.navigation.inputs import GRADES, Fate, ImuNoise, Inertial, Kind, Start
 from georef.navigation.smoother import difference, forward
@@ -158,14 +159,16 @@ def test_every_observation_has_a_fate() -> None:
 
 
 def test_a_position_that_jumps_for_good_is_taken_in_the_end() -> None:
-    """A base station set wrong by 20 m: refused for `reacquire_s`, then the state is widened, which is counted."""
-    truth = fly(survey(), 60.0, 100.0)
+    """A base station set wrong by 20 m: refused for half a minute, as long as a wrong fix may last, then taken."""
+    truth = fly(survey(), 90.0, 100.0)
     inertial, rows = noised(truth, GRADES["tactical"], Fixes(), ARM, 4)
     rows["value"][30:] += [10.0, 10.0, 14.0]
-    run = run_filter(inertial, rows, setup_for(GRADES["tactical"], ARM), drawn_start(truth, 4))
+    setup = setup_for(GRADES["tactical"], ARM)
+    run = run_filter(inertial, rows, setup, drawn_start(truth, 4))
     fates = run.innovations["fate"]
-    assert (fates[30:35] == Fate.REJECTED).all()
-    assert Fate.REACQUIRED in fates[35:38]
+    refused = round(PATIENCE * setup.reacquire_s)
+    assert (fates[30 : 30 + refused] == Fate.REJECTED).all()
+    assert Fate.REACQUIRED in fates[30 + refused : 36 + refused]
     assert (fates[-10:] <= Fate.REACQUIRED).all()
     end = forward(run)
     off = end.position_e[-1] - truth.flight.motion(truth.edges[-1:]).position_e[0]
