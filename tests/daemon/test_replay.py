@@ -27,6 +27,7 @@ from tests.daemon.test_recording import ROVER, SREP, Pty, nmea_zda
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # what is replayed is recorded once, by one worker
 SECONDS = 18
+TIMED = ROVER.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')  # LOCKED after the table's end, too
 BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
 
 
@@ -37,7 +38,7 @@ def record_first(folder: Path) -> LogContent:
     os.mkfifo(fifo)
     pty = Pty(link)
     can_port = free_udp_port()
-    config = session_table(folder / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+    config = session_table(folder / "logs") + SREP.format(port=port) + TIMED.format(path=link, fifo=fifo)
     with (
         Recorder(folder, config + BUS.format(port=can_port)) as recorder,
         fifo.open("w") as edges,
@@ -78,7 +79,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LogContent]:
 def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogContent, str]:
     """Play logs to a second recorder that was there first; what it recorded, and what replay said."""
     port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
-    config = session_table(folder / "logs") + SREP.format(port=port) + ROVER.format(path=link, fifo=fifo)
+    config = session_table(folder / "logs") + SREP.format(port=port) + TIMED.format(path=link, fifo=fifo)
     config += BUS.format(port=free_udp_port())
     config += (
         f'[scanner.right]\ntransport = "udp:127.0.0.1:{free_udp_port()}"\nprotocol = "srep"\nmirror_factor = 1.0\n'
