@@ -33,6 +33,7 @@ ENOUGH = 120  # components of one source: 60 positions' horizontal ones
 EVIDENCE = 2.0  # of ln likelihood: chance gives it to one in twenty
 SIGNIFICANT = 8.0  # the same, of a share against a setup that says white
 SCALES = (0.02, 30.0)
+LARGEST = 5.0  # times what is told of positions: beyond, a time, a lever arm or a frame is wrong, and it is no noise
 NEAR = 0.03  # of 1: mean square that needs no other scale
 ROUNDS = 4  # runs, at most, until scales stay
 STEP = 0.7  # of ln (lasting / white variance) between shares tried
@@ -209,7 +210,19 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
     if gain < needed:
         best, gain = first, 0.0
     told = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
+    if _too_large(best.setup, setup, counts):
+        return NoiseFound(setup, told, moments, counts)
     return NoiseFound(best.setup, told, moments, counts, evidence, gain)
+
+
+def _too_large(found: Setup, asked: Setup, counts: Mapping[Source, int]) -> bool:
+    """Tell whether positions of a fix type would err more than `LARGEST` times as much as is told of them.
+
+    Times that drift by milliseconds look like that. Scaled, positions would be averaged that are each right.
+    """
+    fixes = {fix for kind, fix, _ in counts if kind == Kind.POSITION}
+    horizontal = {fix: found.gnss_sigma_scale.get(fix, 1.0) / asked.gnss_sigma_scale.get(fix, 1.0) for fix in fixes}
+    return any(scale > LARGEST for scale in horizontal.values())
 
 
 class Judged:
