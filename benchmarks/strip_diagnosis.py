@@ -1,4 +1,4 @@
-"""Whether the sigmas of the strips' diagnosis hold: a virtual flight, its trajectory wrong as navigation expects it.
+"""Test the sigmas of the strips' diagnosis: a virtual flight, its trajectory wrong as navigation expects it.
 
 python -m benchmarks.strip_diagnosis [--runs 50] [--json FILE]
 

@@ -118,7 +118,7 @@ def _rot_b_from_s(head: Head, swath: Swath) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Arms:
-    """Where points of a strip were seen from: poses (n,), rot_t_from_b (n, 3, 3), body to point in t and b (n, 3)."""
+    """Hold the places that points were seen from: poses (n,), rot_t_from_b (n, 3, 3), body to point in t, b (n, 3)."""
 
     poses: Poses
     rot_t_from_b: FloatArray

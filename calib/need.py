@@ -31,7 +31,7 @@ STEP = 0.1  # sigmas by which a parameter is changed to see what that does
 
 @dataclass(frozen=True)
 class Need:
-    """What is needed, and what there is.
+    """Compare what is needed with what there is.
 
     Attributes:
         point_m: one sigma (root of the sum of three variances) that a calibration may leave in points.

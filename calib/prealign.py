@@ -98,7 +98,7 @@ def prealign(
 
 @dataclass(frozen=True)
 class Prealigned:
-    """What came of it.
+    """Hold the outcome of a pre-alignment.
 
     Attributes:
         calibrations: by scanner.

@@ -85,7 +85,7 @@ class Signatures:
 
     @property
     def rough(self) -> bool:
-        """Whether the strips are too far apart for effects to be told."""
+        """Tell whether the strips are too far apart for effects to be told."""
         return any(one.level == "rough" for one in self.found)
 
     @property

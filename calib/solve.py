@@ -105,7 +105,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class HeldEffects:
-    """What parameters that are held do to an adjustment (Schmidt 1966: "consider" parameters).
+    """Hold what parameters that are held do to an adjustment (Schmidt 1966: "consider" parameters).
 
     Attributes:
         by_unit: (u, c) change of each unknown per unit of each held parameter's error.

@@ -105,12 +105,12 @@ class Detectable:
 
     @property
     def seen(self) -> bool:
-        """Whether the size is one that anybody would look for."""
+        """Tell whether the size is one that anybody would look for."""
         return self.size < BLIND * RULES_OF_ALL.of(f"{self.scanner}.{self.parameter}").plausible
 
     @property
     def words(self) -> str:
-        """As ``phi 0.0062°``."""
+        """Return the parameter and its size, as ``phi 0.0062°``."""
         unit, factor = UNITS.get(self.parameter.rpartition("_")[2], (" ppm", 1e6))
         return f"{self.name} {float(f'{factor * self.size:.2g}'):g}{unit}"
 
