@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -46,7 +46,9 @@ def command(
         typer.Option(metavar="FILE", help="Of logs: SBET, Waypoint text or CSV; default: their IMU and GNSS."),
     ] = None,
     at: TrajectoryPoint = "body",
-    week: TrajectoryWeek = None,
+    week: Annotated[
+        int | None, typer.Option(help="GPS week of a trajectory or of points that say none.", min=0)
+    ] = None,
     calibration: Annotated[
         list[str] | None, typer.Option(metavar="[SCANNER=]FILE", help="Of logs: instead of their own.")
     ] = None,

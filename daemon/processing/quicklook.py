@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.processing.point_times import time_notes
 from daemon.processing.quicklook_grids import FIRST, Surface, cell_for, frame_of, inner
 from daemon.processing.quicklook_profile import (
     Line,
@@ -293,6 +294,7 @@ def _notes(reading: _Reading, overlap: Overlap, cell_m: float | None, strip_cell
     """What was taken for granted, left out or changed."""
     notes = [reading.units.note] if reading.units.note else []
     notes += reading.book.notes
+    notes += time_notes([source.times for source in reading.sources])
     notes += [f"{source.path.name}: {source.damage}: partial" for source in reading.sources if source.damage]
     if any(source.crs is not None for source in reading.sources):
         without = [source.path.name for source in reading.sources if source.crs is None]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
+from daemon.processing.point_times import PointTimes, point_times_of
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
 from daemon.processing.quicklook_sidecar import height_unit_in, sessions_in, sidecar_of
 
@@ -102,6 +103,7 @@ class Source:
         trouble: why there is no CRS; empty: there is.
         low, high: (3,) corners of its header, in its own unit.
         sigmas: whether every point has three sigmas.
+        times: what its points' times are.
         sidecar: of the JSON beside it; empty: there is none.
         damage: why not all of it could be read; empty: it could.
         boxes_m: (4,) west, south, east, north of each block read.
@@ -116,6 +118,7 @@ class Source:
     low: FloatArray
     high: FloatArray
     sigmas: bool
+    times: PointTimes
     sidecar: dict[str, Any] = field(default_factory=dict)
     damage: str = ""
     boxes_m: list[FloatArray] = field(default_factory=list)
@@ -226,6 +229,7 @@ def open_source(path: Path) -> Source:
         low=low,
         high=high,
         sigmas=names.issuperset(SIGMA_NAMES),
+        times=point_times_of(path),
         sidecar=sidecar_of(path),
     )
 

@@ -29,22 +29,25 @@ from calib.strip_cells import (
 from calib.trajectory_errors import TrajectoryPrior
 from daemon.errors import ExitCode, UserError
 from daemon.processing.carried_verdict import Carried
+from daemon.processing.point_times import PointClock
 from daemon.processing.quicklook import Look, StripFacts, look_at
 from daemon.processing.quicklook_grids import Surface, cell_for, frame_of
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
 from daemon.processing.quicklook_read import NOISE_CLASSES, QuickLookError, StripBook, Units
 from daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE
 from daemon.processing.strip_agreement import compare_flight, corners_of
+from georef.formats.trajectory_columns import LATEST_NS
 from georef.formats.trajectory_file import read_trajectory
 from georef.mapping import Mapping, MappingError
-from georef.trajectory import Trajectory, TrajectoryError
+from georef.records import Int64Array
+from georef.timescales.gps_time import WEEK_NS
+from georef.trajectory import Trajectory, TrajectoryError, gps_text
 
 FloatArray = NDArray[np.float64]
 Told = Callable[[str, int, int], None]
 
 BLOCK_POINTS = 500_000
 TRAJECTORY = "_trajectory.csv"
-LAS_EPOCH_S = 1_000_000_000  # of adjusted standard GPS time
 WANTED = Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
 WANTED |= Selection.POINT_SOURCE_ID | Selection.GPS_TIME
 
@@ -74,13 +77,21 @@ class Strips:
     carried: list[Carried] = field(default_factory=list)
 
 
-def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Strips:
+def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told, week: int | None = None) -> Strips:
     """Of LAS or LAZ files and folders.
+
+    Args:
+        paths: of them.
+        rules: of the comparison.
+        told: is told how far it is.
+        week: GPS week of times that say none; None: that of the trajectory beside the points.
 
     Raises:
         UserError: they cannot be read, or are one strip.
     """
     what = ", ".join(map(str, paths))
+    if week is not None and week > LATEST_NS // WEEK_NS:
+        raise UserError(f"--week {week} is no GPS week; want whole weeks since 1980, such as 2423", ExitCode.USAGE)
     try:
         look = look_at(paths, strip_cell_m=rules.cell_m, told=lambda done, of: told(f"reading {what}", done, of))
     except QuickLookError as error:
@@ -88,15 +99,18 @@ def strips_of_files(paths: Sequence[Path], rules: StripRules, told: Told) -> Str
     notes = list(look.notes)
     refuse_one(what, look)
     cells = cells_of(look, rules)
-    gathered = gather(_file_blocks(look), cells)
+    seen, place, trouble = None, None, "there is no trajectory beside the points; want a folder of swath georef"
     try:
         seen, place = _seen_from(look)
     except (TrajectoryError, MappingError, OSError, KeyError, TypeError, AttributeError, ValueError) as error:
-        notes.append(f"{what}: no signatures: {error}")
+        trouble = str(error)
+    clock = PointClock([source.times for source in look.sources], week, None if seen is None else _middle_ns(seen))
+    notes += clock.notes
+    gathered = gather(_file_blocks(look, clock), cells)
+    if seen is None or place is None:
+        notes.append(f"{what}: no signatures: {trouble}")
         return Strips(what, look, gathered, cells.cell_m, None, notes=notes)
-    if seen is None:
-        notes.append(f"{what}: no signatures: there is no trajectory beside the points; want a folder of swath georef")
-        return Strips(what, look, gathered, cells.cell_m, None, notes=notes)
+    notes += _times_apart(gathered, seen)
     return Strips(what, look, replace(gathered, points=place(gathered.points)), cells.cell_m, seen, notes=notes)
 
 
@@ -157,32 +171,68 @@ def cells_of(look: Look, rules: StripRules) -> Cells:
 # ---------------------------------------------------------------------- files
 
 
-def _file_blocks(look: Look) -> Iterator[tuple[int, StripBlock]]:
+def _file_blocks(look: Look, clock: PointClock) -> Iterator[tuple[int, StripBlock]]:
     """Blocks by strip, numbered as the quick look numbered them: it read the same files in the same order."""
     book = StripBook()
     for source in look.sources:
         try:
             with PointReader(source.path, WANTED) as reader:
                 while len(points := reader.read(BLOCK_POINTS)):
-                    yield from _by_strip(points, book.numbers(source, np.asarray(points["point_source_id"])), look)
+                    strip = book.numbers(source, np.asarray(points["point_source_id"]))
+                    yield from _by_strip(points, strip, _time_ns(points, source.path, clock), look)
         except UNREADABLE:
             continue  # the quick look has noted the damage
 
 
-def _by_strip(points: Any, strip: NDArray[np.int32], look: Look) -> Iterator[tuple[int, StripBlock]]:
+def _time_ns(points: Any, path: Path, clock: PointClock) -> Int64Array:
+    """Return GPS times (n,) of a file's points; 0 where it has none."""
+    if "gps_time" not in points.point_format.dimension_names:
+        return np.zeros(len(points), np.int64)
+    return clock.time_ns(path, np.asarray(points["gps_time"], np.float64))
+
+
+def _by_strip(
+    points: Any, strip: NDArray[np.int32], time_ns: Int64Array, look: Look
+) -> Iterator[tuple[int, StripBlock]]:
     good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES) & (np.asarray(points["withheld"]) == 0)
     units = look.units
     places = np.stack([points.x * units.east_m, points.y * units.north_m, points.z * units.up_m], axis=1)
-    time_ns = np.zeros(len(strip), np.int64)
-    if "gps_time" in points.point_format.dimension_names:
-        seconds = np.asarray(points["gps_time"], np.float64)
-        time_ns = np.rint(seconds * 1e9).astype(np.int64) + LAS_EPOCH_S * 1_000_000_000
     flag = np.asarray(points["scan_direction_flag"])
     direction = (2 * flag.astype(np.int8) - 1) * np.int8(flag.any() and not flag.all())
     single = np.asarray(points["number_of_returns"]) <= 1
     for number in np.unique(strip[good]):
         own = good & (strip == number)
         yield int(number), StripBlock(np.asarray(places[own]), time_ns[own], single[own], direction[own])
+
+
+def _middle_ns(seen: SeenFrom) -> int | None:
+    """Return the middle of the flight by its trajectories; None: they are of more than one week."""
+    begin = min(trajectory.span[0] for trajectory in seen.trajectories)
+    end = max(trajectory.span[1] for trajectory in seen.trajectories)
+    return (begin + end) // 2 if end - begin < WEEK_NS // 2 else None
+
+
+def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
+    """Return a line where most returns are of other times than their strips' trajectories."""
+    outside = 0
+    for number, flown in enumerate(seen.flown):
+        begin, end = seen.trajectories[flown].span
+        times = strips.time_ns[strips.strip == number]
+        outside += int(((times < begin) | (times > end)).sum())
+    if 2 * outside <= len(strips.time_ns):
+        return []
+    spans = [
+        f"{gps_text(int(begin))} to {gps_text(int(end))}"
+        for begin, end in (
+            (strips.time_ns.min(), strips.time_ns.max()),
+            (min(one.span[0] for one in seen.trajectories), max(one.span[1] for one in seen.trajectories)),
+        )
+    ]
+    share = 100.0 * outside / len(strips.time_ns)
+    return [
+        f"{share:.0f} % of the points are of other times, {spans[0]}, than the trajectory beside them, {spans[1]}: "
+        "what the differences look like is not told of them; want the header's GPS time type, or --week, mended"
+    ]
 
 
 def _seen_from(look: Look) -> tuple[SeenFrom | None, Callable[[FloatArray], FloatArray]]:

@@ -117,7 +117,7 @@ def _kind(path: Path) -> str:
 
 def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> Strips:
     if not is_of_logs(paths):
-        strips = strips_of_files(paths, wish.rules, told)
+        strips = strips_of_files(paths, wish.rules, told, wish.logs.trajectory.week)
         strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
         return strips
     folder.mkdir(parents=True, exist_ok=True)

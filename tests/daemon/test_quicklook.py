@@ -53,10 +53,15 @@ def write(
     sigma_m: tuple[Array | float, ...] | None = None,
     point_format: int = 6,
     scale: float = 0.0001,
+    adjusted: bool = True,
     **columns: Array | int,
 ) -> Path:
-    """A file of points; all are single returns unless the columns say otherwise."""
+    """A file of points; all are single returns unless the columns say otherwise.
+
+    Its header says that GPS times are adjusted standard ones, or else seconds of the week.
+    """
     header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType(int(adjusted))
     header.scales, header.offsets = np.full(3, scale), np.floor([x.min(), y.min(), 0.0])
     if crs is not None:
         header.add_crs(crs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from daemon.processing.strips_inputs import strips_of_files, strips_of_flight
 from daemon.processing.strips_run import refuse_installations
 from georef.formats.trajectory_csv import csv_text
 from georef.mapping import Mapping
+from georef.timescales.gps_time import WEEK_NS
 from tests.calib.cast_flight import Cast, cast_flight
 from tests.daemon.standin import aircraft_config
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
@@ -65,13 +67,19 @@ def products(
     *,
     session: str = "a",
     up_m: float = 0.0,
+    of_week: Sequence[int] = (),
 ) -> Path:
-    """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar."""
+    """A flight's points as a folder of `swath georef`: LAZ a strip, trajectory, sidecar.
+
+    Strips ``of_week`` have the seconds of the GPS week, as other programs write them.
+    """
     folder.mkdir()
     mapping = mapping or Mapping("EPSG:25832", datum="same")
     for number, swath in enumerate(flight.swaths, start=1):
         points = mapping.map_from_e(flight.frame.e_from_t(np.asarray(swath.points_t)))
         seconds = (swath.time_ns - 1_000_000_000_000_000_000) / 1e9
+        if number in of_week:
+            seconds = swath.time_ns % WEEK_NS / 1e9
         number_of = np.asarray(swath.rows["number_of_returns"])
         write(
             folder / f"a_strip{number:02d}.laz",
@@ -80,6 +88,7 @@ def products(
             points[:, 2] + up_m,
             number,
             crs=CRS.from_epsg(25832),
+            adjusted=number not in of_week,
             gps_time=seconds,
             return_number=np.asarray(swath.rows["return_number"]),
             number_of_returns=number_of,
@@ -245,6 +254,29 @@ def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, 
     folders = [products(tmp_path / name, made.flight) for name in ("left", "right")]
     strips = strips_of_files(folders, StripRules(), lambda what, done, of: None)
     assert (strips.look.names, strips.notes) == (["1", "2"], [])
+
+
+@pytest.mark.parametrize("of_week", [(2,), (1, 2)])
+def test_seconds_of_the_week_are_of_the_trajectory_beside_them(
+    made: Cast, tmp_path: Path, of_week: tuple[int, ...]
+) -> None:
+    """By the header of each file; files that mix both kinds are named."""
+    folder = products(tmp_path / "p", made.flight, of_week=of_week)
+    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None)
+    begin, end = made.flight.trajectories[0].span
+    assert ((strips.gathered.time_ns >= begin) & (strips.gathered.time_ns <= end)).all()
+    mixed = "files mix times: seconds of the GPS week in a_strip02.laz; adjusted standard GPS time in a_strip01.laz"
+    assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
+
+
+def test_points_of_another_time_than_their_trajectory_are_said_to_be(made: Cast, tmp_path: Path) -> None:
+    folder = products(tmp_path / "p", made.flight, of_week=(1, 2))
+    week = made.flight.trajectories[0].span[0] // WEEK_NS
+    strips = strips_of_files([folder], StripRules(), lambda what, done, of: None, week - 1)
+    assert len(strips.notes) == 1
+    assert strips.notes[0].startswith("100 % of the points are of other times")
+    with pytest.raises(UserError, match="--week 24233 is no GPS week; want whole weeks since 1980"):
+        strips_of_files([folder], StripRules(), lambda what, done, of: None, 24233)
 
 
 def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> None:

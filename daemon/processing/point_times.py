@@ -1,0 +1,175 @@
+"""GPS times of points in LAS files: seconds of the week or adjusted standard time, as each file's header says.
+
+LAS 1.4 R15, 2.4: bit 0 of the global encoding is 0 for seconds of the GPS week, 1 for adjusted standard GPS time. Files
+of both kinds are merged and delivered side by side, and some headers say one and mean the other.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from laspy.header import GpsTimeType
+from numpy.typing import NDArray
+
+from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, open_points
+from georef.records import Int64Array
+from georef.timescales.gps_time import GPS_EPOCH, LAS_ADJUSTED_ZERO_S, SECOND_NS, WEEK_NS, WEEK_S
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+SAMPLED_POINTS = 1000
+OF_WEEK_BELOW_S = 2 * WEEK_S  # a flight that goes on beyond the week's end may be counted on
+NAMED_FILES = 3
+LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
+
+
+class TimeKind(Enum):
+    """What the times of a file's points are."""
+
+    NONE = "no GPS times"
+    OF_WEEK = "seconds of the GPS week"
+    ADJUSTED = "adjusted standard GPS time"
+
+
+@dataclass(frozen=True, eq=False)
+class PointTimes:
+    """Times of a file's points.
+
+    Attributes:
+        path: the file.
+        kind: what its times are; decided by the header unless the times contradict it.
+        sample_s: (k,) times of the first points, seconds as in the file.
+        doubt: why the header is not believed, or not likely to be right, one line; empty: nothing speaks against it.
+    """
+
+    path: Path
+    kind: TimeKind
+    sample_s: FloatArray
+    doubt: str = ""
+
+
+def point_times_of(path: Path) -> PointTimes:
+    """Return what the times of a file's points are, by its header and its first points; no raise.
+
+    A file that cannot be read has none: whoever reads its points says why.
+    """
+    try:
+        with open_points(path) as reader:
+            header = reader.header
+        if "gps_time" not in header.point_format.dimension_names:
+            return PointTimes(path, TimeKind.NONE, np.zeros(0))
+        with PointReader(path, Selection.XY_RETURNS_CHANNEL | Selection.GPS_TIME) as points:
+            seconds = np.asarray(points.read(SAMPLED_POINTS)["gps_time"], np.float64)
+    except UNREADABLE:
+        return PointTimes(path, TimeKind.NONE, np.zeros(0))
+    seconds = seconds[np.isfinite(seconds) & (np.abs(seconds) < LARGEST_S)]
+    if not seconds.any():
+        return PointTimes(path, TimeKind.NONE, np.zeros(0))
+    kind = TimeKind.ADJUSTED if header.global_encoding.gps_time_type == GpsTimeType.STANDARD else TimeKind.OF_WEEK
+    return _weighed(path, kind, seconds)
+
+
+def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
+    """Return the times with what the numbers themselves say against the header."""
+    low, high = float(seconds.min()), float(seconds.max())
+    if said is TimeKind.OF_WEEK and not 0.0 <= low <= high < OF_WEEK_BELOW_S:
+        doubt = (
+            f"{path}: its header says {said.value}, but its times, from {low:,.0f} s on, are none; "
+            f"taken for {TimeKind.ADJUSTED.value}: set bit 0 of the header's global encoding"
+        )
+        return PointTimes(path, TimeKind.ADJUSTED, seconds, doubt)
+    if said is TimeKind.ADJUSTED and 0.0 <= low <= high <= WEEK_S:
+        day = GPS_EPOCH + dt.timedelta(seconds=LAS_ADJUSTED_ZERO_S + low)
+        doubt = (
+            f"{path}: its header says {said.value}, by which its times, from {low:,.0f} s on, are of {day}; if they "
+            f"are {TimeKind.OF_WEEK.value}, clear bit 0 of the header's global encoding"
+        )
+        return PointTimes(path, said, seconds, doubt)
+    return PointTimes(path, said, seconds)
+
+
+def time_notes(times: Sequence[PointTimes]) -> list[str]:
+    """Return lines on files whose header is doubtful, and on files that mix kinds of times."""
+    notes = [one.doubt for one in times if one.doubt]
+    of_week = [one.path.name for one in times if one.kind is TimeKind.OF_WEEK]
+    adjusted = [one.path.name for one in times if one.kind is TimeKind.ADJUSTED]
+    if of_week and adjusted:
+        notes.append(
+            f"files mix times: {TimeKind.OF_WEEK.value} in {_named(of_week)}; {TimeKind.ADJUSTED.value} in "
+            f"{_named(adjusted)}; a file merged of them needs one kind"
+        )
+    return notes
+
+
+def _named(names: Sequence[str]) -> str:
+    more = len(names) - NAMED_FILES
+    return ", ".join(names[:NAMED_FILES]) + (f" and {more} more" if more > 0 else "")
+
+
+class PointClock:
+    """GPS times of points of several files, of which some say seconds of a week only."""
+
+    def __init__(self, times: Sequence[PointTimes], week: int | None = None, near_ns: int | None = None) -> None:
+        """Take what is known of the files.
+
+        Args:
+            times: of all files.
+            week: GPS week of the first of the times that say none; None: it was not given.
+            near_ns: a GPS time of the flight, by a trajectory beside the points; None: there is none.
+        """
+        self._kinds = {one.path: one.kind for one in times}
+        of_week = [one.sample_s for one in times if one.kind is TimeKind.OF_WEEK]
+        adjusted = [one.sample_s for one in times if one.kind is TimeKind.ADJUSTED]
+        self.notes: list[str] = []
+        self._near_ns = 0
+        if of_week:
+            first_ns, length_ns = _span_of_week(np.concatenate(of_week))
+            self._near_ns = first_ns + length_ns // 2
+            if week is not None:
+                self._near_ns += week * WEEK_NS
+            elif near_ns is not None:
+                self._near_ns = near_ns
+            elif adjusted:
+                self._near_ns = int(_adjusted_ns(np.array([np.median(np.concatenate(adjusted))]))[0])
+            else:
+                self.notes.append(_untold([one.path.name for one in times if one.kind is TimeKind.OF_WEEK]))
+
+    def time_ns(self, path: Path, seconds: FloatArray) -> Int64Array:
+        """Return GPS times (n,) of seconds (n,) as a file has them; 0 where it has no time that can be."""
+        known = np.isfinite(seconds) & (np.abs(seconds) < LARGEST_S)
+        seconds = np.where(known, seconds, 0.0)
+        kind = self._kinds.get(path, TimeKind.NONE)
+        if kind is TimeKind.NONE:
+            return np.zeros(len(seconds), np.int64)
+        if kind is TimeKind.ADJUSTED:
+            return np.where(known, _adjusted_ns(seconds), 0)
+        of_week_ns = np.rint(seconds * SECOND_NS).astype(np.int64)
+        away_ns = (of_week_ns - self._near_ns + WEEK_NS // 2) % WEEK_NS - WEEK_NS // 2
+        return np.where(known, self._near_ns + away_ns, 0)
+
+
+def _adjusted_ns(seconds: FloatArray) -> Int64Array:
+    whole = np.rint(seconds * SECOND_NS).astype(np.int64)
+    return np.asarray(whole + LAS_ADJUSTED_ZERO_S * SECOND_NS)
+
+
+def _span_of_week(seconds: FloatArray) -> tuple[int, int]:
+    """Return first and length, ns, of the shortest span that has all of some times of a week, over its end or not."""
+    times = np.unique(np.rint((seconds % WEEK_S) * SECOND_NS).astype(np.int64))
+    gaps = np.diff(times, append=times[0] + WEEK_NS)
+    last = int(np.argmax(gaps))
+    first_ns = int(times[(last + 1) % len(times)])
+    return first_ns, int(WEEK_NS - gaps[last])
+
+
+def _untold(names: Sequence[str]) -> str:
+    return (
+        f"{_named(names)}: times are {TimeKind.OF_WEEK.value}, and nothing says of which; they count among themselves "
+        "only: give it with --week"
+    )
