@@ -114,7 +114,8 @@ def lines_of(case: Case) -> tuple[Line, ...]:
 def true_errors(case: Case) -> dict[str, float]:
     """Return by how much each parameter is off its start, SI; nothing of what the made ranges do not know."""
     rng = np.random.default_rng([case.seed, 1])
-    known = {name: PARAMETERS[INDEX[name]].plausible for name in MODELS[case.model if case.model == "full" else "scanner"]}
+    names = MODELS[case.model if case.model == "full" else "scanner"]
+    known = {name: PARAMETERS[INDEX[name]].plausible for name in names}
     sizes = {**INSTALLED, **known}
     return {name: SHARE * size * float(rng.normal()) for name, size in sizes.items() if name not in NOT_MADE}
 
