@@ -24,6 +24,7 @@ THIN_POINTS = 2.0
 THIN_SPREAD = 0.15  # of a cell's size: standard deviation of points that lie on a line rather than on a plane
 _ONE_RETURN = 1
 _GOLDEN, _HIGH = whole(-7046029254386353131), whole(20)  # 2⁶⁴ over the golden ratio, and bits that are left out
+_SURELY = 3.0  # sigmas of a plane's direction
 _REFIT_SHARE = 1.15  # a growing plane is fitted anew when it has so many times the points of its last fit
 
 
@@ -247,7 +248,9 @@ def grow(
     """Planes grown from good cells, best first, over their eight neighbours.
 
     A plane that came to its end is fitted anew and begins again at all its cells, until none joins. Level planes end
-    where tiles of the grid end, so that all swaths cut the ground alike; steep ones at their edges.
+    where tiles of the grid end, so that all swaths cut the ground alike; steep ones at their edges. A plane counts as
+    level until, come to its end, it is steep beyond doubt, and again when it no longer is: one cell of a slope may look
+    steeper than it is, and a plane that began there would go on over all the ground of its swath.
 
     Args:
         order: good cells, those to begin with first.
@@ -273,7 +276,7 @@ def grow(
         region = regions[count]
         region[:] = moments[seed]
         doubt = _refitted(region, plane, sigma_m)
-        flat = plane[2] >= level
+        flat = True
         home_column, home_row = (seed % columns + east) // tile, (seed // columns + north) // tile
         label[seed] = count
         fitted, size, begun, at_last, members[0] = region[0], 1, 0, 0, seed
@@ -283,6 +286,7 @@ def grow(
                     break
                 at_last, begun = size, 0
                 doubt, fitted = _refitted(region, plane, sigma_m), region[0]
+                flat = plane[2] >= math.cos(math.acos(level) + _SURELY * doubt)
             here = members[begun]
             begun += 1
             row, column = here // columns, here % columns
@@ -306,6 +310,7 @@ def grow(
                     size += 1
                     if region[0] > _REFIT_SHARE * fitted:
                         doubt, fitted = _refitted(region, plane, sigma_m), region[0]
+                        flat = flat or plane[2] >= level
         count += 1
     return count
 

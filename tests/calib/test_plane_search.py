@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib.features import Features, Plane
 from calib.flight import Flight
 from calib.plane_fit import fit_sight
-from calib.plane_kernels import MOMENTS, accumulate, fill_table, fit_cells, gather
+from calib.plane_kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
 from calib.plane_search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
 from sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
 from tests.calib.cast_flight import Cast, Line, cast_flight
@@ -342,6 +342,37 @@ def test_cells_have_the_planes_of_their_points() -> None:
         np.testing.assert_allclose(moments[at, 1:4], mine.mean(axis=0), rtol=0, atol=1e-9)
         assert abs(normal[at] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-10)
         assert rms_m[at] == pytest.approx(np.sqrt(values[0] * len(mine) / (len(mine) - 3)), rel=1e-6)
+
+
+def _grown_over(slope_rad: float, sigma_m: float, limit_rad: float) -> NDArray[np.int32]:
+    """(40, 40) number of the plane of each cell of 1.5 m with six returns, on a slope up to the east, of noise."""
+    draws, corner, shape, count = np.random.default_rng(8), (0.0, 0.0, 1.5), (40, 40), 1600
+    points = draws.uniform(0.0, 60.0, (6 * count, 3))
+    points[:, 2] = np.tan(slope_rad) * points[:, 0] + sigma_m * draws.standard_normal(6 * count)
+    moments, base = np.zeros((count, MOMENTS)), np.zeros(count)
+    several, seen = np.zeros(count, np.int32), np.zeros(count, np.int64)
+    accumulate(points, np.ones(6 * count, np.uint8), 0, corner, shape, moments, base, several, seen)
+    normal, rms_m, what = np.zeros((count, 3)), np.zeros(count), np.zeros(count, np.uint8)
+    fit_cells(moments, base, several, corner, 40, (5.0, 0.3, 1.5 * sigma_m, 0.4), normal, rms_m, what)
+    good = np.flatnonzero(what == GOOD)
+    order = good[np.argsort(rms_m[good], kind="stable")]
+    label, regions = np.full(count, -1, np.int32), np.zeros((len(order), MOMENTS))
+    limits = (1.5 * sigma_m, sigma_m, float(np.cos(np.radians(15.0))), float(np.cos(limit_rad)))
+    grow(order, what, moments, normal, shape, (10, 0, 0), limits, label, regions)
+    return label.reshape(shape)
+
+
+def test_sloping_ground_ends_where_tiles_end_whatever_single_cells_look_like() -> None:
+    """A cell of it may look steeper than ground is, and what began there went on over all the ground of a swath."""
+    label = _grown_over(np.radians(7.0), 0.04, np.radians(10.0))
+    tile = np.add.outer(4 * (np.arange(40) // 10), np.arange(40) // 10)
+    for plane in np.unique(label[label >= 0]):
+        assert len(np.unique(tile[label == plane])) == 1
+
+
+def test_a_steep_face_goes_on_beyond_tiles() -> None:
+    label = _grown_over(np.radians(20.0), 0.04, np.radians(10.0))
+    assert np.bincount(label[label >= 0]).max() > 0.9 * label.size
 
 
 def test_the_table_of_cells_finds_what_a_search_through_all_finds() -> None:
