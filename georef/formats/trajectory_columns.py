@@ -21,6 +21,7 @@ LOWEST_M, HIGHEST_M = -1000.0, 50_000.0
 GREATEST_SPEED_MPS = 1000.0
 GREATEST_SAID_MPS, GREATEST_SIGMA = 1e5, 1e6  # of single rows: beyond, numbers mean something else
 EARLIEST_NS, LATEST_NS = 0, 1 << 62  # GPS time, 1980 to 2126: differences of times stay within 64 bits
+LONGEST_GAP_AT_WEEKS_END_S = 3600.0  # of epochs left out between Saturday and Sunday
 COURSE_FROM_MPS, GREATEST_COURSE_ERROR_RAD, COURSE_OUTLIERS = 20.0, float(np.radians(5.0)), 0.01
 COURSE_PIECE_NS, LONGEST_PIECE_NS = SECOND_NS, 3 * SECOND_NS  # pieces of flight whose course is looked at
 HEADING_OFF_RAD = float(np.radians(45.0))  # more than any drift angle
@@ -100,7 +101,7 @@ def trajectory_of(columns: TrajectoryColumns, name: str, max_gap_ns: int) -> Tra
 def continuous_of_week(time_s: FloatArray, name: str, row: str = "record", first_row: int = 1) -> Int64Array:
     """Nanoseconds since the start of the first one's week, of seconds of week that may begin anew at its end."""
     steps = np.diff(time_s)
-    crossing = np.abs(steps + WEEK_S) <= 1.0
+    crossing = (steps + WEEK_S >= -1.0) & (steps + WEEK_S <= LONGEST_GAP_AT_WEEKS_END_S)
     back = (steps < 0) & ~crossing
     if back.any():
         at = int(np.argmax(back))

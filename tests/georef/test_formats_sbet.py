@@ -225,6 +225,21 @@ def test_sigmas_that_begin_after_the_weeks_end() -> None:
         read_trajectory(sbet_bytes(trajectory), "s", week=WEEK, smrmsg=rows.tobytes())
 
 
+def test_epochs_left_out_between_saturday_and_sunday_cross_the_week() -> None:
+    """As where only the lines of a flight were exported, or at epochs of some seconds."""
+    end_ns = (WEEK + 1) * WEEK_S * 10**9
+    trajectory = flown(start_ns=end_ns - 10 * 10**9)
+    table = table_of(trajectory)
+    table[:, 0] %= WEEK_S
+    kept = (trajectory.time_ns < end_ns - 2 * 10**9) | (trajectory.time_ns > end_ns + 3 * 10**9)
+    back = read(table[kept], week=WEEK)
+    np.testing.assert_allclose(back.time_ns, trajectory.time_ns[kept], atol=100)
+    early = table[kept].copy()
+    early[early[:, 0] < WEEK_S / 2, 0] += 4000.0
+    with pytest.raises(TrajectoryError, match="time goes back by"):
+        read(early, week=WEEK)
+
+
 def test_another_flight_is_told_with_both_spans() -> None:
     with pytest.raises(
         TrajectoryError,
