@@ -9,6 +9,10 @@ From the last node back, with the components taken and the transitions between n
 
     smoothed error of the filter's state: P λ        smoothed covariance: P − P Λ P
 
+Where the filter began off the mean of what was known before (`solve` begins again from the smoothed attitude), its
+errors have a mean from the start on: m ← Φ m, m ← (1 − K h) m. An innovation ν counts as ν − h m then, the smoothed
+error is m + P λ: the same as if that had begun at the mean, but linear about the better state.
+
 At a node the error goes onto the filter's state by the exponential. Between two nodes the filter's own path is bent so
 that it leaves from the one smoothed state and arrives at the next: attitude and velocity linearly, position by the
 cubic that has these velocities at its ends.
@@ -74,7 +78,7 @@ class SmoothedNodes:
         sensor_sigma: (m, n − 9) of the other errors, in the order of `error_model`.
         leave, arrive: (m, 9) smoothed − filtered position, velocity and attitude in e, with and without the node's
             observations.
-        separation, separation_sigma: (m, 9) filtered − smoothed, and its sigma.
+        separation, separation_sigma: (m, 9) filtered − smoothed, and its sigma; filtered with its errors' mean.
     """
 
     time_ns: Int64Array
@@ -97,8 +101,12 @@ def forward(run: FilterRun) -> Solution:
     return solution_of(run, None)
 
 
-def smooth_nodes(run: FilterRun) -> SmoothedNodes:
-    """Smooth the nodes of a run."""
+def smooth_nodes(run: FilterRun, mean: FloatArray | None = None) -> SmoothedNodes:
+    """Smooth the nodes of a run.
+
+    Args:
+        mean: (n,) of the errors, true − begun with, at the start; None: 0.
+    """
     n, m = run.layout.size, sum(len(block.time_ns) for block in run.nodes)
     out = SmoothedNodes(
         np.concatenate([block.time_ns for block in run.nodes]),
@@ -110,13 +118,16 @@ def smooth_nodes(run: FilterRun) -> SmoothedNodes:
         np.empty((m, 9)),
         np.empty((m, 9)),
     )
+    means, felt = _means(run, mean)
     adjoint, information = np.zeros(n), np.zeros((n, n))
     end = m
-    for block in reversed(run.nodes):
+    for block, of_components in zip(reversed(run.nodes), reversed(felt), strict=True):
         part = slice(end - len(block.time_ns), end)
         _backward(
             block,
             run.layout,
+            means[part],
+            of_components,
             adjoint,
             information,
             out.state[part],
@@ -130,6 +141,48 @@ def smooth_nodes(run: FilterRun) -> SmoothedNodes:
         run.storage.rest()
         end = part.start
     return out
+
+
+def _means(run: FilterRun, mean: FloatArray | None) -> tuple[FloatArray, list[FloatArray]]:
+    """(m, n) means of the errors at the nodes; by block, (k,) what innovations lose by them. Without a mean no rows."""
+    if mean is None:
+        return np.zeros((0, 0)), [np.zeros(0) for _ in run.nodes]
+    means = run.storage.empty((sum(len(block.time_ns) for block in run.nodes), run.layout.size), np.float64)
+    going, felt, begin = mean.copy(), [], 0
+    for block in run.nodes:
+        felt.append(np.empty(len(block.h)))
+        _forward(block, going, means[begin : begin + len(block.time_ns)], felt[-1])
+        begin += len(block.time_ns)
+    return means, felt
+
+
+@kept
+def _forward(nodes: Nodes, mean: FloatArray, means: FloatArray, felt: FloatArray) -> None:
+    """Carry the errors' mean (n,), which is changed, over a block of nodes.
+
+    Args:
+        means: (c, n) is filled, with the nodes' observations.
+        felt: (k,) is filled: what each component's innovation over its variance loses.
+    """
+    n, core = len(mean), nodes.top.shape[2]
+    moved = np.empty(MOVED)
+    for k in range(len(nodes.time_ns)):
+        for i in range(MOVED):
+            value = 0.0
+            for j in range(core):
+                value += nodes.top[k, i, j] * mean[j]
+            moved[i] = value
+        for i in range(n):
+            mean[i] = moved[i] if i < MOVED else mean[i] * nodes.decay[k, i]
+        end = nodes.first[k + 1] if k + 1 < len(nodes.time_ns) else len(nodes.h)
+        for i in range(nodes.first[k], end):
+            along = 0.0
+            for j in range(n):
+                along += nodes.h[i, j] * mean[j]
+            felt[i] = along * nodes.weighed[i, 1]
+            for j in range(n):
+                mean[j] -= nodes.gain[i, j] * along
+        copy_into(means[k], mean)
 
 
 @kernel
@@ -157,9 +210,9 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def _over_component(
-    adjoint: FloatArray, information: FloatArray, h: FloatArray, gain: FloatArray, weighed: FloatArray
+    adjoint: FloatArray, information: FloatArray, h: FloatArray, gain: FloatArray, innovation: float, inverse: float
 ) -> None:
-    """λ and Λ from behind an observed component to before it."""
+    """λ and Λ from behind an observed component to before it: its innovation, and 1, over its variance."""
     n = len(adjoint)
     along, through = 0.0, 0.0
     seen = np.empty(n)
@@ -172,9 +225,9 @@ def _over_component(
     for i in range(n):
         through += gain[i] * seen[i]
     for i in range(n):
-        adjoint[i] += h[i] * (weighed[0] - along)
+        adjoint[i] += h[i] * (innovation - along)
         for j in range(n):
-            information[i, j] += h[i] * h[j] * (through + weighed[1]) - h[i] * seen[j] - seen[i] * h[j]
+            information[i, j] += h[i] * h[j] * (through + inverse) - h[i] * seen[j] - seen[i] * h[j]
 
 
 @kernel
@@ -257,13 +310,13 @@ def _position_sigmas_in_gnss_time(x: FloatArray, p: FloatArray, late: int, sigma
 
 @kept
 def _backward(
-    nodes: Nodes, layout: Layout, adjoint: FloatArray, information: FloatArray, state: FloatArray, sigma: FloatArray,
-    sensor_sigma: FloatArray, leave: FloatArray, arrive: FloatArray, separation: FloatArray,
-    separation_sigma: FloatArray,
+    nodes: Nodes, layout: Layout, means: FloatArray, felt: FloatArray, adjoint: FloatArray, information: FloatArray,
+    state: FloatArray, sigma: FloatArray, sensor_sigma: FloatArray, leave: FloatArray, arrive: FloatArray,
+    separation: FloatArray, separation_sigma: FloatArray,
 ) -> None:  # fmt: skip
     n = len(adjoint)
     p, once, twice = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    error, end = np.empty(n), len(nodes.h)
+    error, whole, end = np.empty(n), np.empty(n), len(nodes.h)
     for k in range(len(nodes.time_ns) - 1, -1, -1):
         _unpack(nodes.covariance[k], p)
         for i in range(n):
@@ -271,9 +324,10 @@ def _backward(
             for j in range(n):
                 value += p[i, j] * adjoint[j]
             error[i] = value
+            whole[i] = value + (means[k, i] if len(means) > 0 else 0.0)
         copy_into(state[k], nodes.after[k])
-        inject(state[k], error, layout)
-        copy_into(leave[k], error)
+        inject(state[k], whole, layout)
+        copy_into(leave[k], whole)
         difference(state[k], nodes.before[k], arrive[k])
         _separate(state[k], error, separation[k])
         _product(information, p, once)
@@ -288,7 +342,8 @@ def _backward(
         for i in range(MOVED, n):
             sensor_sigma[k, i - MOVED] = math.sqrt(max(p[i, i], 0.0))
         for i in range(end - 1, nodes.first[k] - 1, -1):
-            _over_component(adjoint, information, nodes.h[i], nodes.gain[i], nodes.weighed[i])
+            innovation = nodes.weighed[i, 0] - (felt[i] if len(felt) > 0 else 0.0)
+            _over_component(adjoint, information, nodes.h[i], nodes.gain[i], innovation, nodes.weighed[i, 1])
         end = nodes.first[k]
         _over_way(adjoint, information, nodes.top[k], nodes.decay[k], once)
 

@@ -1,9 +1,10 @@
 """A whole flight: filter, smoother, the noise found, and further passes from where the smoothed flight began.
 
 The filter is linear about its own state, which is poor while the heading is hardly known: a pass that begins with the
-smoothed attitude has small errors from its first sample on, and with the prior sigmas kept it learns nothing twice that
-matters. A GNSS time offset is taken out of the observations' times likewise, so that what is left of it is small. The
-solutions are in GNSS's time, in which the laser fires too: the epochs of the inertial unit less the whole offset.
+smoothed attitude has small errors from its first sample on. What was known of the start stays as it was, its mean and
+its sigmas (`smoother`), so that nothing is learnt twice. A GNSS time offset is taken out of the observations' times
+likewise, so that what is left of it is small. The solutions are in GNSS's time, in which the laser fires too: the
+epochs of the inertial unit less the whole offset.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.cross_covariance import ErrorChain, error_chain
-from georef.navigation.filter import FilterRun, run_filter
+from georef.navigation.error_model import MOVED
+from georef.navigation.filter import FilterRun, run_filter, start_state
 from georef.navigation.inputs import Inertial, Setup, Solution, Start
 from georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
-from georef.navigation.smoother import SmoothedNodes, forward, smooth_nodes, solution_of
+from georef.navigation.smoother import SmoothedNodes, difference, forward, smooth_nodes, solution_of
 from georef.navigation.stores import IN_MEMORY, Storage
 from georef.navigation.strapdown import ATTITUDE, TIME_OFFSET
 from georef.records import StructArray
@@ -107,12 +109,12 @@ def solve(
             found = replace(found, setup=rescaled(setup, run.innovations[not_blunders(run.innovations)])[0])
         found = replace(found, setup=setup)
     flown, nodes = forward(run), smooth_nodes(run)
-    changes, offset_s = [_change(nodes)], 0.0
+    changes, offset_s, asked = [_change(nodes)], 0.0, start
     while (_bent(nodes) or abs(nodes.state[0, TIME_OFFSET]) > OFFSET_LEFT_S) and len(changes) < MOST_PASSES:
         offset_s += float(nodes.state[0, TIME_OFFSET])
         start = replace(start, attitude_rad=_attitude(nodes))
         run = run_filter(inertial, _shifted(observations, offset_s), setup, start, storage=storage)
-        nodes = smooth_nodes(run)
+        nodes = smooth_nodes(run, _mean(run, asked, offset_s))
         changes.append(_change(nodes))
     whole_s = offset_s + float(nodes.state[0, TIME_OFFSET])
     flown = _in_gnss_time(flown, 0.0, whole_s)
@@ -143,6 +145,15 @@ def _attitude(nodes: SmoothedNodes) -> FloatArray:
     lat, lon, _ = geodetic_from_e(nodes.state[0, :3])
     rot = rot_e_from_l(lat, lon).T @ rot_from_quaternion(nodes.state[0, ATTITUDE : ATTITUDE + 4])
     return np.array(attitude_of(rot), dtype=np.float64)
+
+
+def _mean(run: FilterRun, asked: Start, offset_s: float) -> FloatArray:
+    """(n,) mean of a run's errors at its start, by the start that was asked for and the time offset that was taken."""
+    mean = np.zeros(run.layout.size)
+    difference(start_state(run.setup, asked), start_state(run.setup, run.start), mean[:MOVED])
+    if run.layout.time_offset >= 0:
+        mean[run.layout.time_offset] = -offset_s
+    return mean
 
 
 def _change(nodes: SmoothedNodes) -> float:

@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from georef.navigation.error_model import MOVED
-from georef.navigation.filter import FilterRun, run_filter
-from georef.navigation.inputs import GRADES, Kind, Solution
-from georef.navigation.smoother import forward, smooth, smooth_nodes, solution_of
+from georef.navigation.filter import FilterRun, run_filter, start_state
+from georef.navigation.inputs import GRADES, Kind, Solution, Start
+from georef.navigation.smoother import difference, forward, smooth, smooth_nodes, solution_of
+from georef.quaternions import conjugate, product, rotation_vector
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import (
     LINES_S,
@@ -50,7 +51,7 @@ def test_the_reference_flight_is_smoothed_as_well_as_can_be(name: str) -> None:
     assert of_maxima(t, np.linalg.norm(off[:, :3], axis=1), spans) < 1.10 * OUTAGES_M[name][1]
 
 
-def flown(seed: int, **setup_keys: Any) -> FilterRun:
+def flown(seed: int, start: Start | None = None, **setup_keys: Any) -> FilterRun:
     truth = fly(survey(), 60.0, 50.0)
     inertial, rows = noised(truth, GRADES["mems"], Fixes(velocity_mps=0.05), ARM, seed)
     rows = rows[(rows["time_ns"] % 10**10 < 3 * 10**9) | (rows["kind"] == Kind.POSITION)]
@@ -58,7 +59,7 @@ def flown(seed: int, **setup_keys: Any) -> FilterRun:
         (rows["time_ns"] < rows["time_ns"][0] + 20 * 10**9) | (rows["time_ns"] > rows["time_ns"][0] + 35 * 10**9)
     ]
     setup = replace(setup_for(GRADES["mems"], ARM), **setup_keys)
-    return run_filter(inertial, rows, setup, drawn_start(truth, seed))
+    return run_filter(inertial, rows, setup, start or drawn_start(truth, seed))
 
 
 def dense(packed: FloatArray, n: int) -> FloatArray:
@@ -105,6 +106,24 @@ def test_the_adjoint_form_is_the_smoother_of_rauch_tung_and_striebel() -> None:
     block = run.nodes[0]
     learnt = nodes.state[:, 10:22] - block.after[:, 10:22]
     np.testing.assert_allclose(learnt / size[:, 9:21], errors_there[:, 9:21] / size[:, 9:21], rtol=0, atol=1e-4)
+
+
+def test_a_start_off_its_mean_is_as_one_begun_there() -> None:
+    """Begun 50 µrad off what was known before, and told: states to a hundredth of a sigma, sigmas to a thousandth."""
+    keys: dict[str, Any] = {"estimate_time_offset_s": 0.01, "gnss_correlated_share": 0.4}
+    there, off = flown(1, **keys), np.array([5e-5, -3e-5, 4e-5])
+    begun = replace(there.start, attitude_rad=there.start.attitude_rad + off)
+    run = flown(1, begun, **keys)
+    mean = np.zeros(run.layout.size)
+    difference(start_state(run.setup, there.start), start_state(run.setup, begun), mean[:MOVED])
+    expected, blind, found = smooth_nodes(there), smooth_nodes(run), smooth_nodes(run, mean)
+    turned = [rotation_vector(product(q.state[:, 6:10], conjugate(expected.state[:, 6:10]))) for q in (blind, found)]
+    least = expected.sigma[:, 6:].min()
+    assert np.abs(turned[0]).max() > 0.05 * least
+    assert np.abs(turned[1]).max() < 5e-3 * least
+    assert (np.abs(found.state - expected.state)[:, :6] < 1e-2 * expected.sigma[:, :6].min(axis=0)).all()
+    np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-3)
+    np.testing.assert_allclose(found.separation[:, 6:], expected.separation[:, 6:], rtol=0, atol=1e-2 * least)
 
 
 def test_a_sensor_without_errors_does_no_harm() -> None:
