@@ -56,6 +56,7 @@ def adjust(
     rematch: Rematch | None = None,
     first: Mapping[str, Calibration] | None = None,
     doubted: Mapping[str, float] | None = None,
+    entire: Rematch | None = None,
 ) -> Adjusted:
     """Estimate.
 
@@ -69,6 +70,8 @@ def adjust(
         rematch: finds the features anew with better calibrations; None, or if it gives None: they stay.
         first: by scanner, boresight angles from which iterations begin; None: from the start.
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
+        entire: gives everything that was observed, once correspondences of a part of it stay; None, or if it gives
+            None: that part is all.
 
     Returns:
         What was found. Sigmas are those that the observations' sigmas imply; where the global test rejects, times the
@@ -88,6 +91,9 @@ def adjust(
         last = rematch is None or matching == settings.matchings or (before is not None and _stable(before, found))
         again = None if last or rematch is None else rematch(placed_with)
         if again is None:
+            everything = None if entire is None else entire(placed_with)
+            if everything is not None:
+                found = settled(Block.of(flight, everything, asked, prior, placed_with), settings, found)
             return _adjusted(found, settings, matching)
         features = again
     raise ValueError(f"matchings: got {settings.matchings}, want at least 1")

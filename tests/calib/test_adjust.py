@@ -364,6 +364,28 @@ def test_correspondences_are_found_anew_until_they_are_stable() -> None:
     assert more.matchings == 3
 
 
+def test_everything_that_was_observed_is_adjusted_once_correspondences_stay() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    part = Features(tuple(built.features.planes[::2]))
+    asked: list[dict[str, Calibration]] = []
+
+    def everything(calibrations: dict[str, Calibration]) -> Features:
+        asked.append(calibrations)
+        return built.features
+
+    found = adjust(built.flight, part, Wish(), prior, rematch=lambda _: part, entire=everything)
+    whole = adjust(built.flight, built.features, Wish(), prior)
+    less = adjust(built.flight, part, Wish(), prior)
+    assert len(asked) == 1
+    np.testing.assert_allclose(asked[0]["left"].parameters, less.calibrations["left"].parameters, atol=1e-6)
+    np.testing.assert_allclose(found.values, whole.values, atol=0.05 * whole.sigmas.min())
+    np.testing.assert_allclose(found.sigmas, whole.sigmas, rtol=1e-3)
+    assert (found.sigmas < less.sigmas).all()
+    same = adjust(built.flight, part, Wish(), prior, entire=lambda _: None)
+    np.testing.assert_array_equal(same.values, less.values)
+
+
 def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
