@@ -287,13 +287,18 @@ def _trajectory(report: ReportInput) -> Iterator[tuple[str, float]]:
 
 
 def _correlated(report: ReportInput) -> Iterator[tuple[str, float]]:
-    adjusted = report.adjusted
+    """Tell pairs whose sum alone is known, but where points are known as well as is wanted: there the sum suffices."""
+    adjusted, need = report.adjusted, report.need
+    left_m = {} if need is None else need.left_m
+    enough = {scanner for scanner, left in left_m.items() if need is not None and left <= need.point_m}
     several = len(adjusted.calibrations) > 1
     at = [i for i, name in enumerate(adjusted.names) if unknown(name).is_parameter]
-    words = [words_of(one.scanner, one.name, several=several) for one in (unknown(adjusted.names[i]) for i in at)]
+    known = [unknown(adjusted.names[i]) for i in at]
+    words = [words_of(one.scanner, one.name, several=several) for one in known]
     matrix = np.abs(adjusted.correlation[np.ix_(at, at)])
     for i, j in np.argwhere(np.triu(matrix, 1) > MOST_CORRELATED):
-        yield f"{words[i]} and {words[j]}", float(matrix[i, j])
+        if not {known[i].scanner, known[j].scanner} <= enough:
+            yield f"{words[i]} and {words[j]}", float(matrix[i, j])
 
 
 def _sigmas_words(value: float) -> str:

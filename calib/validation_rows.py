@@ -28,6 +28,7 @@ FloatArray = NDArray[np.float64]
 FLOOR_M = 0.003  # of a distance, at most: what natural planes differ by from one sight to another
 HALF = math.sqrt(0.5)  # of the floor, each sight's
 FAR_M = 10.0
+FEWEST = 6  # returns of a sight
 MOST_ROWS = 1500
 FLOOR_ROWS = 500  # that the floor is estimated from: twenty factorisations
 
@@ -200,7 +201,7 @@ def plane_rows(
     values, firsts, seconds, names = [], [], [], []
     for plane in features.planes:
         sights = [_sight(flight, plane, number) for number in range(len(plane.patches))]
-        for first, second in combinations([one for one in sights if one.plane.count >= 6], 2):
+        for first, second in combinations([one for one in sights if one is not None], 2):
             away = first.plane.centre_t - second.plane.centre_t
             if abs(float(away @ second.plane.normal_t)) < FAR_M:
                 values.append(float(away @ second.plane.normal_t))
@@ -233,16 +234,21 @@ def plane_rows(
     )
 
 
-def _sight(flight: Flight, plane: Plane, number: int) -> _Sight:
+def _sight(flight: Flight, plane: Plane, number: int) -> _Sight | None:
+    """What a swath shows of a plane by those of its returns that have a place; None: too few have."""
     patch = plane.patches[number]
     swath = flight.swaths[patch.swath]
     points = np.asarray(swath.points_t[patch.at])
+    there = np.isfinite(points).all(axis=1)
+    if there.sum() < FEWEST:
+        return None
+    points, at = points[there], patch.at[there]
     fit = plane_through(points)
     spread_m = float(np.linalg.svd(points - fit.centre_t, compute_uv=False)[1]) / math.sqrt(fit.count)
     if fit.normal_t @ plane.normal_t < 0.0:
         fit = LocalPlane(fit.centre_t, -fit.normal_t, fit.rms_m, fit.count)
-    times = swath.time_ns[patch.at]
-    rate = 0.0 if swath.encoder_rate is None else float(np.mean(np.sign(swath.encoder_rate[patch.at])))
+    times = swath.time_ns[at]
+    rate = 0.0 if swath.encoder_rate is None else float(np.mean(np.sign(swath.encoder_rate[at])))
     return _Sight(patch.swath, fit, int(times[0]) + int(np.mean(times - times[0])), rate, spread_m)
 
 

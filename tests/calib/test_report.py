@@ -82,6 +82,19 @@ def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
     assert verdict.sentence.startswith("Usable with care: not a boresight calibration: boresight φ (pitch), held, ")
 
 
+@pytest.mark.parametrize(("left_m", "level"), [(0.04, Level.GOOD), (0.06, Level.CARE)])
+def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wanted(
+    report: ReportInput, left_m: float, level: Level
+) -> None:
+    """What a calibration leaves in points holds the correlation: where that is little enough, the pair's sum does."""
+    correlation = np.eye(len(report.adjusted.names))
+    correlation[0, 1] = correlation[1, 0] = 0.97
+    need = Need(0.05, {}, 0.1, {"left": left_m})
+    verdict = judge(replace(sound(report, correlation=correlation), need=need))
+    assert verdict.level is level
+    assert any("told apart" in reason.what for reason in verdict.reasons) is (level is Level.CARE)
+
+
 @pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
 def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg: float, level: Level) -> None:
     """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""

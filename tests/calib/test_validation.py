@@ -386,6 +386,30 @@ def test_the_logs_of_the_calibration_itself_are_told(made: Cast) -> None:
     assert same_logs(made.truth, [("b.mcap", "12ab")]) == ()
 
 
+def test_returns_without_a_place_are_no_part_of_a_sight(made: Cast, roofs: Features) -> None:
+    """A calibration that moves stamps beyond the trajectory's end leaves some returns without a place."""
+    flight = made.flight.placed({"left": made.truth})
+    prior = gauss_markov(flight)
+    plane = max(roofs.planes, key=lambda one: (len(one.patches), one.points))
+    first, second = plane.patches[:2]
+    swaths = list(flight.swaths)
+    for patch, lost in ((first, patch_part(first, 3)), (second, second.at)):
+        points = np.array(swaths[patch.swath].points_t)
+        points[lost] = np.nan
+        swaths[patch.swath] = replace(swaths[patch.swath], points_t=points)
+    less = replace(flight, swaths=tuple(swaths))
+    one = replace(roofs, planes=(plane,))
+    rows = plane_rows(less, one, {"left": made.truth}, prior)
+    assert np.isfinite(rows.value_m).all()
+    assert first.swath in rows.first
+    assert second.swath not in {*rows.first.tolist(), *rows.second.tolist()}
+
+
+def patch_part(patch: Patch, every: int) -> NDArray[np.int64]:
+    """One in so many of its returns."""
+    return patch.at[::every]
+
+
 def test_more_rows_than_can_be_tested_together_are_drawn_evenly(made: Cast) -> None:
     count = 4000
     rows = Rows(
