@@ -14,8 +14,7 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import get_database_metadata, query_utm_crs_info
+from pyproj.database import get_database_metadata
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
@@ -32,6 +31,7 @@ from georef.datums import (
 )
 from georef.earth import geodetic_from_e
 from georef.map_cells import APPROXIMATION_M, ROOT_M, MapCells
+from georef.map_fit import degrees_text, misfit_of, outside_deg
 
 __all__ = ["Mapping", "MappingError"]
 
@@ -40,9 +40,6 @@ FloatArray = NDArray[np.float64]
 EPOCHS = (1980.0, 2100.0)
 NEARBY_DEG = 0.5
 FAR_DEG = 9.0
-OVERLAP_M = 40_000.0  # by which zones of UTM overlap
-DEGREE_M = 111_200.0  # of a great circle
-GREATEST_SCALE = 0.005  # off 1
 
 
 class Mapping:
@@ -113,57 +110,13 @@ class Mapping:
         return np.array([*units, 1.0][:3])
 
     def misfit(self, points_e: FloatArray) -> str:
-        """Return why the frame does not suit positions in e (n, 3), with the one that would; empty: it suits.
-
-        It does not where one lies farther outside the CRS's area of use than neighbouring zones overlap, or where the
-        scale there is 0.5 % off 1: a metre of the map is not one on the ground.
-        """
+        """Return why the frame does not suit positions in e (n, 3), as of `misfit_of`; empty: it suits."""
         if self._geocentric or not len(points_e):
             return ""
         lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(points_e))
-        away_m = DEGREE_M * self._outside_deg(lat, lon)
-        factors = pyproj.Proj(self._target.horizontal).get_factors(lon, lat)
-        scales = np.stack([np.asarray(factors.meridional_scale), np.asarray(factors.parallel_scale)])
-        off = np.where(np.isfinite(scales), np.abs(scales - 1.0), np.inf).max(axis=0)
-        far, wide = away_m > OVERLAP_M, off > GREATEST_SCALE
-        if not (far.any() or wide.any()):
-            return ""
-        at = int(np.argmax(away_m)) if far.any() else int(np.argmax(off))
-        scale = float(scales[int(np.argmax(np.abs(scales[:, at] - 1.0))), at])
-        where = _degrees(float(lat[at]), float(lon[at]), 2)
-        outside = ""
-        if far.any() and (area := self._target.horizontal.area_of_use) is not None:
-            outside = (
-                f"is used from {area.west:g}° to {area.east:g}° E, {area.south:g}° to {area.north:g}° N, and "
-                f"{away_m[at] / 1e3:.0f} km away, "
-            )
-        return (
-            f'output.crs = "{self._target.text}" ({self._target.crs.name}) {outside}at {where} a metre on the ground '
-            f"is {scale:.4f} m of the map; {self._better(float(lat[at]), float(lon[at]))}"
+        return misfit_of(
+            self._target.horizontal, f'output.crs = "{self._target.text}" ({self._target.crs.name})', lat, lon
         )
-
-    def _outside_deg(self, lat: FloatArray, lon: FloatArray) -> FloatArray:
-        """Return how far positions (n,) in degrees lie outside the CRS's area of use, in degrees of a great circle."""
-        area = self._target.horizontal.area_of_use
-        if area is None:
-            return np.zeros(len(lat))
-        width = (area.east - area.west) % 360.0 or 360.0
-        east = (lon - area.west) % 360.0
-        beside = np.where(east <= width, 0.0, np.minimum(east - width, 360.0 - east)) * np.cos(np.radians(lat))
-        above = np.maximum(0.0, np.maximum(area.south - lat, lat - area.north))
-        outside: FloatArray = np.hypot(beside, above)
-        return outside
-
-    def _better(self, lat: float, lon: float) -> str:
-        """Return the zone of UTM there, on the frame's own datum where that has zones."""
-        geodetic = self._target.horizontal.geodetic_crs
-        place = AreaOfInterest(lon, lat, lon, lat)
-        for datum in (geodetic.name if geodetic is not None else "", "WGS 84"):
-            for info in query_utm_crs_info(datum_name=datum, area_of_interest=place):
-                zone = info.name.removeprefix(f"{datum} / UTM zone ")
-                if len(zone) <= len("32N"):  # not one with axes in another order
-                    return f'want "EPSG:{info.code}" ({info.name}), or another that is used there'
-        return "want one that is used there"
 
     def settle(self, points_e: ArrayLike) -> None:
         """Choose the operation for positions in e (n, 3), if that is still open: before work is shared out.
@@ -327,9 +280,9 @@ class Mapping:
         if area is None or not len(centre_e):
             return
         lat, lon, _ = (np.degrees(angle) for angle in geodetic_from_e(centre_e))
-        far = np.flatnonzero(self._outside_deg(lat, lon) > FAR_DEG)
+        far = np.flatnonzero(outside_deg(self._target.horizontal, lat, lon) > FAR_DEG)
         if len(far):
-            where = _degrees(float(lat[far[0]]), float(lon[far[0]]), 1)
+            where = degrees_text(float(lat[far[0]]), float(lon[far[0]]), 1)
             raise MappingError(
                 f'output.crs = "{self._target.text}" ({self._target.crs.name}) is used from {area.west:g}° to '
                 f"{area.east:g}° E, {area.south:g}° to {area.north:g}° N: points lie more than 1000 km outside, "
@@ -386,12 +339,7 @@ def _place(point_e: FloatArray) -> str:
     if not np.isfinite(point_e).all():
         return "positions that are not numbers"
     lat, lon, height = geodetic_from_e(point_e)
-    return f"{_degrees(math.degrees(float(lat)), math.degrees(float(lon)), 4)}, height {float(height):.0f} m"
-
-
-def _degrees(lat_deg: float, lon_deg: float, digits: int) -> str:
-    north, east = "NS"[lat_deg < 0.0], "EW"[lon_deg < 0.0]
-    return f"{abs(lat_deg):.{digits}f}° {north}, {abs(lon_deg):.{digits}f}° {east}"
+    return f"{degrees_text(math.degrees(float(lat)), math.degrees(float(lon)), 4)}, height {float(height):.0f} m"
 
 
 def _wkt(crs: CRS) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,12 +13,13 @@ import laspy
 import numpy as np
 from laspy.errors import LaspyException
 from numpy.typing import NDArray
-from pyproj import CRS
+from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError
 
 from daemon.processing.point_times import PointTimes, point_times_of
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
 from daemon.processing.quicklook_sidecar import height_unit_in, sessions_in, sidecar_of
+from georef.map_fit import misfit_of, scales_at
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -31,6 +32,7 @@ SIGMA_NAMES = ("sigma_easting", "sigma_northing", "sigma_height")
 NOISE_CLASSES = (7, 18)  # LAS 1.4 R15, table 17: low and high noise
 LARGEST_SCALE, FARTHEST = 1000.0, 1e9  # units of the coordinates, of any map there is
 MOST_CELLS = 1_000_000_000  # along a side, so that a cell's number has 64 bits
+FARTHEST_SCALE = 10.0  # of a map for one on the ground; beyond, the coordinates are of another map
 METRES_PER_DEGREE = 111_320.0  # of the equator; good to 0.5 % anywhere, for pictures only
 WANTED = (  # layers of LAZ that are decoded: all others would cost time and show nothing
     Selection.XY_RETURNS_CHANNEL
@@ -264,6 +266,14 @@ def units_of(sources: Sequence[Source]) -> Units:
     if not axes:
         return Units(note="the CRS names no unit: coordinates taken for metres")
     across_m, name = axes[0].unit_conversion_factor, axes[0].unit_name.replace("metre", "m")
+    flat_m, misfit = _on_the_ground(plain, known)
+    units = _projected(axes, across_m, name, known)
+    notes = "; ".join(filter(None, (units.note, misfit)))
+    return replace(units, east_m=units.east_m / flat_m, north_m=units.north_m / flat_m, note=notes)
+
+
+def _projected(axes: Sequence[Any], across_m: float, name: str, known: Sequence[Source]) -> Units:
+    """Return units of a map's axes, as their CRS says."""
     if len(axes) > 2:
         return Units(across_m, across_m, axes[2].unit_conversion_factor, name)
     if across_m == 1.0:
@@ -272,6 +282,29 @@ def units_of(sources: Sequence[Source]) -> Units:
     if said_m is not None:
         return Units(across_m, across_m, said_m, name)
     return Units(across_m, across_m, across_m, name, f"no vertical CRS: heights taken for {name}")
+
+
+def _on_the_ground(crs: CRS, sources: Sequence[Source]) -> tuple[float, str]:
+    """Return metres of a map for one on the ground in the files' middle, 1 where it is near; and what is wrong with it.
+
+    Of a map that is far from true to scale there, as web Mercator's, or whose area of use is elsewhere.
+    """
+    flat = crs.sub_crs_list[0] if crs.is_compound and crs.sub_crs_list else crs
+    middles = np.array([(source.low + source.high)[:2] / 2 for source in sources if source.point_count])
+    middles = middles[np.isfinite(middles).all(axis=1)]
+    if not flat.is_projected or not len(middles):
+        return 1.0, ""
+    lon_deg, lat_deg = Proj(flat)(middles[:, 0], middles[:, 1], inverse=True)
+    there = np.isfinite(lon_deg) & np.isfinite(lat_deg)
+    if not there.any():
+        return 1.0, f"{crs.name}: the coordinates are none of it; want the files' own CRS"
+    misfit = misfit_of(flat, crs.name, lat_deg[there], lon_deg[there])
+    if not misfit:
+        return 1.0, ""
+    scale = float(np.sqrt(np.median(scales_at(flat, lat_deg[there], lon_deg[there]).prod(axis=0))))
+    if not 1.0 / FARTHEST_SCALE < scale < FARTHEST_SCALE:
+        return 1.0, misfit
+    return scale, f"{misfit}; lengths and areas here are those on the ground"
 
 
 def check_one_crs(sources: Sequence[Source]) -> None:

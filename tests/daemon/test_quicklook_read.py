@@ -144,3 +144,30 @@ def test_differences_of_metres_are_told_in_metres(tmp_path: Path) -> None:
     numbers = look_at([tmp_path]).overlap.numbers()
     assert numbers is not None
     assert (numbers["median_m"], numbers["p95_m"]) == (pytest.approx(-2.5), pytest.approx(2.5))
+
+
+def test_lengths_on_a_map_far_from_true_to_scale_are_those_on_the_ground(tmp_path: Path) -> None:
+    """At 47.5° N web Mercator has 1.48 m for one on the ground, and so 2.19 times fewer pulses a square metre."""
+    x, y = lattice(990_000.0, 6_024_000.0, 300.0, 100.0, 0.5)  # four a square metre of the map
+    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(3857))
+    look = look_at([tmp_path])
+    lat = 2.0 * np.arctan(np.exp(6_024_050.0 / 6_378_137.0)) - np.pi / 2
+    assert look.density == pytest.approx(4.0 / np.cos(lat) ** 2, rel=0.02)
+    (note,) = look.notes
+    assert "a metre on the ground is 1.4" in note
+    assert note.endswith("lengths and areas here are those on the ground")
+    assert '"EPSG:32632"' in note
+
+
+def test_points_outside_the_area_of_use_of_their_crs_are_said_to_be(tmp_path: Path) -> None:
+    """Points of 9° E in zone 33, which begins at 12° E."""
+    x, y = lattice(47_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
+    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(32633))
+    (note,) = look_at([tmp_path]).notes
+    assert "WGS 84 / UTM zone 33N is used from 12° to 18° E" in note
+
+
+def test_points_where_they_belong_have_no_such_note(tmp_path: Path) -> None:
+    x, y = lattice(500_000.0, 5_275_000.0, 50.0, 50.0, 0.5)
+    write(tmp_path / "s.laz", x, y, 0.0 * x + 400.0, crs=CRS.from_epsg(25832))
+    assert look_at([tmp_path]).notes == []
