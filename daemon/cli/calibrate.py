@@ -10,7 +10,14 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import ForceCrs, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from daemon.cli.options import (
+    AcceptVerdict,
+    ForceCrs,
+    ForceTrajectory,
+    TrajectoryDatum,
+    TrajectoryPoint,
+    TrajectoryWeek,
+)
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
 
@@ -69,12 +76,14 @@ def command(
     workers: Annotated[int | None, typer.Option(help="Processes; default: one a processor.", min=1)] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     force_trajectory: ForceTrajectory = False,
+    accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="The outcome to stdout, for scripts.")] = False,
 ) -> None:
     """Calibrate: boresight, range offset and the rest of the sensor model, with sigmas, from logs alone.
 
     What this flight cannot determine is held, and said. Exit code 1 where no calibration could be made that would
-    be worth its name, then no file is written; or where its verdict is "Not to be used".
+    be worth its name, then no file is written; or where its verdict is "Not to be used", unless --accept-verdict
+    is given: the verdict stands in the file all the same.
     """
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from daemon.cli.georef import calibrations_given
@@ -107,6 +116,7 @@ def command(
             config=None if config is None else load_config(config),
             strips=strips,
             workers=workers or os.cpu_count() or 1,
+            accept_verdict=accept_verdict,
         ),
         output=output,
         model=model_of(model, fix, free, prior or []),
@@ -124,7 +134,7 @@ def command(
     with tempfile.TemporaryDirectory(prefix="swath-", dir=output.resolve().parent) as folder, progress_bar() as tell:
         told = write_products(wish, calibrate(wish, Path(folder), tell), tell)
     print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
-    if told.record["verdict"]["level"] == "unusable":
+    if told.record["verdict"]["level"] == "unusable" and not accept_verdict:
         raise UserError(f"{output}: {one_line(told.record['verdict']['sentence'])}")
 
 

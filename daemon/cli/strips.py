@@ -134,6 +134,7 @@ def _compare(
 def _adjust(
     logs: Wish, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
+    from daemon.processing.carried_verdict import refusal
     from daemon.processing.progress import progress_bar
     from daemon.processing.strip_adjust_products import write_adjustment
     from daemon.processing.strip_adjust_run import AdjustWish, correct_strips
@@ -142,6 +143,8 @@ def _adjust(
     with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:
         told = write_adjustment(wish, correct_strips(wish, Path(returns), tell), tell)
     print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))
+    if line := refusal(told.record["verdict"]):
+        raise UserError(line)
 
 
 def _refuse_besides(*given: tuple[str, object]) -> None:

@@ -25,13 +25,16 @@ from calib.record_values import Plain
 from calib.report_input import Finding, ReportInput
 from calib.report_verdict import DEG, Verdict, held_words, judge
 from calib.signatures import signatures
+from calib.strip_cells import StripRules
 from calib.strips import differences
 from calib.validation import Asked, validate
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
+from daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from daemon.processing.json_values import finite
+from daemon.processing.navigation_verdict import Level
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from daemon.processing.trajectory_files import write_whole
@@ -61,7 +64,13 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     inputs = _inputs(wish, done)
     headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
     tell("checks", 0, 1)
-    findings = (*done.findings, *strips_say(done), *validation_says(done))
+    carried = list(dict.fromkeys(one for flight in done.kept.logged for one in flight.trajectory_verdicts))
+    findings = (
+        *trajectory_says(carried),
+        *done.findings,
+        *strips_say(done, after.cells.frame.cell_m),
+        *validation_says(done),
+    )
     report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
     verdict = judge(report)
     source = _trajectory_of(wish, done)
@@ -78,6 +87,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
         "ibrc_knots": list(wish.model.ibrc_knots),
         "verdict": _verdict_entry(verdict),
         "need": _need_entry(report.need),
+        "carried": verdict_entry(carried, accepted=wish.logs.accept_verdict),
     }
     if wish.report is not None:
         tell("report", 0, 1)
@@ -88,13 +98,28 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
     return Told(
         record | {"files": written},
-        [*_lines(done, wish.model.ibrc_knots, before, after), verdict.sentence, *reasons, *written],
+        [
+            *first_lines(record["carried"]),
+            *_lines(done, wish.model.ibrc_knots, before, after),
+            *(verdict.sentence, *reasons, *written),
+        ],
     )
 
 
-def strips_say(done: Calibrated) -> list[Finding]:
-    """Return effects that strips still show and that neither their sigmas nor the calibration's explain."""
-    seen = signatures(differences(done.flight).checks, SeenFrom.of(done.flight), done.prior)
+def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
+    """Return the verdicts on the trajectories, before all that was found with them: parameters took up their errors."""
+    change = "mend the trajectory, then calibrate anew"
+    return [Finding(one.sentence, change, math.inf, unusable=one.level is Level.UNUSABLE) for one in carried]
+
+
+def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
+    """Return effects that strips still show and that neither their sigmas nor the calibration's explain.
+
+    Args:
+        done: the outcome.
+        cell_m: side of the cells in which strips are compared.
+    """
+    seen = signatures(differences(done.flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(done.flight), done.prior)
     found = []
     for one in seen.found:
         if one.level != "significant":

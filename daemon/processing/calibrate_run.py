@@ -26,7 +26,8 @@ from calib.normals import NormalError
 from calib.outcome import Adjusted
 from calib.parameters import ANGLES, ParameterError
 from calib.parameters import Wish as Model
-from calib.picked_points import PickedError, carried
+from calib.picked_points import PickedError
+from calib.picked_points import carried as carried_points
 from calib.plane_given import given_planes
 from calib.plane_matching import rematch
 from calib.plane_returns import limited
@@ -47,6 +48,7 @@ from daemon.processing.calibration_flight import (
     replaced,
     smoothed_prior,
 )
+from daemon.processing.carried_verdict import told_before
 from daemon.processing.flights import Wish
 from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
@@ -159,6 +161,12 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
     kept = read_flight(wish.logs, folder, tell)
     _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
+    carried = [one for flight in kept.logged for one in flight.trajectory_verdicts]
+    with told_before(carried, *REFUSED):
+        return _calibrated(wish, kept, folder, tell)
+
+
+def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
     _refuse_one_strip(kept)
     points = _control(wish, kept.flight)
     workers = wish.logs.workers
@@ -182,7 +190,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
             return rematch(flight, planes, PLANES, pool.map)
 
     def observed() -> Features:
-        return Features.joined([_features(wish, flight, planes, points), carried(picked, kept.flight, flight)])
+        return Features.joined([_features(wish, flight, planes, points), carried_points(picked, kept.flight, flight)])
 
     planes, searched = search(), 1
     refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)

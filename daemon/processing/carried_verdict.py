@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daemon.errors import ExitCode, UserError
 from daemon.processing.navigation_figures import figures_of
 from daemon.processing.navigation_series import Flight, separation_of
 from daemon.processing.navigation_verdict import Level, judge
@@ -18,9 +20,11 @@ if TYPE_CHECKING:
     from daemon.processing.navigate import Navigated
     from daemon.processing.setup import Setup
     from georef.calibration import Calibration
+    from georef.trajectory import Trajectory
 
 LEVELS = {level.words: level for level in Level}
 OF_TRAJECTORY, OF_POINTS = "swath.trajectory", "swath.georef"  # formats of summaries and sidecars
+OF_ADJUSTMENT, ADJUSTMENT = "swath.strip-adjustment", "strip-adjustment.json"  # its format and its file
 SOURCES = {"smoothed": "navigated", "realtime": "navigated", "as-is": "ins"}  # by a trajectory's summary
 MADE_WITH = {"navigated": "a trajectory navigated from IMU and GNSS", "ins": "the device's own INS", "file": "a file"}
 TRAJECTORY_ENDS = ("_trajectory.csv", "_trajectory.sbet")
@@ -56,6 +60,29 @@ def first_lines(entry: Mapping[str, Any]) -> list[str]:
     """Return a line for each reason of an entry, the worst first."""
     reasons = sorted(entry.get("reasons", []), key=lambda one: -LEVELS.get(one["level"], Level.GOOD))
     return [f"{one['level']}: {one['what']}" for one in reasons]
+
+
+@contextmanager
+def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterator[None]:
+    """Have a problem within say first what is not to be used: most likely that is why. Wrong use stays what it is.
+
+    Args:
+        carried: verdicts on what is worked with.
+        refused: errors whose text is for the user as it stands, UserError aside.
+
+    Raises:
+        UserError: of an error within, where something is not to be used; else the error itself.
+    """
+    try:
+        yield
+    except Exception as error:
+        is_problem = isinstance(error, refused) or (
+            isinstance(error, UserError) and error.exit_code == ExitCode.PROBLEM
+        )
+        bad = next((one.line for one in carried if one.level is Level.UNUSABLE), "")
+        if not (is_problem and bad):
+            raise
+        raise UserError(f"{bad}; so: {error}") from error
 
 
 def refusal(entry: Mapping[str, Any]) -> str:
@@ -113,6 +140,18 @@ def nominal_words(name: str, calibration: Calibration) -> str:
 # ---------------------------------------------------------------------- trajectories
 
 
+def trajectory_entry(trajectory: Trajectory, source: str, carried: Sequence[Carried]) -> dict[str, Any]:
+    """Return what a record says of a trajectory, by which `file_verdicts` tells it of files beside the record."""
+    first_ns, last_ns = trajectory.span
+    return {
+        "name": trajectory.name,
+        "source": source,
+        "verdict": [{"level": one.level.words, "what": one.sentence} for one in carried],
+        "first_gps_ns": first_ns,
+        "last_gps_ns": last_ns,
+    }
+
+
 def navigated_verdicts(flight: Navigated) -> Iterator[Carried]:
     """Yield the verdict on each leg of what was navigated here."""
     for number, leg in enumerate(flight.legs, start=1):
@@ -134,7 +173,7 @@ def file_verdicts(file: Path, span_ns: tuple[int, int]) -> tuple[list[Carried], 
         if record.get("format") == OF_TRAJECTORY:
             legs = [leg for session in record.get("sessions", []) for leg in session.get("legs", [])]
             return list(_of_legs(file, legs, span_ns)), SOURCES.get(str(record.get("solution")), "file")
-        if record.get("format") == OF_POINTS:
+        if record.get("format") in (OF_POINTS, OF_ADJUSTMENT):
             return _of_sidecar(file, record, span_ns)
     return [], "file"
 
@@ -144,7 +183,7 @@ def _beside(file: Path) -> list[Path]:
     named += [
         file.with_name(file.name.removesuffix(end) + ".json") for end in TRAJECTORY_ENDS if file.name.endswith(end)
     ]
-    return named
+    return [*named, file.with_name(ADJUSTMENT)]
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -165,7 +204,7 @@ def _of_legs(file: Path, legs: Sequence[Mapping[str, Any]], span_ns: tuple[int, 
 
 
 def _of_sidecar(file: Path, record: Mapping[str, Any], span_ns: tuple[int, int]) -> tuple[list[Carried], str]:
-    """Return the trajectory's verdict by the sidecar of points that were made with it."""
+    """Return the trajectory's verdict by the sidecar of points, or the record of an adjustment, made with it."""
     carried: list[Carried] = []
     source = "file"
     for flight in record.get("flights", []):

@@ -259,10 +259,14 @@ def _judge(wish: Wish, flight: Flight) -> None:
     flight.verdicts = [*flight.trajectory_verdicts, *calibration_verdicts(flight.setup, flight.source)]
 
 
+def verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
+    """Return the verdicts on all flights, each once."""
+    return list(dict.fromkeys(one for flight in flights for one in flight.verdicts))
+
+
 def verdict_of(wish: Wish, flights: Sequence[Flight]) -> dict[str, Any]:
     """Return the verdict on a run, as its record says it: each reason once."""
-    carried = list(dict.fromkeys(one for flight in flights for one in flight.verdicts))
-    return verdict_entry(carried, accepted=wish.accept_verdict)
+    return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)
 
 
 def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:

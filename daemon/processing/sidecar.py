@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daemon.processing.carried_verdict import trajectory_entry
 from daemon.processing.models import air_of
 from daemon.processing.trajectory_files import write_whole
 from daemon.processing.unread import unread_lines
@@ -159,21 +160,16 @@ def _of(results: Sequence[JobResult], flight: Flight, flights: Sequence[Flight])
 def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
     setup, trajectory = flight.setup, flight.trajectory
     assert trajectory is not None
-    first_ns, last_ns = trajectory.span
     return {
         "session": flight.session.session_id,
         "start": utc_text(flight.session.info.realtime_ns),
         "recorder": flight.session.info.software,
         "origin": flight.session.info.origin or "recording",
         "returns_gps_ns": list(flight.span),
-        "trajectory": {
-            "name": trajectory.name,
-            "source": flight.source,
-            "verdict": [{"level": one.level.words, "what": one.sentence} for one in flight.trajectory_verdicts],
+        "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts)
+        | {
             "epochs": len(trajectory),
             "solutions": flight.solutions,
-            "first_gps_ns": first_ns,
-            "last_gps_ns": last_ns,
             "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
         },
         "clock": flight.clock,

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from calib.strip_functions import StripChoice
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_products import Told, strips_entry
+from daemon.processing.carried_verdict import first_lines, trajectory_entry
 from daemon.processing.flights import Flight as LoggedFlight
+from daemon.processing.flights import verdict_of
 from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, files_of
@@ -59,7 +61,7 @@ def write_adjustment(wish: AdjustWish, done: StripsCorrected, tell: Callable[[st
             wish.output.rmdir()
         raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
     told = [str(path) for _, path in written]
-    return Told(record | {"files": told}, [*_lines(done), *told])
+    return Told(record | {"files": told}, [*first_lines(record["verdict"]), *_lines(done), *told])
 
 
 def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
@@ -120,6 +122,14 @@ def _record(wish: AdjustWish, done: StripsCorrected, written: list[tuple[Path, P
         "version": 1,
         "software": f"swath {importlib.metadata.version('swath')}",
         "what": f"{WHAT} {KEPT[0].upper()}{KEPT[1:]}.",
+        "verdict": verdict_of(wish.logs, done.kept.logged),
+        "flights": [
+            {
+                "session": flight.session.session_id,
+                "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts),
+            }
+            for flight, trajectory in zip(done.kept.logged, done.adjusted.trajectories, strict=True)
+        ],
         "calibrations_held": {head.name: head.start.id for head in heads},
         "strip_model": wish.model,
         "settings": asdict(settings),

@@ -23,6 +23,7 @@ from calib.normals import NormalError
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError
 from calib.signatures import signatures
+from calib.strip_cells import StripRules
 from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
 from calib.strips import differences
 from daemon.errors import ExitCode, UserError
@@ -36,8 +37,9 @@ from daemon.processing.calibration_flight import (
     replaced,
     smoothed_prior,
 )
+from daemon.processing.carried_verdict import ADJUSTMENT, told_before
 from daemon.processing.flights import Flight as LoggedFlight
-from daemon.processing.flights import Wish
+from daemon.processing.flights import Wish, verdicts_of
 from daemon.processing.strip_agreement import FlightStrips, before_and_after
 from daemon.processing.strips_run import is_of_logs, refuse_installations
 from daemon.processing.trajectory_files import TrajectoryFiles
@@ -48,7 +50,7 @@ from georef.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 
-RECORD = "strip-adjustment.json"
+RECORD = ADJUSTMENT
 AUTO = "auto"
 CHOICES = (*MODELS, AUTO)
 REFUSED = (
@@ -160,6 +162,11 @@ def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrect
 
 def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     kept = read_flight(wish.logs, folder, tell)
+    with told_before(verdicts_of(kept.logged), *REFUSED):
+        return _of_flight(wish, kept, folder, tell)
+
+
+def _of_flight(wish: AdjustWish, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
     _refuse(wish, kept)
     for logged in kept.logged:
         files_of(wish, logged)
@@ -186,7 +193,7 @@ def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
     adjusted = adjust_strips(flight, features, calibrations, wish.settings)
     tell("strips before and after", 0, 1)
     before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
-    notes += [*kept.holes, *_notes(wish, kept, features), *adjusted.notes]
+    notes += [*kept.holes, *_notes(wish, kept, features, before.cells.frame.cell_m), *adjusted.notes]
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 
@@ -209,7 +216,7 @@ def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
             )
 
 
-def _notes(wish: AdjustWish, kept: KeptFlight, features: Features) -> list[str]:
+def _notes(wish: AdjustWish, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
     notes, flight = [], kept.flight
     if not wish.control:
         settings = wish.settings
@@ -220,7 +227,9 @@ def _notes(wish: AdjustWish, kept: KeptFlight, features: Features) -> list[str]:
     seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
     for strip in sorted({swath.strip for swath in flight.swaths} - seen):
         notes.append(f"strip {strip:02d}: no plane of it is seen by another: not corrected")
-    found = signatures(differences(flight).checks, SeenFrom.of(flight), smoothed_prior(kept)).found
+    found = signatures(
+        differences(flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(flight), smoothed_prior(kept)
+    ).found
     told = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
     notes += [
         f"before, strips differed as by an error of the calibration, which is for swath calibrate: {words}"

@@ -15,8 +15,8 @@ from calib.strip_cells import StripRules
 from calib.strips import Numbers, PairReport, StripReport, report_of
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibration_flight import read_flight, smoothed_prior
-from daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, verdict_entry
-from daemon.processing.flights import Wish
+from daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
+from daemon.processing.flights import Wish, verdicts_of
 from daemon.processing.json_values import finite
 from daemon.processing.strip_agreement import Agreement, difference_of
 from daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
@@ -124,9 +124,11 @@ def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> 
     kept = read_flight(replace(wish.logs, logs=paths), folder, told)
     refuse_installations(kept.logged)
     mapping = kept.logged[0].setup.mapping
-    strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
+    carried = verdicts_of(kept.logged)
+    with told_before(carried, FlightError):
+        strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
     strips.notes.extend(kept.holes)
-    strips.carried.extend(dict.fromkeys(one for flight in kept.logged for one in flight.verdicts))
+    strips.carried.extend(carried)
     return strips
 
 

@@ -26,8 +26,8 @@ from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_inputs import control_of
 from daemon.processing.calibrate_run import PLANES, prior_of
 from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
-from daemon.processing.carried_verdict import Carried, first_lines, refusal, verdict_entry
-from daemon.processing.flights import Wish
+from daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
+from daemon.processing.flights import Wish, verdicts_of
 from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
 from daemon.processing.strips_run import refuse_installations
@@ -141,7 +141,12 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
 def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -> None:
     kept = read_flight(wish.logs, folder, told)
     refuse_installations(kept.logged)
-    found.carried += dict.fromkeys(one for flight in kept.logged for one in flight.verdicts)
+    found.carried += verdicts_of(kept.logged)
+    with told_before(found.carried, *REFUSED):
+        _against_flight(wish, found, kept, folder, told)
+
+
+def _against_flight(wish: ValidateWish, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
     _refuse_others(wish, found, kept)
     flight = kept.flight
     points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])

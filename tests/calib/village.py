@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -156,3 +157,10 @@ def told(trajectory: Trajectory, sigma_m: float, sigma_deg: float) -> Trajectory
     position = np.full((len(trajectory), 3), sigma_m)
     attitude = np.radians(np.tile([sigma_deg, sigma_deg, 2.0 * sigma_deg], (len(trajectory), 1)))
     return replace(trajectory, position_sigma_l=position, attitude_sigma_rad=attitude)
+
+
+def judge_unusable(file: Path, why: str) -> None:
+    """Write the summary of `swath trajectory` beside a trajectory's file: not to be used."""
+    verdict = {"level": "unusable", "sentence": why, "reasons": [{"level": "unusable", "name": "x", "what": why}]}
+    summary = {"format": "swath.trajectory", "solution": "smoothed", "sessions": [{"legs": [{"verdict": verdict}]}]}
+    file.with_suffix(".json").write_text(json.dumps(summary))

@@ -24,7 +24,7 @@ from daemon.processing.warm_calibration import warm_calibration
 from georef.calibration import Calibration, read_calibration
 from georef.mapping import Mapping
 from sim.plan import parse_plan
-from tests.calib.village import KNOWN, Made, village
+from tests.calib.village import KNOWN, Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
@@ -228,6 +228,26 @@ def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
     spans = [f"{int(swath.time_ns[0])},{int(swath.time_ns[-1])}" for swath in made.flight.swaths[:count]]
     strips.write_text("\n".join(["start_gps_ns,end_gps_ns", *spans]) + "\n")
     return "--strips", str(strips)
+
+
+def test_a_calibration_on_a_trajectory_not_to_be_used_is_not_to_be_used(
+    made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is said first, stands in the file, and goes on to whatever is made with the calibration."""
+    file, output = tmp_path / "flight.csv", tmp_path / "left.toml"
+    file.write_bytes((made.flown.folder / "true_trajectory.csv").read_bytes())
+    judge_unusable(file, "the lever arm has another sign")
+    given = arguments(made, output)
+    given[given.index("--trajectory") + 1] = str(file)
+    assert run_app(given) == 1
+    told = capsys.readouterr()
+    assert told.out.splitlines()[0] == f"not to be used: trajectory {file}: the lever arm has another sign"
+    assert f"left.toml: Not to be used: trajectory {file}: the lever arm" in told.err
+    header = read_calibration(output.read_text(), "left.toml").header
+    assert header["verdict"] == "not to be used"
+    assert "the lever arm has another sign" in header["verdict_reasons"][0]
+    assert run_app([*given, "--overwrite", "--accept-verdict"]) == 0
+    assert read_calibration(output.read_text(), "left.toml").header["verdict"] == "not to be used"
 
 
 def test_one_strip_is_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

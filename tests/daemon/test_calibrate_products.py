@@ -7,8 +7,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from daemon.processing.calibrate_products import _header
+from daemon.processing.calibrate_products import _header, trajectory_says
 from daemon.processing.calibrate_run import Calibrated
+from daemon.processing.carried_verdict import Carried
+from daemon.processing.navigation_verdict import Level
 
 
 def session(installation: str, **serials: str) -> Any:
@@ -24,3 +26,9 @@ def test_a_scanner_that_the_first_session_lacks_has_the_head_of_its_own() -> Non
     features = SimpleNamespace(planes=[], ties=[])
     done = cast(Calibrated, SimpleNamespace(adjusted=adjusted, kept=kept, features=features))
     assert [_header(done, name, []).scanner_serial for name in ("left", "right")] == ["L1", "R1"]
+
+
+def test_what_was_judged_of_the_trajectory_speaks_against_the_calibration_before_all_else() -> None:
+    bad, care = trajectory_says([Carried(Level.UNUSABLE, "lever arm"), Carried(Level.CARE, "few fixes")])
+    assert (bad.what, bad.unusable, bad.excess) == ("lever arm", True, np.inf)
+    assert (care.what, care.unusable) == ("few fixes", False)

@@ -11,6 +11,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from calib.prealign import PrealignError
+from daemon.errors import ExitCode, UserError
 from daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
@@ -18,11 +20,14 @@ from daemon.processing.carried_verdict import (
     first_lines,
     points_verdicts,
     refusal,
+    told_before,
+    trajectory_entry,
     verdict_entry,
 )
 from daemon.processing.navigation_verdict import Level
 from daemon.processing.setup import Setup
 from georef.calibration import INDEX, Calibration, nominal, read_calibration
+from tests.georef.flown import flown
 
 TEXT = """
 [calibration]
@@ -115,6 +120,28 @@ def test_the_sidecar_of_points_says_it_of_the_trajectory_beside_them(tmp_path: P
     (tmp_path / "s.json").write_text(json.dumps({"format": "swath.georef", "flights": [{"trajectory": trajectory}]}))
     (said,), source = file_verdicts(tmp_path / "s_trajectory.csv", (10, 20))
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
+
+
+def test_the_record_of_a_strip_adjustment_says_it_of_the_trajectories_it_has_corrected(tmp_path: Path) -> None:
+    first = int(flown().time_ns[0])
+    entry = trajectory_entry(flown(), "file", [Carried(Level.UNUSABLE, "trajectory a.sbet: lever arm")])
+    record = {"format": "swath.strip-adjustment", "flights": [{"session": "s", "trajectory": entry}]}
+    (tmp_path / "strip-adjustment.json").write_text(json.dumps(record))
+    (said,), source = file_verdicts(tmp_path / "s_trajectory.sbet", (first, first + 1))
+    assert (said.level, source) == (Level.UNUSABLE, "file")
+    assert said.sentence.endswith("s_trajectory.sbet: trajectory a.sbet: lever arm")
+
+
+def test_what_cannot_be_done_with_something_bad_says_first_that_it_is_bad() -> None:
+    care, bad = Carried(Level.CARE, "a"), Carried(Level.UNUSABLE, "lever arm")
+    told = r"^not to be used: lever arm; so: does not come to rest$"
+    for error in (UserError("does not come to rest"), PrealignError("does not come to rest")):
+        with pytest.raises(UserError, match=told), told_before([care, bad], PrealignError):
+            raise error
+    with pytest.raises(UserError, match=r"^no planes$"), told_before([care]):
+        raise UserError("no planes")
+    with pytest.raises(UserError, match=r"^no such file$"), told_before([bad]):
+        raise UserError("no such file", ExitCode.IO)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "no json", '{"format": "of others", "sessions": 3}'])

@@ -15,8 +15,10 @@ import pytest
 from daemon.cli.main import run_app
 from daemon.errors import ExitCode, UserError
 from daemon.processing import strip_adjust_products
+from daemon.processing.carried_verdict import file_verdicts
 from daemon.processing.flights import Wish
 from daemon.processing.flown import TrajectoryWish
+from daemon.processing.navigation_verdict import Level
 from daemon.processing.setup import Options
 from daemon.processing.strip_adjust_products import write_adjustment
 from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, correct_strips
@@ -24,7 +26,7 @@ from georef.earth import rot_e_from_l
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory
-from tests.calib.village import Made, village
+from tests.calib.village import Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
@@ -149,6 +151,25 @@ def test_the_corrected_trajectory_reads_as_one_and_wants_no_correction(
     np.testing.assert_allclose(heights_m, true_m, rtol=0.0, atol=0.015)
     assert run_app(arguments(made, path, tmp_path / "again")) == 0
     assert {strip["model"] for strip in record_of(tmp_path / "again")["strips"]} == {"none"}
+
+
+def test_a_trajectory_not_to_be_used_is_said_to_be_first_and_stays_so(
+    made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 1, the files written, and the same word on what is made with them."""
+    file = tmp_path / "flight.csv"
+    file.write_bytes(lifted.read_bytes())
+    judge_unusable(file, "the lever arm has another sign")
+    output = tmp_path / "out"
+    assert run_app(arguments(made, file, output, "--strip-model", "constant")) == 1
+    told = capsys.readouterr()
+    line = f"not to be used: trajectory {file}: the lever arm has another sign"
+    assert told.out.splitlines()[0] == line
+    assert f"{line}; --accept-verdict takes it all the same" in told.err
+    (said,), source = file_verdicts(trajectory_of(output, ".sbet"), made.trajectory.span)
+    assert (said.level, source) == (Level.UNUSABLE, "navigated")
+    assert run_app(arguments(made, file, output, "--strip-model", "constant", "--overwrite", "--accept-verdict")) == 0
+    assert record_of(output)["verdict"]["accepted"]
 
 
 def test_a_common_shift_is_found_with_control(made: Made, tmp_path: Path) -> None:
