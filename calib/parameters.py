@@ -283,7 +283,7 @@ def unknowns(
     Raises:
         ParameterError: the wish names what is not known, or what such a scanner does not have.
     """
-    _check(flight, wish)
+    check_wish(flight, wish)
     bases, items, held, considered = [], [], [], []
     for index, head in enumerate(flight.heads):
         calibration = head.start if start is None else start[head.name]
@@ -418,14 +418,19 @@ def _with_knots(calibration: Calibration, wish: Wish) -> Calibration:
     return replace(moved, ibrc=(knots, values - away))
 
 
-def _check(flight: Flight, wish: Wish) -> None:
+def check_wish(flight: Flight, wish: Wish) -> None:
+    """Raise ParameterError where a wish names what there is not, or says what cannot be; before anything lasts long."""
     if wish.model not in MODELS:
         raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")
     heads = [head.name for head in flight.heads]
     known = set(INDEX) | {f"{head}.{name}" for head in heads for name in INDEX}
+    extra = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")
+    for name in sorted({*wish.fix, *wish.free, *wish.priors}):
+        scanner, dot, _ = name.partition(".")
+        if dot and scanner not in heads and not name.startswith(extra):
+            raise ParameterError(f"parameters of {scanner}: no such scanner in this flight, but {', '.join(heads)}")
     for name in sorted({*wish.fix, *wish.free} - known):
         raise ParameterError(f"{name}: is no parameter; want one of {', '.join(INDEX)}, or with {heads[0]}. before it")
-    extra = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")
     for name, sigma in wish.priors.items():
         if name not in known and not name.split(".", 1)[-1].startswith(extra) and not name.startswith(extra):
             raise ParameterError(f"prior {name}: is no parameter; want one of {', '.join(INDEX)}")

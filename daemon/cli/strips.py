@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from daemon.processing.installed import require_installed
 if TYPE_CHECKING:
     from daemon.processing.flights import Wish
 
-SMALLEST_CELL_M = 0.05
+SMALLEST_CELL_M, LARGEST_CELL_M = 0.05, 100.0
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
 
 
@@ -85,8 +84,9 @@ def command(
     from daemon.processing.flown import TrajectoryWish
     from daemon.processing.setup import Options
 
-    if cell is not None and not (math.isfinite(cell) and cell >= SMALLEST_CELL_M):
-        raise UserError(f"--cell: got {cell:g}, want metres, {SMALLEST_CELL_M:g} or more", ExitCode.USAGE)
+    if cell is not None and not SMALLEST_CELL_M <= cell <= LARGEST_CELL_M:
+        wanted = f"{SMALLEST_CELL_M:g} to {LARGEST_CELL_M:g} metres"
+        raise UserError(f"--cell: got {cell:g}, want {wanted}", ExitCode.USAGE)
     if level is not None and level not in LEVELS:
         raise UserError(f'--level: got "{level}", want one of {", ".join(LEVELS)}', ExitCode.USAGE)
     logs = Wish(

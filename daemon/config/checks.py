@@ -113,6 +113,8 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
         yield f"{section}.protocol: {error}"
         return
     yield from _check_transport(config, section, table, driver)
+    if isinstance(table, ScannerConfig):
+        yield from _check_clock(section, table, driver)
     needs = list(_check_needs(section, table, driver))
     yield from needs
     if not needs and not any(_unreadable(path) for path in config.files_of(table).values()):
@@ -123,6 +125,19 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
                 driver.startup(settings, StartupWish())
         except DriverSettingsError as error:
             yield f"{section}: {error}"
+
+
+def _check_clock(section: str, table: ScannerConfig, driver: Driver) -> Iterator[str]:
+    """What a scanner's stamps are said to be against what its protocol can say."""
+    if driver.past_hour:
+        can = ("auto", "utc-hour", "free")
+    elif driver.line_scanner:
+        can = ("auto",)  # it latches its pulse: nothing is to be said
+    else:
+        can = ("auto", "ptp-tai", "ptp-utc", "free")
+    if table.clock not in can:
+        wanted = " or ".join(f'"{one}"' for one in can)
+        yield f'{section}.clock: got "{table.clock}", which stamps of {table.protocol} cannot be; want {wanted}'
 
 
 def _check_forwarding(config: Config, section: str, table: CorrectionsConfig) -> Iterator[str]:

@@ -145,6 +145,8 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
         return f"at most {context['max_length']} characters"
     if kind == "string_too_short":
         return "text that is not empty"
+    if kind == "multiple_of":
+        return f"a multiple of {context['multiple_of']:g}"
     if kind == "string_pattern_mismatch":
         return _wanted_of_pattern(str(context["pattern"]))
     if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):

@@ -24,7 +24,7 @@ from calib.features import ControlPoint, Features
 from calib.flight import Flight, FlightError
 from calib.normals import NormalError
 from calib.outcome import Adjusted
-from calib.parameters import ANGLES, ParameterError
+from calib.parameters import ANGLES, ParameterError, check_wish
 from calib.parameters import Wish as Model
 from calib.picked_points import PickedError
 from calib.picked_points import carried as carried_points
@@ -161,6 +161,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
     kept = read_flight(wish.logs, folder, tell)
     _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
+    check_wish(kept.flight, wish.model)
     carried = [one for flight in kept.logged for one in flight.trajectory_verdicts]
     with told_before(carried, *REFUSED):
         return _calibrated(wish, kept, folder, tell)

@@ -229,6 +229,7 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
         (Wish(fix=frozenset(["omega"])), "omega: is no parameter"),
         (Wish(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
         (Wish(priors={"phi_rad": 0.0}), "want a sigma above 0"),
+        (Wish(fix=frozenset(["right.omega_rad"])), "parameters of right: no such scanner in this flight, but "),
         (Wish(priors={"fie_rad": 0.1}), "prior fie_rad"),
         (Wish(ibrc_knots=(5.0, 5.0)), "rising intensities"),
         (Wish(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),

@@ -288,7 +288,7 @@ def test_a_sidecar_that_says_no_datum_is_noted(made: Cast, tmp_path: Path) -> No
     assert "no signatures: the sidecar beside the points does not say of which datum they are" in note
 
 
-@pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level"])
+@pytest.mark.parametrize("what", ["one", "apart", "twice", "nothing", "absent", "level", "cell"])
 def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.0, 500.0 if what == "apart" else 30.0)
     arguments, said = [str(folder)], ""
@@ -306,12 +306,14 @@ def test_what_cannot_be_compared_is_one_line(what: str, tmp_path: Path) -> None:
         arguments, said = [str(tmp_path / "empty")], "holds neither LAS or LAZ files nor logs"
     elif what == "absent":
         arguments, said = [str(tmp_path / "no")], "no such file or folder"
+    elif what == "cell":
+        arguments, said = [str(folder), "--cell", "1e9"], r"--cell: got 1e\+09, want 0\.05 to 100 metres"
     else:
         arguments, said = [str(folder), "--level", "QL9"], 'got "QL9", want one of QL0, QL1, QL2, QL3'
     with pytest.raises(UserError, match=said) as caught:
         run(*arguments)
     assert "\n" not in caught.value.message
-    codes = {"nothing": ExitCode.IO, "absent": ExitCode.IO, "level": ExitCode.USAGE}
+    codes = {"nothing": ExitCode.IO, "absent": ExitCode.IO, "level": ExitCode.USAGE, "cell": ExitCode.USAGE}
     assert caught.value.exit_code == codes.get(what, ExitCode.PROBLEM)
 
 
