@@ -206,7 +206,9 @@ def time_that_explains(apart: Apart) -> float | None:
             moved = _way_at(way_l, time_s, time_s[there] + tried_s + TRIED_S) - fix_l[there] - rest
             share = float((rest * moved).sum() / max((moved**2).sum(), 1e-9))
             best, late_s = usual, float(tried_s) - share * TRIED_S
-            left = float(np.median(np.linalg.norm(rest - share * moved, axis=1)))
+            # farther than to the next step a straight way would be a guess: any place ahead could be so reached
+            within = abs(share) <= 1.0
+            left = float(np.median(np.linalg.norm(rest - share * moved, axis=1))) if within else np.inf
     return late_s if left < max(3.0 * float(apart.fix_sigma_l.max()), 0.05 * apart.metres) else None
 
 

@@ -235,7 +235,7 @@ def _choose(wish: Wish, flight: Flight) -> None:
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
     chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
     flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
-    flight.troubles += chosen.doubts
+    flight.troubles += [doubt for doubt in chosen.doubts if doubt not in flight.troubles]
     _judge(wish, flight)
     assert flight.setup.mapping is not None
     within = flight.trajectory.between(*flight.span)

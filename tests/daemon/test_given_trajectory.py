@@ -142,6 +142,16 @@ def test_a_trajectory_7_km_east_is_of_another_place(log: Log) -> None:
     )
 
 
+def test_on_a_straight_line_a_place_far_ahead_is_no_matter_of_time(log: Log) -> None:
+    """The line is flown east at 50 m/s: 7.5 km further on would be 151 s, which nobody saw the way of."""
+    fixes = {source: rows[: len(rows) // 5] for source, rows in log.clocks.fixes.items()}
+    clocks = replace(log.clocks, fixes=fixes)
+    east = raised(log.truth, lambda lat, lon, height: (lat, lon + np.radians(0.1), height))
+    line = replace(log, clocks=clocks).refused(east)
+    assert "its time were" not in line
+    assert "of another place" in line
+
+
 def test_heights_in_feet_are_named(log: Log) -> None:
     line = log.refused(raised(log.truth, lambda lat, lon, height: (lat, lon, height / 0.3048)))
     assert "its heights are in feet" in line
