@@ -129,12 +129,11 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
 
 def _check_clock(section: str, table: ScannerConfig, driver: Driver) -> Iterator[str]:
     """What a scanner's stamps are said to be against what its protocol can say."""
+    can = ["auto"]
     if driver.past_hour:
-        can = ("auto", "utc-hour", "free")
-    elif driver.line_scanner:
-        can = ("auto",)  # it latches its pulse: nothing is to be said
-    else:
-        can = ("auto", "ptp-tai", "ptp-utc", "free")
+        can += ["utc-hour", "free"]
+    elif not driver.line_scanner:  # which latches its pulse: nothing is to be said
+        can += ["ptp-tai", "ptp-utc", "free"]
     if table.clock not in can:
         wanted = " or ".join(f'"{one}"' for one in can)
         yield f'{section}.clock: got "{table.clock}", which stamps of {table.protocol} cannot be; want {wanted}'
