@@ -1,0 +1,244 @@
+"""How well a calibration flight could be calibrated at all: the bound that its returns and its trajectory set.
+
+python -m benchmarks.calibration_bound FOLDER [--every 5]
+
+FOLDER is a flight of `swath sim fly`, with its truth, of which are taken: the returns, where they lie, and the planes
+they lie on, exactly. Of the flight: the joint covariance of the smoothed trajectory's errors, as `swath calibrate`
+has it. The sensor equation's derivatives are written here anew and share nothing with the adjustment. Two bounds:
+
+    planes known      direction and place of every plane are known: what the ranges and the trajectory alone leave
+    planes unknown    every roof face and every piece of ground of 15 m is estimated along, as a calibration has to
+
+each with the parameters of `--model scanner` estimated, and with those of `basic` and the others known exactly.
+
+What gyroscopes walk between knots is left out, so that no adjustment reaches the bound; one that is near it has used
+what is there. Information is summed over every so many returns and multiplied.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from calib.trajectory_errors import TrajectoryPrior
+from daemon.processing.calibrate_run import prior_of
+from daemon.processing.calibration_flight import read_flight
+from daemon.processing.flights import Wish as Logs
+from daemon.processing.flown import TrajectoryWish
+from daemon.processing.setup import Options
+from georef.uncertainty import Noise
+from sim.shots import GROUND, MARKING, ROAD, ROOF
+from sim.site import e_from_geodetic, rot_e_from_ned
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MODELS = {"basic": 4, "scanner": 8}
+NAMES = ("omega", "phi", "kappa", "range offset", "range scale", "scan angle scale", "scan plane tilt", "time offset")
+UNITS = ("°", "°", "°", "m", "ppm", "ppm", "°", "µs")
+FACTORS = np.array([180 / np.pi] * 3 + [1.0, 1e6, 1e6, 180 / np.pi, 1e6])
+NEIGHBOURS, PLANE_M = 7, 0.003  # by which a return's plane is found in the truth, and how exactly they lie on it
+TILE_M = 15.0
+LEAST_RETURNS = 3
+SECOND_NS = 1e9
+TRACK = ("gps_ns", "lat_rad", "lon_rad", "height_m", "velocity_l", "roll_rad", "pitch_rad", "heading_rad")
+STEEPEST = np.cos(np.radians(65.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """Returns of the truth on planes.
+
+    Attributes:
+        time_ns: (n,) GPS time.
+        strip: (n,) number.
+        design: (n, 8) change of the distance from the plane with the parameters, SI.
+        normal_l: (n, 3) north, east, down.
+        lever_l: (n, 3) from the body to the point.
+        variance: (n,) m² of the distance by range, angle and footprint.
+        face: (n,) number of the plane.
+        place: (n, 3) two coordinates in the plane, metres, and 1.
+    """
+
+    time_ns: IntArray
+    strip: IntArray
+    design: FloatArray
+    normal_l: FloatArray
+    lever_l: FloatArray
+    variance: FloatArray
+    face: IntArray
+    place: FloatArray
+
+
+def returns_of(folder: Path, head: str, noise: Noise, every: int) -> Returns:
+    """Read every so many returns that lie on a plane of the truth."""
+    with np.load(folder / "truth.npz") as truth:
+        strip, surface = truth[f"{head}.strip"], truth[f"{head}.surface"]
+        there = np.flatnonzero((strip >= 0) & np.isin(surface, (GROUND, ROAD, MARKING, ROOF)))
+        point_e, time_ns = truth[f"{head}.point_e"][there], truth[f"{head}.gps_ns"][there]
+        strip, roof = strip[there].astype(np.int64), surface[there] == ROOF
+        track = {name: truth[f"trajectory.{name}"] for name in TRACK}
+    origin = point_e[len(point_e) // 2]
+    mean = int(np.searchsorted(track["gps_ns"], time_ns[0]))
+    rot_l_from_e = rot_e_from_ned(track["lat_rad"][mean : mean + 1], track["lon_rad"][mean : mean + 1])[0].T
+    point_l = (point_e - origin) @ rot_l_from_e.T
+    taken, normal = planes_at(point_l, strip, roof, every)
+    at = np.clip(np.searchsorted(track["gps_ns"], time_ns[taken]), 1, len(track["gps_ns"]) - 1)
+    share = (time_ns[taken] - track["gps_ns"][at - 1]) / (track["gps_ns"][at] - track["gps_ns"][at - 1])
+
+    def along(values: FloatArray) -> FloatArray:
+        s = share.reshape(-1, *[1] * (values.ndim - 1))
+        mixed: FloatArray = (1.0 - s) * values[at - 1] + s * values[at]
+        return mixed
+
+    body_e = along(np.asarray(e_from_geodetic(track["lat_rad"], track["lon_rad"], track["height_m"])))
+    lever = point_l[taken] - (body_e - origin) @ rot_l_from_e.T
+    turns = np.stack([np.unwrap(track[name]) for name in ("heading_rad", "pitch_rad", "roll_rad")], axis=1)
+    before, after = turns[at - 1], turns[at]
+    rot_l_from_b = Rotation.from_euler("ZYX", along(turns)).as_matrix()
+    turned = (Rotation.from_euler("ZYX", after) * Rotation.from_euler("ZYX", before).inv()).as_rotvec()
+    rate = turned / ((track["gps_ns"][at] - track["gps_ns"][at - 1]) / SECOND_NS)[:, np.newaxis]
+    velocity = along(track["velocity_l"]) + np.cross(rate, lever)
+    design, variance = equations(normal, lever, rot_l_from_b, velocity, noise)
+    face, place = faces(point_l[taken], normal, roof[taken])
+    return Returns(time_ns[taken], strip[taken], design, normal, lever, variance, face, place)
+
+
+def planes_at(point_l: FloatArray, strip: IntArray, roof: NDArray[np.bool_], every: int) -> tuple[IntArray, FloatArray]:
+    """Return indexes (n,) of returns whose neighbours lie on one plane with them, and its normals (n, 3), upwards."""
+    taken, normals = [], []
+    for number in np.unique(strip):
+        for kind in (False, True):
+            mine = np.flatnonzero((strip == number) & (roof == kind))
+            if len(mine) < NEIGHBOURS * every:
+                continue
+            asked = mine[::every]
+            _, near = cKDTree(point_l[mine]).query(point_l[asked], NEIGHBOURS)
+            around = point_l[mine][near]
+            off = around - around.mean(axis=1, keepdims=True)
+            variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+            normal = axes[:, :, 0] * -np.sign(axes[:, 2:3, 0])  # down is positive
+            good = np.abs(np.einsum("nki,ni->nk", off, normal)).max(axis=1) < PLANE_M
+            good &= (-normal[:, 2] > STEEPEST) & (variances[:, 1] > 1e-4)
+            taken.append(asked[good])
+            normals.append(normal[good])
+    return np.concatenate(taken), np.concatenate(normals)
+
+
+def equations(
+    normal: FloatArray, lever: FloatArray, rot_l_from_b: FloatArray, velocity: FloatArray, noise: Noise
+) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives (n, 8) of the distance along the normal, and its variance (n,), in m².
+
+    Sensor and body axes count as alike; of a spinning head the first four columns and the last are right.
+
+    Args:
+        normal, lever: (n, 3) north, east, down: of the plane; from the body to the point, metres.
+        rot_l_from_b: (n, 3, 3).
+        velocity: (n, 3) of the point that moves with the body, metres a second.
+        noise: of the scanner.
+    """
+    lever_b = np.einsum("nji,nj->ni", rot_l_from_b, lever)
+    normal_b = np.einsum("nji,nj->ni", rot_l_from_b, normal)
+    range_m = np.linalg.norm(lever_b, axis=1, keepdims=True)
+    beam_b = lever_b / range_m
+    turned = np.cross(lever_b, normal_b)  # n · (e × x) = e · (x × n)
+    angle = -np.arctan2(beam_b[:, 1], beam_b[:, 2])  # about x, from down
+    cosine = (beam_b * normal_b).sum(axis=1)
+    columns = [*turned.T, cosine, cosine * range_m[:, 0], angle * turned[:, 0], normal_b[:, 0] * range_m[:, 0]]
+    design = np.stack([*columns, (normal * velocity).sum(axis=1)], axis=1)
+    sine = np.sqrt(1.0 - np.minimum(cosine**2, 1.0))
+    aside = range_m[:, 0] * np.hypot(noise.angle_rad * turned[:, 0] / range_m[:, 0], 0.25 * noise.divergence_rad * sine)
+    return design, (noise.range_m * cosine) ** 2 + aside**2
+
+
+def faces(point_l: FloatArray, normal: FloatArray, roof: NDArray[np.bool_]) -> tuple[IntArray, FloatArray]:
+    """Return numbers (n,) of planes, by direction, place and tile of 15 m; places (n, 3) in them."""
+    distance = (normal * point_l).sum(axis=1)
+    tile = np.floor(point_l[:, :2] / TILE_M)
+    key = np.column_stack([tile, np.where(roof, 1, 0), np.where(roof[:, np.newaxis], np.rint(normal * 40.0), 0.0)])
+    key = np.column_stack([key, np.where(roof, np.rint(distance / 0.5), 0.0)])
+    _, face = np.unique(key, axis=0, return_inverse=True)
+    middle = np.stack([np.bincount(face, axis) for axis in point_l[:, :2].T], axis=1) / np.bincount(face)[:, np.newaxis]
+    return face.ravel(), np.column_stack([point_l[:, :2] - middle[face.ravel()], np.ones(len(face))])
+
+
+def bound(returns: Returns, prior: TrajectoryPrior, parameters: int, every: int, *, known: bool) -> FloatArray:
+    """Return sigmas (p,) of the parameters, SI."""
+    size = parameters + 6 * len(prior)
+    normal = np.zeros((size, size))
+    normal[parameters:, parameters:] = prior.information
+    order = np.argsort(returns.face, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(returns.face[order])) + 1):
+        if len(rows) * every < LEAST_RETURNS or len(np.unique(returns.strip[rows])) < (1 if known else 2):
+            continue
+        columns, table = states(returns, rows, prior, parameters)
+        weight = every / returns.variance[rows, np.newaxis]
+        block = table.T @ (weight * table)
+        if not known:
+            place = returns.place[rows]
+            own, mixed = place.T @ (weight * place), table.T @ (weight * place)
+            block -= mixed @ np.linalg.solve(own + 1e-6 * np.eye(3), mixed.T)
+        normal[np.ix_(columns, columns)] += block
+    sigmas: FloatArray = np.sqrt(np.diag(np.linalg.inv(normal))[:parameters])
+    return sigmas
+
+
+def states(returns: Returns, rows: IntArray, prior: TrajectoryPrior, parameters: int) -> tuple[IntArray, FloatArray]:
+    """Return unknowns (m,) behind returns of one plane and the design (n, m): parameters, then errors at knots."""
+    after = np.clip(np.searchsorted(prior.time_ns, returns.time_ns[rows]), 1, len(prior) - 1)
+    share = (returns.time_ns[rows] - prior.time_ns[after - 1]) / (prior.time_ns[after] - prior.time_ns[after - 1])
+    share = np.clip(share, 0.0, 1.0)[:, np.newaxis]
+    normal = returns.normal_l[rows]
+    each = np.concatenate([normal, np.cross(returns.lever_l[rows], normal)], axis=1)
+    knots, of = np.unique(np.concatenate([after - 1, after]), return_inverse=True)
+    table = np.zeros((len(rows), len(knots), 6))
+    at = np.arange(len(rows))
+    table[at, of[: len(rows)]] += (1.0 - share) * each
+    table[at, of[len(rows) :]] += share * each
+    columns = (parameters + 6 * knots[:, np.newaxis] + np.arange(6)).ravel()
+    design = np.concatenate([returns.design[rows, :parameters], table.reshape(len(rows), -1)], axis=1)
+    return np.concatenate([np.arange(parameters), columns]), design
+
+
+def bounds(folder: Path, every: int, tell: Callable[[str], None] = print) -> dict[tuple[str, bool], FloatArray]:
+    """Return sigmas by model and whether planes are known, in the units of `UNITS`."""
+    options = Options(datum="same", uncertainty=False)
+    with tempfile.TemporaryDirectory(prefix="swath-bound-") as work:
+        wish = Logs([folder], Path(work), TrajectoryWish(navigate=True), options)
+        kept = read_flight(wish, Path(work), lambda *_: None)
+        (head,) = kept.flight.heads
+        prior = prior_of(kept)
+    returns = returns_of(folder, head.name, head.noise, every)
+    tell(f"about {len(returns.face) * every:,} returns on {int(returns.face.max()) + 1:,} planes, {len(prior)} knots")
+    return {
+        (model, known): FACTORS[:count] * bound(returns, prior, count, every, known=known)
+        for model, count in MODELS.items()
+        for known in (True, False)
+    }
+
+
+def main() -> None:
+    """Print the bounds."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of a flight of one scanner, made by swath sim fly")
+    parser.add_argument("--every", type=int, default=5, help="one in so many returns is looked at")
+    wish = parser.parse_args()
+    found = bounds(wish.folder, wish.every)
+    heads = [f"{model}, planes {'known' if known else 'unknown'}" for model, known in found]
+    print(f"{'':<18}" + "".join(f"{head:>24}" for head in heads))
+    for number, name in enumerate(NAMES):
+        told = (f"{sigmas[number]:.5f} {UNITS[number]}" if number < len(sigmas) else "" for sigmas in found.values())
+        print(f"{name:<18}" + "".join(f"{cell:>24}" for cell in told))
+
+
+if __name__ == "__main__":
+    main()
