@@ -73,6 +73,8 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
         "time_offset": _time_offset(flight),
         "noise_found": dict(flight.noise_found),
         "lasting_share": flight.setup.gnss_correlated_share,
+        "lasting_velocity_share": flight.setup.gnss_velocity_share,
+        "lasting_velocity_s": flight.setup.gnss_velocity_correlation_s if flight.setup.gnss_velocity_share else None,
         "counts": {name: int(count) for name, count in sorted(flight.forward.counts.items())},
     }
 

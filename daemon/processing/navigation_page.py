@@ -325,6 +325,8 @@ def _run(figures: Figures) -> str:
         *([f"filter − smoother / sigma, {name}", _number(value, ".2f")] for name, value in separation.items()),
         *([f"noise found, {name}", f"× {_number(value)}"] for name, value in figures["noise_found"].items()),
         ["share of positions' variance that lasts", _number(figures["lasting_share"], ".2f")],
+        ["share of velocities' variance that lasts", _number(figures["lasting_velocity_share"], ".2f")],
+        ["how long velocities' errors last, s", _number(figures["lasting_velocity_s"], ".1f")],
         *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items()),
     ]
     return "<h2>The run</h2>" + _table(("", ""), rows)

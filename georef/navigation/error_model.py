@@ -36,6 +36,7 @@ from georef.navigation.strapdown import (
     LEVER_ARM,
     POSITION,
     SLOW,
+    SLOW_VELOCITY,
     SUM_FORCE,
     SUM_FORCE_ACROSS,
     SUM_RATE,
@@ -65,6 +66,7 @@ class Layout(NamedTuple):
         lever_arm: 3, of antenna 0, b.
         time_offset: 1, of GNSS.
         slow: 3, the time-correlated part of GNSS positions, in units of its sigma.
+        slow_velocity: 3, the same of GNSS velocities.
         height_bias: 1, of a barometer.
     """
 
@@ -73,6 +75,7 @@ class Layout(NamedTuple):
     lever_arm: int
     time_offset: int
     slow: int
+    slow_velocity: int
     height_bias: int
 
     @property
@@ -109,6 +112,7 @@ def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
         (setup.estimate_lever_arm > 0.0, 3),
         (setup.estimate_time_offset_s > 0.0, 1),
         (setup.gnss_correlated_share > 0.0, 3),
+        (setup.gnss_velocity_share > 0.0, 3),
         (heights and setup.height_bias_m > 0.0, 1),
     ):
         places.append(size if asked else -1)
@@ -132,6 +136,7 @@ def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
         (layout.lever_arm, 3, setup.estimate_lever_arm),
         (layout.time_offset, 1, setup.estimate_time_offset_s),
         (layout.slow, 3, 1.0),
+        (layout.slow_velocity, 3, 1.0),
         (layout.height_bias, 1, setup.height_bias_m),
     ):
         if first >= 0:
@@ -145,6 +150,8 @@ def drive_of(setup: Setup, layout: Layout) -> Drive:
     correlation_s[E_GYRO_BIAS : E_ACCEL_BIAS + 3] = setup.noise.bias_correlation_s
     if layout.slow >= 0:
         correlation_s[layout.slow : layout.slow + 3] = setup.gnss_correlation_s
+    if layout.slow_velocity >= 0:
+        correlation_s[layout.slow_velocity : layout.slow_velocity + 3] = setup.gnss_velocity_correlation_s
     if layout.height_bias >= 0:
         correlation_s[layout.height_bias] = setup.height_correlation_s
     variance = np.where(np.isfinite(correlation_s), prior_variance(setup, layout), 0.0)
@@ -372,6 +379,7 @@ def inject(x: FloatArray, error: FloatArray, layout: Layout) -> None:
         (layout.lever_arm, 3, LEVER_ARM),
         (layout.time_offset, 1, TIME_OFFSET),
         (layout.slow, 3, SLOW),
+        (layout.slow_velocity, 3, SLOW_VELOCITY),
         (layout.height_bias, 1, HEIGHT_BIAS),
     ):
         if first >= 0:

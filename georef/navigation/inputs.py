@@ -207,6 +207,7 @@ class Setup:
             inertial unit's time (positive: GNSS stamps are early, or inertial ones late).
         gnss_correlation_s: e-folding time of the GNSS positions' common error.
         gnss_correlated_share: share (0 … 1) of the positions' variance that is time-correlated; 0: white.
+        gnss_velocity_correlation_s, gnss_velocity_share: the same of the velocities.
         height_bias_m: prior sigma of a barometer's bias; 0: heights are taken as they are.
         height_correlation_s: e-folding time of it.
         position_floor_m, velocity_floor_mps: the least sigma believed; of positions more where the fix is no fixed one.
@@ -232,6 +233,8 @@ class Setup:
     estimate_time_offset_s: float = 0.0
     gnss_correlation_s: float = 60.0
     gnss_correlated_share: float = 0.0
+    gnss_velocity_correlation_s: float = 2.0
+    gnss_velocity_share: float = 0.0
     height_bias_m: float = 10.0
     height_correlation_s: float = 3600.0
     position_floor_m: float = 0.005

@@ -4,7 +4,7 @@ The innovation is observed − predicted, and H the derivative of what is predic
 and velocities (components north, east, down). With l the lever arm, C = rot_e_from_b, v and a the antenna's:
 
     position    r + C l + v τ + ½ a τ² + L √share c      τ the time offset, c the slow error, L Lᵀ its covariance
-    velocity    v + C (ω_eb × l) + a τ
+    velocity    v + C (ω_eb × l) + a τ + L √share c
     heading     direction of C · baseline in l
     attitude    roll, pitch, heading of C in l
     zero        v = 0 ;  non-holonomic: y and z of Cᵀ v are 0 ;  height: of r, + the barometer's bias
@@ -46,6 +46,7 @@ from georef.navigation.strapdown import (
     LEVER_ARM,
     POSITION,
     SLOW,
+    SLOW_VELOCITY,
     TIME_OFFSET,
     VELOCITY,
     copy_into,
@@ -76,7 +77,7 @@ class Rules(NamedTuple):
 
     Attributes:
         arms_b: (k, 3) lever arms; baseline_b: (3,), nan: none.
-        share: of GNSS positions' variance that is slow.
+        share, velocity_share: of GNSS positions' and velocities' variance that is slow.
         position_floor_m: (fix types,).
         position_scale, velocity_scale: (fix types, 2) of the horizontal and the vertical, floors included.
         heading_scale: likewise.
@@ -89,6 +90,7 @@ class Rules(NamedTuple):
     arms_b: FloatArray
     baseline_b: FloatArray
     share: float
+    velocity_share: float
     position_floor_m: FloatArray
     position_scale: FloatArray
     velocity_scale: FloatArray
@@ -109,6 +111,7 @@ def rules_of(setup: Setup) -> Rules:
         np.ascontiguousarray(setup.lever_arms_b, dtype=np.float64).reshape(-1, 3),
         baseline,
         float(setup.gnss_correlated_share),
+        float(setup.gnss_velocity_share),
         np.array(floors),
         _scales_of(setup.gnss_sigma_scale, setup.gnss_vertical_scale),
         _scales_of(setup.gnss_velocity_scale, setup.gnss_velocity_vertical_scale),
@@ -202,22 +205,22 @@ def _position(
         if layout.time_offset >= 0:
             rows[i, layout.time_offset] = dot(a, plus(moving, offset_s, acceleration))
     if layout.slow >= 0:
-        _add_slow(x, rules, layout, nu, rows, noise)
+        _add_slow(three(x, SLOW), rules.share, layout.slow, nu, rows, noise)
 
 
 @kernel
-def _add_slow(x: FloatArray, rules: Rules, layout: Layout, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
-    """The time-correlated share of a position's error."""
+def _add_slow(slow: Three, share: float, at: int, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
+    """Add the time-correlated share of a position's or velocity's error, whose place among the errors is ``at``."""
     factor = noise.copy()
     if not factorise(factor, 3):
         return
-    root = math.sqrt(rules.share)
+    root = math.sqrt(share)
     for i in range(3):
         for j in range(i + 1):
-            rows[i, layout.slow + j] = root * factor[i, j]
-            nu[i] -= root * factor[i, j] * x[SLOW + j]
+            rows[i, at + j] = root * factor[i, j]
+            nu[i] -= root * factor[i, j] * slow[j]
         for j in range(3):
-            noise[i, j] *= 1.0 - rules.share
+            noise[i, j] *= 1.0 - share
 
 
 @kernel
@@ -261,6 +264,8 @@ def _velocity(
             put(rows[i], layout.lever_arm, cross(in_b, rate))
         if layout.time_offset >= 0:
             rows[i, layout.time_offset] = dot(a, acceleration)
+    if layout.slow_velocity >= 0:
+        _add_slow(three(x, SLOW_VELOCITY), rules.velocity_share, layout.slow_velocity, nu, rows, noise)
 
 
 @kernel

@@ -12,6 +12,10 @@ inertial unit knows better over seconds than the receiver: much at 5 Hz, little 
 likelihood of the innovations, scales matched for each, together with a prior, `PRIOR_SIGMA` of ln (lasting / white
 variance) about the share that was assumed; another share than that needs `EVIDENCE` too. Against the hypothesis of a
 setup that says white, it needs `SIGNIFICANT`.
+
+Velocities' errors last for seconds where a receiver filters them. Their share is looked for likewise, with the times of
+`VELOCITY_TIMES_S`, before that of the positions, which takes their part where nobody says that they last; it needs
+`SIGNIFICANT`.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +41,8 @@ SCALES = (0.02, 30.0)
 LARGEST = 5.0  # times what is told of positions: beyond, a time, a lever arm or a frame is wrong, and it is no noise
 NEAR = 0.03  # of 1: mean square that needs no other scale
 ROUNDS = 4  # runs, at most, until scales stay
+VELOCITY_TIMES_S = (0.7, 1.4, 2.8, 5.6)  # e-folding times of velocities' errors that are tried
+LITTLE = 0.2  # share of velocities' tried first: where even that is less likely than none, none lasts
 STEP = 0.7  # of ln (lasting / white variance) between shares tried
 MIDDLE, PRIOR_SIGMA, REACH = 0.5, 1.0, 7  # share tried first where none is assumed; steps either way, at most
 GREATEST = 50.0  # χ² that counts of an innovation
@@ -48,18 +55,45 @@ Source = tuple[int, int, bool]  # kind, fix type (of headings 0), whether it is 
 
 
 @dataclass(frozen=True)
+class Part:
+    """What a share that lasts is of: the names of its fields in `Setup`."""
+
+    share: str
+    scales: str
+
+    def of(self, setup: Setup) -> float:
+        """Return the share in a setup."""
+        return float(getattr(setup, self.share))
+
+    def with_share(self, setup: Setup, share: float) -> Setup:
+        """Return a setup with another share that lasts, and as large a white part."""
+        white = math.sqrt((1.0 - self.of(setup)) / (1.0 - share))
+        scales = getattr(setup, self.scales)
+        every = {fix: white * scales.get(fix, 1.0) for fix in range(16)}
+        changes: dict[str, Any] = {self.share: share, self.scales: every}
+        return replace(setup, **changes)
+
+
+POSITIONS = Part("gnss_correlated_share", "gnss_sigma_scale")
+VELOCITIES = Part("gnss_velocity_share", "gnss_velocity_scale")
+
+
+@dataclass(frozen=True)
 class Hypothesis:
-    """A share of positions' variance that lasts, with the scales that go with it.
+    """Shares of positions' and velocities' variances that last, with the scales that go with them.
 
     Attributes:
-        share: 0 … 1.
         log_likelihood: of the innovations, relative to the share that was assumed.
-        setup: with this share, scales matched.
+        setup: with these shares, scales matched.
     """
 
-    share: float
     log_likelihood: float
     setup: Setup
+
+    @property
+    def share(self) -> float:
+        """Share of the positions' variance."""
+        return self.setup.gnss_correlated_share
 
 
 @dataclass(frozen=True)
@@ -72,6 +106,7 @@ class NoiseFound:
         second_moment: by source, mean square of normalised innovations of the first run.
         count: by source, components that this is of.
         evidence: ln likelihood won by the first scale of each source; of the share `share_evidence`.
+        velocity_evidence: of the share of velocities' errors that lasts; 0: none was found.
     """
 
     setup: Setup
@@ -80,6 +115,7 @@ class NoiseFound:
     count: dict[Source, int]
     evidence: dict[Source, float] = field(default_factory=dict)
     share_evidence: float = 0.0
+    velocity_evidence: float = 0.0
 
     @property
     def share(self) -> float:
@@ -196,23 +232,61 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
     sound = innovations[not_blunders(innovations)]
     moments, counts = second_moments(sound)
     if sum(count for (kind, *_), count in counts.items() if kind == Kind.POSITION) < ENOUGH:
-        return NoiseFound(setup, (Hypothesis(setup.gnss_correlated_share, 0.0, setup),), moments, counts)
+        return NoiseFound(setup, (Hypothesis(0.0, setup),), moments, counts)
     begun, evidence = rescaled(setup, sound)
     judged = Judged(stretch)
     first = judged.matched(begun)
-    if setup.gnss_correlated_share > 0.0:
-        tried, best = _shares(judged, first)
-        needed = EVIDENCE
-    else:
-        tried, best = _shares(judged, judged.matched(_with_share(first.setup, MIDDLE)))
-        tried, needed = [first, *tried], SIGNIFICANT
+    of_speeds = 0.0
+    if sum(count for (kind, *_), count in counts.items() if kind == Kind.VELOCITY) >= ENOUGH:
+        white = first if POSITIONS.of(setup) > 0.0 else _of_positions(judged, first)[1]
+        lasting = _of_velocities(judged, white)
+        if lasting is not white:
+            of_speeds, first = lasting.log_likelihood - white.log_likelihood, lasting
+    tried, best = _of_positions(judged, first)
     gain = best.log_likelihood - first.log_likelihood
-    if gain < needed:
-        best, gain = first, 0.0
     told = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
     if _too_large(best.setup, setup, counts):
         return NoiseFound(setup, told, moments, counts)
-    return NoiseFound(best.setup, told, moments, counts, evidence, gain)
+    return NoiseFound(best.setup, told, moments, counts, evidence, gain, of_speeds)
+
+
+def _of_positions(judged: Judged, first: Hypothesis) -> tuple[list[Hypothesis], Hypothesis]:
+    """Return hypotheses of the share of positions' errors that lasts, the assumed one first, and the one to go by."""
+    if POSITIONS.of(first.setup) > 0.0:
+        tried, best = _shares(judged, first, POSITIONS)
+        needed = EVIDENCE
+    else:
+        tried, best = _shares(judged, judged.matched(POSITIONS.with_share(first.setup, MIDDLE)), POSITIONS)
+        tried, needed = [first, *tried], SIGNIFICANT
+    return tried, best if best.log_likelihood - first.log_likelihood >= needed else first
+
+
+def _of_velocities(judged: Judged, white: Hypothesis) -> Hypothesis:
+    """Return the hypothesis of velocities' errors that last which has the evidence needed; else the one given."""
+    if VELOCITIES.of(white.setup) > 0.0:
+        return white
+
+    def begun(place: int) -> Hypothesis:
+        """Return the hypothesis of a time from which its shares are climbed."""
+        setup = replace(white.setup, gnss_velocity_correlation_s=VELOCITY_TIMES_S[place])
+        return judged.matched(VELOCITIES.with_share(setup, LITTLE))
+
+    at = len(VELOCITY_TIMES_S) // 2
+    if begun(at).log_likelihood <= white.log_likelihood:
+        return white
+    tried: dict[int, Hypothesis] = {}
+
+    def worth(place: int) -> float:
+        """Ln likelihood with the likeliest share for a time."""
+        if place not in tried:
+            _, likeliest = _shares(judged, begun(place), VELOCITIES)
+            tried[place] = judged.matched(likeliest.setup)
+        return tried[place].log_likelihood
+
+    way = 1 if worth(at + 1) > worth(at) else -1
+    while 0 <= at + way < len(VELOCITY_TIMES_S) and worth(at + way) > worth(at):
+        at += way
+    return tried[at] if worth(at) - white.log_likelihood >= SIGNIFICANT else white
 
 
 def _too_large(found: Setup, asked: Setup, counts: Mapping[Source, int]) -> bool:
@@ -237,7 +311,7 @@ class Judged:
         self._kept: BoolArray | None = None
 
     def matched(self, setup: Setup) -> Hypothesis:
-        """Return a setup with the scales that go with its share."""
+        """Return a setup with the scales that go with its shares."""
         for left in reversed(range(ROUNDS)):
             found = self._stretch(setup)
             if self._kept is None:
@@ -248,24 +322,12 @@ class Judged:
             if not won or not left:
                 break
             setup = other
-        return Hypothesis(setup.gnss_correlated_share, log_likelihood(found), setup)
+        return Hypothesis(log_likelihood(found), setup)
 
 
-def _with_share(setup: Setup, share: float) -> Setup:
-    """Return a setup with another share that lasts, and as large a white part."""
-    white = math.sqrt((1.0 - setup.gnss_correlated_share) / (1.0 - share))
-    scales = _all_scales(setup.gnss_sigma_scale, white)
-    return replace(setup, gnss_correlated_share=share, gnss_sigma_scale=scales)
-
-
-def _all_scales(scales: Mapping[int, float], factor: float) -> dict[int, float]:
-    """Return scales of all fix types, each multiplied."""
-    return {fix: factor * scales.get(fix, 1.0) for fix in range(16)}
-
-
-def _shares(judged: Judged, middle: Hypothesis) -> tuple[list[Hypothesis], Hypothesis]:
+def _shares(judged: Judged, middle: Hypothesis, part: Part) -> tuple[list[Hypothesis], Hypothesis]:
     """Climb from an assumed share to the likeliest; all that were tried, and that one, on a parabola through three."""
-    centre = math.log(middle.share / (1.0 - middle.share))
+    centre = math.log(part.of(middle.setup) / (1.0 - part.of(middle.setup)))
     known = {0: middle}
 
     def worth(place: int) -> float:
@@ -273,7 +335,7 @@ def _shares(judged: Judged, middle: Hypothesis) -> tuple[list[Hypothesis], Hypot
         if place not in known:
             share = 1.0 / (1.0 + math.exp(-(centre + STEP * place)))
             near = known[place - 1 if place > 0 else place + 1]
-            known[place] = judged.matched(_with_share(near.setup, share))
+            known[place] = judged.matched(part.with_share(near.setup, share))
         return known[place].log_likelihood - 0.5 * (STEP * place / PRIOR_SIGMA) ** 2
 
     at, way = 0, 1 if worth(1) > worth(-1) else -1
@@ -286,4 +348,4 @@ def _shares(judged: Judged, middle: Hypothesis) -> tuple[list[Hypothesis], Hypot
     off = 0.5 * (above - below) / bend if bend > 0.0 else 0.0
     share = 1.0 / (1.0 + math.exp(-(centre + STEP * (at + off))))
     peak = known[at].log_likelihood + 0.25 * off * (above - below)
-    return list(known.values()), Hypothesis(share, peak, _with_share(known[at].setup, share))
+    return list(known.values()), Hypothesis(peak, part.with_share(known[at].setup, share))

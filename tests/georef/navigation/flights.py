@@ -89,7 +89,7 @@ def fly(motion: Motion, seconds: float, rate_hz: float) -> Truth:
 
 @dataclass(frozen=True)
 class Fixes:
-    """GNSS of the made flight: sigmas of position and velocity, share of position's that lasts, for how long."""
+    """GNSS of the made flight: sigmas of position and velocity, shares of their variances that last, for how long."""
 
     sigma_m: tuple[float, float, float] = (0.01, 0.01, 0.02)
     share: float = 0.0
@@ -97,6 +97,8 @@ class Fixes:
     rate_hz: float = 1.0
     velocity_mps: float = 0.0
     first_s: float = 0.3217
+    velocity_share: float = 0.0
+    velocity_tau_s: float = 2.0
 
 
 def markov(rng: np.random.Generator, steps: int, columns: int, step_s: float, tau_s: float) -> FloatArray:
@@ -139,7 +141,11 @@ def noised(
     if fixes.velocity_mps:
         swing = np.einsum("nij,nj->ni", at.rot_e_from_b, np.cross(at.rate_eb_b, lever_arm_b))
         speed = np.einsum("nji,nj->ni", here, at.velocity_e + swing)
-        speed = speed + fixes.velocity_mps * rng.standard_normal(speed.shape)
+        error = np.sqrt(1.0 - fixes.velocity_share) * rng.standard_normal(speed.shape)
+        if fixes.velocity_share:
+            lasting = markov(rng, len(t), 3, 1.0 / fixes.rate_hz, fixes.velocity_tau_s)
+            error += np.sqrt(fixes.velocity_share) * lasting
+        speed = speed + fixes.velocity_mps * error
         sigma = np.full(3, fixes.velocity_mps)
         rows = np.concatenate([rows, observed(Kind.VELOCITY, t, speed, sigma, FixType.RTK_FIXED)])
     return inertial, rows
