@@ -18,40 +18,24 @@ from daemon.processing.given_trajectory import Belonging, Given, judge_given, po
 from daemon.processing.setup import Options, Setup
 from georef.earth import geodetic_from_e
 from georef.trajectory import Trajectory
-from tests.daemon.short_flight import Flown, fly_short
+from tests.daemon.short_flight import Flown, fly_short, two_lines
 
-PLAN = """
-[flight]
-name = "given"
-origin_deg = [47.48, 11.4]
-speed_mps = 50.0
-lead_s = 3.0
-
-[[line]]
-name = "there"
-from_m = [-600.0, 0.0]
-to_m = [600.0, 0.0]
-height_m = 800.0
-
-[[line]]
-name = "back"
-from_m = [600.0, 200.0]
-to_m = [-600.0, 200.0]
-height_m = 800.0
-
-[pps.main]
-
-[imu.main]
-
-[gnss.rover]
-lever_arm_m = [0.4, -0.25, -1.2]
-{gnss}
-
-[scanner.left]
-prf_hz = 1000
-"""
 UNDULATION_M = 48.0  # of the virtual receiver
 Angles = tuple[Any, Any, Any]
+
+
+def plan(gnss: str) -> str:
+    """Two lines in the Alps, whose receiver has an antenna aside."""
+    return two_lines(
+        "given",
+        flight="origin_deg = [47.48, 11.4]\nlead_s = 3.0",
+        half_m=600.0,
+        norths_m=(0.0, 200.0),
+        height_m=800.0,
+        gnss=f"lever_arm_m = [0.4, -0.25, -1.2]\n{gnss}",
+        imu="",
+        prf_hz=1000,
+    )
 
 
 @dataclass
@@ -89,13 +73,13 @@ def read(flown: Flown) -> Log:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
     """An RTK receiver; two lines and the turn between them."""
-    return read(fly_short(tmp_path_factory.mktemp("rtk"), PLAN.format(gnss='grade = "rtk"')))
+    return read(fly_short(tmp_path_factory.mktemp("rtk"), plan('grade = "rtk"')))
 
 
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory) -> Log:
     """A receiver alone that says no sigmas, by NMEA."""
-    return read(fly_short(tmp_path_factory.mktemp("spp"), PLAN.format(gnss='grade = "spp"\nprotocol = "nmea"')))
+    return read(fly_short(tmp_path_factory.mktemp("spp"), plan('grade = "spp"\nprotocol = "nmea"')))
 
 
 def raised(trajectory: Trajectory, change: Any) -> Trajectory:

@@ -6,14 +6,11 @@ import csv
 import hashlib
 import json
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pyproj import Transformer
-from scipy.spatial.transform import Rotation
 
 from daemon.cli.main import run_app
 from daemon.log.reader import open_logs
@@ -23,39 +20,12 @@ from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory
 from sim.plan import Plan, parse_plan
 from tests.daemon import short_flight
-from tests.daemon.short_flight import MARK_AFTER_NS, Flown, fly_short
+from tests.daemon.short_flight import MARK_AFTER_NS, Flown, errors, fly_short, post_processed, two_lines
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
 S = 1_000_000_000
-PLAN = """
-[flight]
-name = "navigated"
-seed = 5
-speed_mps = 50.0
-
-[[line]]
-name = "1"
-from_m = [-500, 0]
-to_m = [500, 0]
-height_m = 700
-
-[[line]]
-name = "2"
-from_m = [500, 400]
-to_m = [-500, 400]
-height_m = 700
-
-[gnss.rover]
-rate_hz = 2
-secondary_lever_arm_m = [0.1, 1.15, -1.2]
-
-[imu.main]
-rate_hz = 100
-
-[scanner.left]
-prf_hz = 500
-"""
+PLAN = two_lines("navigated", gnss="rate_hz = 2\nsecondary_lever_arm_m = [0.1, 1.15, -1.2]")
 SECONDS = 55.0
 
 
@@ -90,34 +60,6 @@ def read(folder: Path, flown: Flown) -> Trajectory:
     span = flown.truth().span
     smrmsg = (folder / "a.smrmsg").read_bytes()
     return read_trajectory((folder / "a.sbet").read_bytes(), "a.sbet", span_ns=span, smrmsg=smrmsg)
-
-
-def errors(trajectory: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) of position, north, east, down, m, and of attitude, rad, where both say something."""
-    inside = truth.fates(trajectory.time_ns) == 0
-    part = Trajectory(
-        *(
-            getattr(trajectory, name)[inside]
-            for name in ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
-        )
-    )
-    poses = truth.poses(part.time_ns)
-    true = Trajectory(
-        part.time_ns,
-        poses.position_e,
-        poses.q_e_from_b,
-        poses.velocity_e,
-        part.position_sigma_l,
-        part.attitude_sigma_rad,
-    )
-    lat, lon, _ = true.geodetic()
-    down = np.stack([-np.cos(lat) * np.cos(lon), -np.cos(lat) * np.sin(lon), -np.sin(lat)], axis=1)
-    east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], axis=1)
-    north = np.cross(east, down)
-    apart = part.position_e - true.position_e
-    position = np.stack([(apart * axis).sum(axis=1) for axis in (north, east, down)], axis=1)
-    angles = np.stack(part.attitude(), axis=1) - np.stack(true.attitude(), axis=1)
-    return position, (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 class TestSmoothed:
@@ -332,33 +274,6 @@ def test_an_attitude_that_cannot_be_is_refused(text: str) -> None:
 
 def test_an_attitude_by_hand_is_in_degrees() -> None:
     assert attitude_of_text("1.5, -2,270") == pytest.approx(np.radians([1.5, -2.0, 270.0]).tolist())
-
-
-POS_HEAD = """% program   : RTKLIB
-%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio
-"""
-PPK_M = np.array([0.003, 0.003, 0.006])  # north, east, up
-ARM_B = np.array([0.1, -0.05, -1.2])
-
-
-def post_processed(truth: Trajectory, span_ns: tuple[int, int]) -> str:
-    """What RTKLIB would write: the antenna each half second, wrong by `PPK_M` from one to the next."""
-    rng = np.random.default_rng(12)
-    time_ns = np.arange(-(-span_ns[0] // S) * S, span_ns[1], S // 2)
-    poses = truth.poses(time_ns)
-    antenna_e = poses.position_e + Rotation.from_quat(poses.q_e_from_b[:, [1, 2, 3, 0]]).apply(ARM_B)
-    lon, lat, height = Transformer.from_crs(4978, 4979, always_xy=True).transform(*antenna_e.T)
-    off = PPK_M * rng.standard_normal((len(time_ns), 3))
-    lat, lon = lat + off[:, 0] / 111_200.0, lon + off[:, 1] / (111_320.0 * np.cos(np.radians(lat)))
-    text = POS_HEAD
-    for k, at in enumerate(time_ns.tolist()):
-        day = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(microseconds=at // 1000)
-        sigma = " ".join(f"{value:.4f}" for value in PPK_M)
-        text += (
-            f"{day:%Y/%m/%d %H:%M:%S}.{day.microsecond // 1000:03d} {lat[k]:.9f} {lon[k]:.9f} "
-            f"{height[k] + off[k, 2]:.4f} 1 14 {sigma} 0 0 0 0.00 99.9\n"
-        )
-    return text
 
 
 def test_post_processed_positions_make_it_better(flown: Flown, made: Path, tmp_path: Path) -> None:

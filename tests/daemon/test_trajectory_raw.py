@@ -22,8 +22,7 @@ from drivers.gnss.novatel_encoder import encode_frame
 from georef.formats.trajectory_file import read_trajectory
 from georef.trajectory import Trajectory
 from sim.gnss.novatel import NovatelMessages
-from tests.daemon.short_flight import Flown, fly_short
-from tests.daemon.test_trajectory_cli import errors, post_processed
+from tests.daemon.short_flight import Flown, errors, fly_short, post_processed, two_lines
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -31,33 +30,7 @@ S = 1_000_000_000
 SECONDS = 45.0
 RANGECMP = 140
 WALL_ERROR_S = 0.002
-PLAN = """
-[flight]
-name = "raw"
-seed = 5
-speed_mps = 50.0
-
-[[line]]
-name = "1"
-from_m = [-500, 0]
-to_m = [500, 0]
-height_m = 700
-
-[[line]]
-name = "2"
-from_m = [500, 400]
-to_m = [-500, 400]
-height_m = 700
-
-[gnss.rover]
-rate_hz = 2
-
-[imu.main]
-rate_hz = 100
-
-[scanner.left]
-prf_hz = 500
-"""
+PLAN = two_lines("raw", gnss="rate_hz = 2")
 
 
 @contextmanager
