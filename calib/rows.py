@@ -129,16 +129,6 @@ class Rows:
         less.count = sum(batch.size for batch in less.batches)
         return less
 
-    def with_noise(self, shares: FloatArray) -> Rows:
-        """The same with shares (h,) of the noise that heads are said to have."""
-        quieter = copy(self)
-        heads = tuple(
-            replace(head, noise=head.noise.times(share))
-            for head, share in zip(self.flight.heads, shares.tolist(), strict=True)
-        )
-        quieter.flight = replace(self.flight, heads=heads)
-        return quieter
-
     @property
     def no_sums(self) -> Sums:
         """For passes that do not sum up."""

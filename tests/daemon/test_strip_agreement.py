@@ -134,7 +134,7 @@ def test_cells_that_the_user_asks_for_are_taken(tmp_path: Path, capsys: pytest.C
     assert "cells of 4 m" in record["quality"]["measure"]
     seen = look_at([folder], cell_m=4.0).agreement  # as of swath view --cell 4
     assert seen.record()["rmsdz_m"] == pytest.approx(record["quality"]["rmsdz_m"], abs=1e-6)
-    with pytest.raises(UserError, match=r"--cell: got 0, want metres") as caught:
+    with pytest.raises(UserError, match=r"--cell: got 0, want 0.05 to 100 metres") as caught:
         run(strips.command, str(folder), "--cell", "0")
     assert caught.value.exit_code == ExitCode.USAGE
 
