@@ -290,7 +290,12 @@ def test_a_trajectory_is_given_back_by_the_plumb_line_it_was_read_by(
     wish, outcome = replace(done[0], output=tmp_path / "out"), done[1]
     (logged,) = outcome.kept.logged
     plumbed: Any = SimpleNamespace(
-        log=logged.log, session=logged.session, setup=SimpleNamespace(deflection_rad=xi_eta_rad)
+        log=logged.log,
+        session=logged.session,
+        setup=SimpleNamespace(deflection_rad=xi_eta_rad),
+        verdicts=logged.verdicts,
+        trajectory_verdicts=logged.trajectory_verdicts,
+        source=logged.source,
     )
     kept = replace(outcome.kept, logged=[plumbed])
     write_adjustment(wish, replace(outcome, kept=kept), lambda what, done, total: None)
