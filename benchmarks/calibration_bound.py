@@ -51,6 +51,8 @@ LEAST_RETURNS = 3
 SECOND_NS = 1e9
 TRACK = ("gps_ns", "lat_rad", "lon_rad", "height_m", "velocity_l", "roll_rad", "pitch_rad", "heading_rad")
 STEEPEST = np.cos(np.radians(65.0))
+LEAST_WIDTH_M2 = 1e-4  # variance of neighbours across their longest axis: less is a line, no plane
+FOOTPRINT_SIGMA = 0.25  # of its full width: two sigmas to each side of the middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ def planes_at(point_l: FloatArray, strip: IntArray, roof: NDArray[np.bool_], eve
             variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
             normal = axes[:, :, 0] * -np.sign(axes[:, 2:3, 0])  # down is positive
             good = np.abs(np.einsum("nki,ni->nk", off, normal)).max(axis=1) < PLANE_M
-            good &= (-normal[:, 2] > STEEPEST) & (variances[:, 1] > 1e-4)
+            good &= (-normal[:, 2] > STEEPEST) & (variances[:, 1] > LEAST_WIDTH_M2)
             taken.append(asked[good])
             normals.append(normal[good])
     return np.concatenate(taken), np.concatenate(normals)
@@ -156,7 +158,9 @@ def equations(
     columns = [*turned.T, cosine, cosine * range_m[:, 0], angle * turned[:, 0], normal_b[:, 0] * range_m[:, 0]]
     design = np.stack([*columns, (normal * velocity).sum(axis=1)], axis=1)
     sine = np.sqrt(1.0 - np.minimum(cosine**2, 1.0))
-    aside = range_m[:, 0] * np.hypot(noise.angle_rad * turned[:, 0] / range_m[:, 0], 0.25 * noise.divergence_rad * sine)
+    aside = range_m[:, 0] * np.hypot(
+        noise.angle_rad * turned[:, 0] / range_m[:, 0], FOOTPRINT_SIGMA * noise.divergence_rad * sine
+    )
     return design, (noise.range_m * cosine) ** 2 + aside**2
 
 

@@ -37,7 +37,6 @@ FloatArray = NDArray[np.float64]
 
 LIMIT = 4.0  # sigmas
 ALLOWED = 1.0 / 500.0
-SHARE = 1.0  # of what is plausible, one sigma of what is drawn
 DESIGNS: dict[str, tuple[Line, ...]] = {
     "one": LINES[:1],
     "two opposite": LINES[:2],
@@ -117,7 +116,7 @@ def true_errors(case: Case) -> dict[str, float]:
     names = MODELS[case.model if case.model == "full" else "scanner"]
     known = {name: PARAMETERS[INDEX[name]].plausible for name in names}
     sizes = {**INSTALLED, **known}
-    return {name: SHARE * size * float(rng.normal()) for name, size in sizes.items() if name not in NOT_MADE}
+    return {name: size * float(rng.normal()) for name, size in sizes.items() if name not in NOT_MADE}
 
 
 def flight_of(case: Case) -> tuple[Made, Features]:

@@ -235,7 +235,7 @@ def plane_rows(
 
 
 def _sight(flight: Flight, plane: Plane, number: int) -> _Sight | None:
-    """What a swath shows of a plane by those of its returns that have a place; None: too few have."""
+    """Return what a swath shows of a plane by those of its returns that have a place; None: too few have."""
     patch = plane.patches[number]
     swath = flight.swaths[patch.swath]
     points = np.asarray(swath.points_t[patch.at])

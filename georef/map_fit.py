@@ -1,4 +1,4 @@
-"""Whether a projected CRS suits a place: its area of use, and how long a metre is on its map."""
+"""Tell whether a projected CRS suits a place: its area of use, and how long a metre is on its map."""
 
 from __future__ import annotations
 

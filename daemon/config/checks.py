@@ -128,7 +128,7 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
 
 
 def _check_clock(section: str, table: ScannerConfig, driver: Driver) -> Iterator[str]:
-    """What a scanner's stamps are said to be against what its protocol can say."""
+    """Yield a line where a scanner's stamps are said to be what those of its protocol cannot be."""
     can = ["auto"]
     if driver.past_hour:
         can += ["utc-hour", "free"]

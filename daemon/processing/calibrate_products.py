@@ -33,6 +33,7 @@ from daemon.processing.calibrate_model import in_words, key_of
 from daemon.processing.calibrate_record import instruments_of
 from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
 from daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
+from daemon.processing.flights import trajectory_verdicts_of
 from daemon.processing.json_values import finite
 from daemon.processing.navigation_verdict import Level
 from daemon.processing.sidecar import sha256_of
@@ -64,7 +65,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     inputs = _inputs(wish, done)
     headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
     tell("checks", 0, 1)
-    carried = list(dict.fromkeys(one for flight in done.kept.logged for one in flight.trajectory_verdicts))
+    carried = trajectory_verdicts_of(done.kept.logged)
     findings = (
         *trajectory_says(carried),
         *done.findings,

@@ -48,7 +48,7 @@ from daemon.processing.calibration_flight import (
     smoothed_prior,
 )
 from daemon.processing.carried_verdict import told_before
-from daemon.processing.flights import Wish
+from daemon.processing.flights import Wish, trajectory_verdicts_of
 from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
 from georef.calibration import Calibration
@@ -157,8 +157,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     kept = read_flight(wish.logs, folder, tell)
     _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
     check_wish(kept.flight, wish.model)
-    carried = [one for flight in kept.logged for one in flight.trajectory_verdicts]
-    with told_before(carried, *REFUSED):
+    with told_before(trajectory_verdicts_of(kept.logged), *REFUSED):
         return _calibrated(wish, kept, folder, tell)
 
 

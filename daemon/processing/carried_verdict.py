@@ -75,12 +75,10 @@ def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterat
     """
     try:
         yield
-    except Exception as error:
-        is_problem = isinstance(error, refused) or (
-            isinstance(error, UserError) and error.exit_code == ExitCode.PROBLEM
-        )
+    except (UserError, *refused) as error:
+        wrong_use = isinstance(error, UserError) and error.exit_code != ExitCode.PROBLEM
         bad = next((one.line for one in carried if one.level is Level.UNUSABLE), "")
-        if not (is_problem and bad):
+        if wrong_use or not bad:
             raise
         raise UserError(f"{bad}; so: {error}") from error
 

@@ -264,6 +264,11 @@ def verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
     return list(dict.fromkeys(one for flight in flights for one in flight.verdicts))
 
 
+def trajectory_verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
+    """Return the verdicts on the trajectories of all flights, each once."""
+    return list(dict.fromkeys(one for flight in flights for one in flight.trajectory_verdicts))
+
+
 def verdict_of(wish: Wish, flights: Sequence[Flight]) -> dict[str, Any]:
     """Return the verdict on a run, as its record says it: each reason once."""
     return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)

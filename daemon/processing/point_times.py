@@ -30,7 +30,7 @@ LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
 
 
 class TimeKind(Enum):
-    """What the times of a file's points are."""
+    """Say what the times of a file's points are."""
 
     NONE = "no GPS times"
     OF_WEEK = "seconds of the GPS week"
@@ -39,7 +39,7 @@ class TimeKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class PointTimes:
-    """Times of a file's points.
+    """Hold what the times of a file's points are.
 
     Attributes:
         path: the file.
@@ -55,9 +55,9 @@ class PointTimes:
 
 
 def point_times_of(path: Path) -> PointTimes:
-    """Return what the times of a file's points are, by its header and its first points; no raise.
+    """Return what the times of a file's points are, by its header and its first points.
 
-    A file that cannot be read has none: whoever reads its points says why.
+    A file that cannot be read has none, and nothing is raised: whoever reads its points says why.
     """
     try:
         with open_points(path) as reader:
@@ -113,7 +113,7 @@ def _named(names: Sequence[str]) -> str:
 
 
 class PointClock:
-    """GPS times of points of several files, of which some say seconds of a week only."""
+    """Give GPS times of points of several files, of which some say seconds of a week only."""
 
     def __init__(self, times: Sequence[PointTimes], week: int | None = None, near_ns: int | None = None) -> None:
         """Take what is known of the files.

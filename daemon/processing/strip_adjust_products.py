@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from calib.strip_functions import StripChoice
 from daemon.errors import ExitCode, UserError
 from daemon.processing.calibrate_products import Told, strips_entry
-from daemon.processing.carried_verdict import first_lines, trajectory_entry
+from daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
 from daemon.processing.flights import Flight as LoggedFlight
 from daemon.processing.flights import verdict_of
 from daemon.processing.json_values import finite
 from daemon.processing.sidecar import sha256_of
-from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, files_of
+from daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, files_of
 from daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
 from daemon.processing.trajectory_summary import write_json
 from georef.trajectory import Trajectory
@@ -53,7 +53,7 @@ def write_adjustment(wish: AdjustWish, done: StripsCorrected, tell: Callable[[st
             for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
                 written += write_trajectory(own, _as_given(flight, trajectory), None)
             record = finite(_record(wish, done, written))
-            path = wish.output / RECORD
+            path = wish.output / ADJUSTMENT
             written.append((write_aside(path, partial(write_json, record)), path))
         put_in_place(written)
     except OSError as error:

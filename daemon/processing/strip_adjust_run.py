@@ -50,7 +50,6 @@ from georef.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 
-RECORD = ADJUSTMENT
 AUTO = "auto"
 CHOICES = (*MODELS, AUTO)
 REFUSED = (
@@ -118,9 +117,9 @@ def _refuse_output(wish: AdjustWish) -> None:
         raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
     if not permitted or not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"--adjust {wish.output}: {there} cannot be written to", ExitCode.IO)
-    if (wish.output / RECORD).exists() and not wish.overwrite:
+    if (wish.output / ADJUSTMENT).exists() and not wish.overwrite:
         raise UserError(
-            f"{wish.output / RECORD}: is there already; want another folder, or --overwrite", ExitCode.USAGE
+            f"{wish.output / ADJUSTMENT}: is there already; want another folder, or --overwrite", ExitCode.USAGE
         )
 
 

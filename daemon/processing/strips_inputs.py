@@ -231,7 +231,7 @@ def _times_apart(strips: Gathered, seen: SeenFrom) -> list[str]:
     share = 100.0 * outside / len(strips.time_ns)
     return [
         f"{share:.0f} % of the points are of other times, {spans[0]}, than the trajectory beside them, {spans[1]}: "
-        "what the differences look like is not told of them; want the header's GPS time type, or --week, mended"
+        "the differences have no signatures; correct the GPS time type in the header, or --week"
     ]
 
 

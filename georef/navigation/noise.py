@@ -56,7 +56,7 @@ Source = tuple[int, int, bool]  # kind, fix type (of headings 0), whether it is 
 
 @dataclass(frozen=True)
 class Part:
-    """What a share that lasts is of: the names of its fields in `Setup`."""
+    """Name the fields of `Setup` that hold a share that lasts and the scales that go with it."""
 
     share: str
     scales: str
@@ -80,7 +80,7 @@ VELOCITIES = Part("gnss_velocity_share", "gnss_velocity_scale")
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Shares of positions' and velocities' variances that last, with the scales that go with them.
+    """Hold shares of positions' and velocities' variances that last, with the scales that go with them.
 
     Attributes:
         log_likelihood: of the innovations, relative to the share that was assumed.

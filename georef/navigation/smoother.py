@@ -144,7 +144,7 @@ def smooth_nodes(run: FilterRun, mean: FloatArray | None = None) -> SmoothedNode
 
 
 def _means(run: FilterRun, mean: FloatArray | None) -> tuple[FloatArray, list[FloatArray]]:
-    """(m, n) means of the errors at the nodes; by block, (k,) what innovations lose by them. Without a mean no rows."""
+    """Return means (m, n) of errors at nodes, no rows without one; by block, (k,) what innovations lose by them."""
     if mean is None:
         return np.zeros((0, 0)), [np.zeros(0) for _ in run.nodes]
     means = run.storage.empty((sum(len(block.time_ns) for block in run.nodes), run.layout.size), np.float64)
@@ -212,7 +212,13 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 def _over_component(
     adjoint: FloatArray, information: FloatArray, h: FloatArray, gain: FloatArray, innovation: float, inverse: float
 ) -> None:
-    """λ and Λ from behind an observed component to before it: its innovation, and 1, over its variance."""
+    """Take λ and Λ from behind an observed component to before it.
+
+    Args:
+        adjoint, information: λ (n,) and Λ (n, n), which are changed.
+        h, gain: (n,) of the component.
+        innovation, inverse: its innovation and 1, each over its variance.
+    """
     n = len(adjoint)
     along, through = 0.0, 0.0
     seen = np.empty(n)

@@ -148,7 +148,7 @@ def _attitude(nodes: SmoothedNodes) -> FloatArray:
 
 
 def _mean(run: FilterRun, asked: Start, offset_s: float) -> FloatArray:
-    """(n,) mean of a run's errors at its start, by the start that was asked for and the time offset that was taken."""
+    """Return the mean (n,) of a run's errors at its start, by the start asked for and the time offset taken out, s."""
     mean = np.zeros(run.layout.size)
     difference(start_state(run.setup, asked), start_state(run.setup, run.start), mean[:MOVED])
     if run.layout.time_offset >= 0:

@@ -86,7 +86,7 @@ def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
 def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wanted(
     report: ReportInput, left_m: float, level: Level
 ) -> None:
-    """What a calibration leaves in points holds the correlation: where that is little enough, the pair's sum does."""
+    """Count what a calibration leaves in points, which holds the correlation: where it is little, the sum suffices."""
     correlation = np.eye(len(report.adjusted.names))
     correlation[0, 1] = correlation[1, 0] = 0.97
     need = Need(0.05, {}, 0.1, {"left": left_m})

@@ -135,7 +135,7 @@ def fly_short(folder: Path, plan_text: str, seconds: float = math.inf) -> Flown:
 
 
 def errors(trajectory: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) of position, north, east, down, m, and of attitude, rad, where both say something."""
+    """Return errors (n, 3) of position, north, east, down, m, and of attitude, rad, where both say something."""
     inside = truth.fates(trajectory.time_ns) == 0
     part = Trajectory(
         *(
@@ -163,7 +163,7 @@ def errors(trajectory: Trajectory, truth: Trajectory) -> tuple[np.ndarray, np.nd
 
 
 def post_processed(truth: Trajectory, span_ns: tuple[int, int]) -> str:
-    """What RTKLIB would write: the antenna each half second, wrong by `PPK_M` from one to the next."""
+    """Return what RTKLIB would write: the antenna each half second, wrong by `PPK_M`, white."""
     rng = np.random.default_rng(12)
     time_ns = np.arange(-(-span_ns[0] // S) * S, span_ns[1], S // 2)
     poses = truth.poses(time_ns)

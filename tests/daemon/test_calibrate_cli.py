@@ -233,7 +233,7 @@ def first_strips(made: Made, count: int, folder: Path) -> tuple[str, str]:
 def test_a_calibration_on_a_trajectory_not_to_be_used_is_not_to_be_used(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is said first, stands in the file, and goes on to whatever is made with the calibration."""
+    """Say it first, and in the file, from which whatever is made with the calibration has it."""
     file, output = tmp_path / "flight.csv", tmp_path / "left.toml"
     file.write_bytes((made.flown.folder / "true_trajectory.csv").read_bytes())
     judge_unusable(file, "the lever arm has another sign")

@@ -15,13 +15,13 @@ import pytest
 from daemon.cli.main import run_app
 from daemon.errors import ExitCode, UserError
 from daemon.processing import strip_adjust_products
-from daemon.processing.carried_verdict import file_verdicts
+from daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
 from daemon.processing.flights import Wish
 from daemon.processing.flown import TrajectoryWish
 from daemon.processing.navigation_verdict import Level
 from daemon.processing.setup import Options
 from daemon.processing.strip_adjust_products import write_adjustment
-from daemon.processing.strip_adjust_run import RECORD, AdjustWish, StripsCorrected, correct_strips
+from daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, correct_strips
 from georef.earth import rot_e_from_l
 from georef.formats.trajectory_csv import csv_text
 from georef.formats.trajectory_file import read_trajectory
@@ -75,7 +75,7 @@ def adjusted(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 def record_of(folder: Path) -> Any:
-    return json.loads((folder / RECORD).read_text())
+    return json.loads((folder / ADJUSTMENT).read_text())
 
 
 def trajectory_of(folder: Path, suffix: str) -> Path:
@@ -135,7 +135,7 @@ def test_the_calibration_file_stays_and_the_table_says_what_was_done(
     assert "constant" in row
     assert "not told" in row  # its place in plan, over hardly anything but level ground
     assert "→" in row
-    assert str(tmp_path / "out" / RECORD) in told
+    assert str(tmp_path / "out" / ADJUSTMENT) in told
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".sbet"])
@@ -242,7 +242,7 @@ def test_files_that_are_there_stay(
     was = {path: path.read_bytes() for path in adjusted.iterdir()}
     code, line = refused(capsys, arguments(made, lifted, adjusted))
     assert code == 2
-    assert f"{RECORD}: is there already; want another folder, or --overwrite" in line
+    assert f"{ADJUSTMENT}: is there already; want another folder, or --overwrite" in line
     own = arguments(made, trajectory_of(adjusted, ".sbet"), adjusted, "--overwrite")
     assert "is what is corrected; want another folder" in refused(capsys, own)[1]
     assert "is a file; want a folder" in refused(capsys, arguments(made, lifted, lifted))[1]

@@ -112,7 +112,8 @@ def test_sigmas_are_what_errors_are_whatever_the_receiver_says(name: str) -> Non
     """18 flights of 240 s, sigmas true, too small by 3, too large by 3 in turn: NEES of position, velocity and attitude
     within 99.8 % of what chance allows; positions and velocities err, RMS, at most 1.05 times as the best smoother's.
 
-    Those of attitude are too few: they lie within a tenth of a sigma of the best, which adds half a percent.
+    18 flights are too few to compare attitudes' errors so: attitudes lie within a tenth of a sigma of the best, which
+    adds half a percent to their errors.
     """
     flights, squared, apart = [], np.zeros((2, 9)), []
     for seed in range(18):
