@@ -42,14 +42,14 @@ def misfit_of(crs: CRS, said: str, lat_deg: FloatArray, lon_deg: FloatArray) -> 
     at = int(np.argmax(away_m)) if far.any() else int(np.argmax(off))
     scale = float(scales[int(np.argmax(np.abs(scales[:, at] - 1.0))), at])
     where = degrees_text(float(lat_deg[at]), float(lon_deg[at]), 2)
-    outside = ""
+    outside = ":"
     if far.any() and (area := crs.area_of_use) is not None:
         outside = (
-            f"is used from {area.west:g}° to {area.east:g}° E, {area.south:g}° to {area.north:g}° N, and "
-            f"{away_m[at] / 1e3:.0f} km away, "
+            f" is used from {area.west:g}° to {area.east:g}° E, {area.south:g}° to {area.north:g}° N, and "
+            f"{away_m[at] / 1e3:.0f} km away,"
         )
     return (
-        f"{said} {outside}at {where} a metre on the ground is {scale:.4f} m of the map; "
+        f"{said}{outside} at {where} a metre on the ground is {scale:.4f} m of the map; "
         f"{_better(crs, float(lat_deg[at]), float(lon_deg[at]))}"
     )
 
