@@ -73,9 +73,10 @@ def told_before(carried: Sequence[Carried], *refused: type[Exception]) -> Iterat
     Raises:
         UserError: of an error within, where something is not to be used; else the error itself.
     """
+    told: tuple[type[Exception], ...] = (UserError, *refused)
     try:
         yield
-    except (UserError, *refused) as error:
+    except told as error:
         wrong_use = isinstance(error, UserError) and error.exit_code != ExitCode.PROBLEM
         bad = next((one.line for one in carried if one.level is Level.UNUSABLE), "")
         if wrong_use or not bad:
