@@ -76,8 +76,8 @@ def geometry(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: 
 
 
 @kernel
-def motion(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: Three, turns: bool) -> None:
-    """Speed along the normal of the body, and of the point by the body's turning."""
+def speeds(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: Three) -> None:
+    """Speed of the body along the normal."""
     epoch = -1
     speed = 0.0
     for i in range(n):
@@ -87,13 +87,17 @@ def motion(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: 
             way = plus(vector_at(track.position_e, epoch + 1), -1.0, vector_at(track.position_e, epoch))
             speed = dot(normal, way) * (_LATER / (track.time_ns[epoch + 1] - track.time_ns[epoch]))
         cells[SPEED, i] = speed
-    if turns:
-        for i in range(n):
-            at = locate_epoch(track.time_ns, beam.time_ns[k + i] + round(track.latency_ns), beam.epoch[k + i])
-            at = max(at, 0)
-            rate = vector_at(track.rotvec_b, at)
-            turned = dot(rate, (cells[BODY, i], cells[BODY + 1, i], cells[BODY + 2, i]))
-            cells[TURNED, i] = turned * (_LATER / (track.time_ns[at + 1] - track.time_ns[at]))
+
+
+@kernel
+def turnings(cells: FloatArray, n: int, k: int, beam: Beam, track: Track) -> None:
+    """Speed along the normal of the point by the body's turning."""
+    for i in range(n):
+        at = locate_epoch(track.time_ns, beam.time_ns[k + i] + round(track.latency_ns), beam.epoch[k + i])
+        at = max(at, 0)
+        rate = vector_at(track.rotvec_b, at)
+        turned = dot(rate, (cells[BODY, i], cells[BODY + 1, i], cells[BODY + 2, i]))
+        cells[TURNED, i] = turned * (_LATER / (track.time_ns[at + 1] - track.time_ns[at]))
 
 
 @kernel
@@ -117,7 +121,9 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
 
     What takes a point off its plane is an error of its range above all, and this stands in its coefficients, too: with
     those as measured, Σ aᵀ p f has the expectation Σ (∂a/∂ρ) / (∂f/∂ρ), which for the range scale is the number of
-    rows. Where a million rows share a trajectory that is worth a few millimetres that is several sigmas.
+    rows, for the scan angle's scale Σ θ tan i. Where a million rows share a trajectory that is worth a few millimetres
+    that is several sigmas. As if the beam began where the range does and swung along a great circle: what of its swing
+    is not so is errors of angles alone, the smaller part.
     """
     first, second = vector_at(planes.first_e, at), vector_at(planes.second_e, at)
     longer, wider = 1.0 + head.value[SCALE], (1.0 + head.value[ENCODER_SCALE])
@@ -138,6 +144,11 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
         turned_b = cross(moved_b, (cells[NORMAL, i], cells[NORMAL + 1, i], cells[NORMAL + 2, i]))
         rot_e_from_b = rot_of(q[0, j], q[1, j], q[2, j], q[3, j])
         moved, turned = times(rot_e_from_b, moved_b), times(rot_e_from_b, turned_b)
+        range_m, along, across = beam.range_m[j], cells[ALONG, i], cells[BY_ANGLE, i]
+        swing2 = a[0, j] * a[0, j] + a[1, j] * a[1, j] + a[2, j] * a[2, j]
+        cells[ALONG, i] -= by_angle * across / range_m
+        cells[BY_ANGLE, i] += (by_angle * swing2 * along - by_range * across) / range_m
+        cells[BY_TILT, i] -= by_range * cells[BY_TILT, i] / range_m
         for axis in range(3):
             cells[BORE + axis, i] -= turned_b[axis]
             cells[BODY + axis, i] -= turned_b[axis]
@@ -200,7 +211,8 @@ def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, 
     u = beam.range_axis_b[0, j], beam.range_axis_b[1, j], beam.range_axis_b[2, j]
     spin = vector_at(head.spin_b, 0)
     turns_with_beam = math.isnan(head.before_m)
-    length = beam.range_m[j] - (0.0 if turns_with_beam else head.before_m)
+    length = beam.range_m[j] - cells[LONGER, i] * (1.0 + head.value[SCALE])
+    length -= 0.0 if turns_with_beam else head.before_m
     if kind == AZIMUTH:
         return float(cells[BY_ANGLE, i] if turns_with_beam else length * dot(normal, cross(u, spin)))
     sine = dot(u, spin)
@@ -219,7 +231,7 @@ def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int,
             out[i] = outer[0][1] * cells[BORE, i] + outer[1][1] * cells[BORE + 1, i] + outer[2][1] * cells[BORE + 2, i]
         if kind == SLOPE:
             for i in range(n):
-                out[i] *= beam.angle_rad[k + i]
+                out[i] *= beam.angle_rad[k + i] - cells[AHEAD, i] * (1.0 + value[ENCODER_SCALE])
     elif kind == KAPPA:
         for i in range(n):
             lean = value[SLOPE] * beam.angle_rad[k + i]
@@ -328,13 +340,15 @@ def fill(
     for kind in head.kind:
         turns = turns or kind == TIME or kind == IMU
     geometry(cells, n, k, beam, head, planes, at, states)
-    motion(cells, n, k, beam, track, normal, turns)
+    speeds(cells, n, k, beam, track, normal)
     own_variance(cells, n, k, beam, head)
     if len(sigmas.position_l):
         flown_variance(cells, n, k, beam, sigmas, normal, rot_l_from_e)
     if states:
         states_now(cells, n, k, beam, knots, before, after, normal)
     adjust_observations(cells, n, k, beam, head, planes, at)
+    if turns:
+        turnings(cells, n, k, beam, track)
     walked(cells, n, knots.walk[before] if states else 0.0)
     for c in range(len(active)):
         column(cells, n, k, beam, head, head.kind[active[c]], head.argument[active[c]], panel[c])
