@@ -18,6 +18,7 @@ the held ones and S what is plausible of these, the covariance is N⁻¹ + N⁻�
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import astuple, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ def adjust(
     rematch: Rematch | None = None,
     first: Mapping[str, Calibration] | None = None,
     doubted: Mapping[str, float] | None = None,
+    entire: Rematch | None = None,
 ) -> Adjusted:
     """Estimate.
 
@@ -69,6 +71,8 @@ def adjust(
         rematch: finds the features anew with better calibrations; None, or if it gives None: they stay.
         first: by scanner, boresight angles from which iterations begin; None: from the start.
         doubted: by name, as ``left.kappa_rad``, least sigma (SI) of its start where it is held.
+        entire: gives everything that was observed, once correspondences of a part of it stay; None, or if it gives
+            None: that part is all.
 
     Returns:
         What was found. Sigmas are those that the observations' sigmas imply; where the global test rejects, times the
@@ -88,7 +92,11 @@ def adjust(
         last = rematch is None or matching == settings.matchings or (before is not None and _stable(before, found))
         again = None if last or rematch is None else rematch(placed_with)
         if again is None:
-            return _adjusted(found, settings, matching)
+            everything = None if entire is None else entire(placed_with)
+            if everything is not None:
+                whole = Block.of(flight, everything, asked, prior, placed_with)
+                found = settled(whole, replace(settings, own_noise=True), found)
+            return _adjusted(flight, found, settings, matching)
         features = again
     raise ValueError(f"matchings: got {settings.matchings}, want at least 1")
 
@@ -126,7 +134,20 @@ def _stable(before: Solved, found: Solved) -> bool:
     return all(name in old and abs(value - old[name]) < STABLE * sigma for name, value, sigma in new)
 
 
-def _adjusted(found: Solved, settings: Settings, matchings: int) -> Adjusted:
+def _of_noise(told: Flight, found: Flight) -> tuple[str, ...]:
+    """Return by how much scanners' returns scatter less than was told, a line each."""
+    lines = []
+    for head, own in zip(told.heads, found.heads, strict=True):
+        share = sum(astuple(own.noise)) / sum(astuple(head.noise))
+        if share < 1.0:
+            lines.append(
+                f"returns of {head.name} scatter {share:.2f} times what range_sigma_m, angle_sigma_deg and "
+                "divergence_mrad let expect, and were weighed by that"
+            )
+    return tuple(lines)
+
+
+def _adjusted(flight: Flight, found: Solved, settings: Settings, matchings: int) -> Adjusted:
     solution, quality, asked = found.solution, found.quality, found.solution.rows.unknowns
     factor = quality.square / quality.redundancy if quality.redundancy > 0.0 else 1.0
     chance = global_test(quality.square, quality.redundancy)
@@ -143,6 +164,7 @@ def _adjusted(found: Solved, settings: Settings, matchings: int) -> Adjusted:
     covariance = solution.parameters * (factor if scaled else 1.0) + moved @ moved.T
     sigmas = np.sqrt(np.diag(covariance))
     notes = (_NO_PRIOR,) if solution.rows.prior is None else solution.rows.prior.notes
+    notes += _of_noise(flight, solution.rows.flight)
     return Adjusted(
         calibrations=asked.finished(solution.state.values, covariance, held_sigmas, moved),
         names=asked.names,

@@ -39,10 +39,12 @@ class Patch:
     Attributes:
         swath: index in `Flight.swaths`.
         at: (n,) rising indexes of its returns.
+        each: returns that every one of them stands for, where a flight is planned.
     """
 
     swath: int
     at: Int64Array
+    each: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

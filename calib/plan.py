@@ -19,6 +19,7 @@ from calib.features import ControlPoint, Features, Patch, Plane
 from calib.flight import Flight, FlightError, Head, Swath, Tangent
 from calib.outcome import Held
 from calib.parameters import Wish
+from calib.plane_returns import RIM_M
 from calib.solve import Settings
 from calib.trajectory_errors import TrajectoryPrior
 from georef.calibration import Calibration
@@ -30,10 +31,7 @@ from georef.trajectory import Trajectory
 FloatArray = NDArray[np.float64]
 
 LEAST_POINTS = 10  # on a patch, for it to be found in a flight (FORMULAS 6.6)
-LEAST_MADE, MOST_POINTS = (
-    4,
-    24,
-)  # made of a patch: more would only lessen the noise, which the trajectory's errors exceed by far
+LEAST_MADE, MOST_MADE = 4, 24  # of a patch; each stands for as many as there would be
 STEEPEST_COS = 0.17  # of the incidence: flatter than 80° nothing comes back
 _COARSE_NS = SECOND_NS // 2
 _STEPS = 20
@@ -57,6 +55,12 @@ class Surface:
     area_m2: float
     kind: str = "roof"
     control: tuple[ControlPoint, ...] = ()
+
+    @property
+    def taken_m2(self) -> float:
+        """Area of which returns are taken: of a roof without its rims."""
+        inner_m = max(float(np.sqrt(self.area_m2)) - 2.0 * RIM_M, 0.0)
+        return inner_m**2 if self.kind == "roof" else self.area_m2
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +129,7 @@ def planned(
     trajectories: Sequence[Trajectory],
     lines: Sequence[Line],
     surfaces: Sequence[Surface],
+    most_returns: int,
 ) -> tuple[Flight, Features]:
     """The flight as it would be read, and its planes.
 
@@ -135,6 +140,7 @@ def planned(
         trajectories: planned, with the sigmas that are expected of them.
         lines: to be flown.
         surfaces: flat pieces of the terrain.
+        most_returns: of a strip on a surface that would be adjusted.
 
     Raises:
         FlightError: no surface is seen by two swaths.
@@ -144,11 +150,13 @@ def planned(
     several = len(heads) > 1
     for line in lines:
         for number, (head, scan) in enumerate(zip(heads, scans, strict=True)):
-            shots = _shots(frame, head, scan, trajectories[line.flown], line, surfaces)
+            shots, expected = _shots(frame, head, scan, trajectories[line.flown], line, surfaces)
             if not len(shots.time_ns):
                 continue
             for surface in np.unique(shots.surface).tolist():
-                patches[surface].append(Patch(len(swaths), np.flatnonzero(shots.surface == surface)))
+                at = np.flatnonzero(shots.surface == surface)
+                each = max(min(float(expected[surface]), most_returns) / len(at), 1.0)
+                patches[surface].append(Patch(len(swaths), at, each))
             name = f"{head.name} {line.name}" if several else line.name
             swaths.append(_swath(name, number, line, head.start, scan, shots))
     planes = tuple(
@@ -212,8 +220,8 @@ class _Shots:
 
 def _shots(
     frame: Tangent, head: Head, scan: Scan, trajectory: Trajectory, line: Line, surfaces: Sequence[Surface]
-) -> _Shots:
-    """Where a line's scan meets the surfaces: the moment at which each point lies in the plane of the scan."""
+) -> tuple[_Shots, FloatArray]:
+    """Where a line's scan meets the surfaces, when each point lies in the plane of the scan; by surface, how often."""
     surface = np.concatenate([np.full(len(one.points_t), index) for index, one in enumerate(surfaces)])
     points_t = np.concatenate([one.points_t for one in surfaces])
     points_e = frame.e_from_t(points_t)
@@ -226,9 +234,9 @@ def _shots(
     met = crossed & (np.abs(angle) <= scan.half_angle_rad) & (towards < -STEEPEST_COS)
     met &= (range_m >= low_m) & (range_m <= high_m)
     shots = _Shots(surface, time_ns, range_m, angle, points_t).at(met)
-    kept = _thinned(shots, surface, surfaces, _density(trajectory, line, scan, shots))
+    kept, expected = _thinned(shots, surface, surfaces, _density(trajectory, line, scan, shots))
     shots = shots.at(kept)
-    return shots.at(np.argsort(shots.time_ns, kind="stable"))
+    return shots.at(np.argsort(shots.time_ns, kind="stable")), expected
 
 
 def _crossings(
@@ -299,18 +307,21 @@ def _density(trajectory: Trajectory, line: Line, scan: Scan, shots: _Shots) -> F
     return per_m2
 
 
-def _thinned(shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], density: FloatArray) -> NDArray[np.bool_]:
-    """Which to keep: as many as would come back, at most `MOST_POINTS` a surface, none of what is hardly seen."""
+def _thinned(
+    shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], density: FloatArray
+) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which to keep, at most `MOST_MADE` a surface, none of what is hardly seen; by surface, how many would come."""
     keep = np.zeros(len(shots.surface), dtype=np.bool_)
+    expected = np.zeros(len(surfaces))
     asked = np.bincount(surface, minlength=len(surfaces))
     for index in np.unique(shots.surface).tolist():
         at = np.flatnonzero(shots.surface == index)
         share = len(at) / asked[index]
-        expected = float(density[at].mean()) * surfaces[index].area_m2 * share
-        if expected >= LEAST_POINTS and len(at) >= LEAST_MADE:
-            wanted = int(min(expected, MOST_POINTS, len(at)))
+        expected[index] = density[at].mean() * surfaces[index].taken_m2 * share
+        if expected[index] >= LEAST_POINTS and len(at) >= LEAST_MADE:
+            wanted = int(min(expected[index], MOST_MADE, len(at)))
             keep[at[np.linspace(0, len(at) - 1, wanted).astype(np.int64)]] = True
-    return keep
+    return keep, expected
 
 
 def _swath(name: str, head: int, line: Line, calibration: Calibration, scan: Scan, shots: _Shots) -> Swath:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Patch, Plane
+from calib.features import Features, Patch, Plane
 from calib.flight import Flight, Swath
 from calib.plane_cells import BLOCK, blocks, keys_of
 from calib.plane_fit import Sight, fit_sight, refusal
@@ -102,6 +102,21 @@ def thinned(at: Int64Array, most: int) -> Int64Array:
     edges = np.linspace(0.0, len(at), most + 1)
     share = np.random.default_rng(_SEED).random(most)
     return at[np.minimum((edges[:-1] + share * np.diff(edges)).astype(np.int64), len(at) - 1)]
+
+
+def limited(features: Features, rows: int) -> Features:
+    """Return features with at most so many returns on planes in all: of large patches as many as of every other one."""
+    sizes = np.sort([len(patch.at) for plane in features.planes for patch in plane.patches])
+    if sizes.sum() <= rows:
+        return features
+    kept = np.concatenate([[0], np.cumsum(sizes)[:-1]]) + sizes * np.arange(len(sizes), 0, -1)  # larger ones cut to it
+    first = int(np.argmax(kept > rows))
+    most = max(int((rows - sizes[:first].sum()) // (len(sizes) - first)), 1)
+    planes = (
+        replace(plane, patches=tuple(Patch(patch.swath, thinned(patch.at, most)) for patch in plane.patches))
+        for plane in features.planes
+    )
+    return replace(features, planes=tuple(planes))
 
 
 def sights_of(

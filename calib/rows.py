@@ -69,6 +69,7 @@ class Run:
         at: (n,) returns.
         before, after: knots; −1: none.
         channel: of a spinning head whose beams are estimated; −1: any.
+        each: returns that every one of them stands for.
     """
 
     plane: int
@@ -77,6 +78,7 @@ class Run:
     before: int = -1
     after: int = -1
     channel: int = -1
+    each: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +130,22 @@ class Rows:
         less.batches = tuple(_batches(runs))
         less.count = sum(batch.size for batch in less.batches)
         return less
+
+    def with_noise(self, shares: FloatArray) -> Rows:
+        """The same with shares (h,) of the noise that heads are said to have."""
+        quieter = copy(self)
+        heads = tuple(
+            replace(head, noise=head.noise.times(share))
+            for head, share in zip(self.flight.heads, shares.tolist(), strict=True)
+        )
+        quieter.flight = replace(self.flight, heads=heads)
+        return quieter
+
+    def weights(self) -> SingleArray:
+        """(n,) how many returns each row stands for."""
+        runs = [run for batch in self.batches for run in batch.runs]
+        lengths = [len(run.at) for run in runs]
+        return np.repeat(np.array([run.each for run in runs], np.float32), np.array(lengths, np.int64))
 
     @property
     def no_sums(self) -> Sums:
@@ -318,7 +336,8 @@ class Rows:
                     continue
                 before, after = self.knots_at(swath, swath.time_ns[patch.at])
                 for rows in _pieces(before, after):
-                    run = Run(plane, index, patch.at[rows], int(before[rows.start]), int(after[rows.start]))
+                    knots = int(before[rows.start]), int(after[rows.start])
+                    run = Run(plane, index, patch.at[rows], *knots, each=patch.each)
                     yield from _by_channel(swath, run) if by_channel else (run,)
 
 

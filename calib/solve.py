@@ -23,6 +23,7 @@ from georef.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 
+NOISE_TELLS = 1000.0  # redundancy from which on residuals say how much a scanner's returns scatter
 FEW = 1e-5  # of the rows: whether so many are rejected or not moves nothing
 
 
@@ -41,6 +42,7 @@ class Settings:
         test_level: of the global test.
         thin_above: with more rows the first steps are made with a part of them.
         rules: what is decided to be observable by.
+        own_noise: where returns on planes scatter less than their sigmas say, they are weighed by what they scatter.
     """
 
     huber: float = HUBER
@@ -52,6 +54,7 @@ class Settings:
     test_level: float = 0.01
     thin_above: int = 1_000_000
     rules: Rules = field(default_factory=Rules)
+    own_noise: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,7 @@ class Block:
     def weights(self) -> tuple[SingleArray, SingleArray]:
         """Of rows and sightings, before anything is rejected."""
         sightings = sum(len(tie.sightings) for tie in self.ties.ties)
-        return np.ones(self.rows.count, np.float32), np.ones(sightings, np.float32)
+        return self.rows.weights(), np.ones(sightings, np.float32)
 
     def part(self, most: int) -> tuple[Block, tuple[SingleArray, SingleArray]]:
         """Every so many of the rows, each with the weight of those left out; itself where there are few."""
@@ -92,7 +95,12 @@ class Block:
             return self, (rows, sightings)
         step = -(-4 * len(rows) // most)
         less = self.rows.thinned(step)
-        return replace(self, rows=less), (np.full(less.count, step, np.float32), sightings)
+        return replace(self, rows=less), (step * less.weights(), sightings)
+
+    def with_noise(self, shares: FloatArray) -> Block:
+        """The same observations with shares (h,) of the noise that the heads are said to have."""
+        rows = self.rows.with_noise(shares)
+        return Block(rows, self.ties.of(rows), self.trajectory)
 
     def normals(self, state: State, weights: tuple[SingleArray, SingleArray], huber: float = 0.0) -> Normals:
         """At a state."""
@@ -187,6 +195,10 @@ def solved(block: Block, settings: Settings, state: State) -> Solved:
     state, equations, count, converged = _iterated(part, settings, state, taken, huber)
     weights = block.weights()
     solution, quality = _examined(block, state, equations, weights)
+    if settings.own_noise:
+        shares = noise_shares(quality.residuals, block.rows.flight)
+        if (shares < 1.0).any():
+            block = block.with_noise(shares)
     for _ in range(settings.rounds):
         chosen = _kept(quality.residuals, weights, settings)
         changed = sum(int((new != old).sum()) for new, old in zip(chosen, weights, strict=True))
@@ -198,6 +210,24 @@ def solved(block: Block, settings: Settings, state: State) -> Solved:
         solution, quality = _examined(block, state, equations, weights)
         count += more
     return Solved(solution, quality, count + 1, converged)
+
+
+def noise_shares(residuals: Sequence[Residuals], flight: Flight) -> FloatArray:
+    """Return by head what share (h,) of their sigmas its returns on planes scatter; 1: as much or more, or few tell.
+
+    The root of the variance component Σ p e² / Σ r (Förstner 1979), three of its own sigmas up.
+    """
+    shares = np.ones(len(flight.heads))
+    for one in (one for one in residuals if one.group == "planes"):
+        kept = one.weight > 0.0
+        head = np.array([swath.head for swath in flight.swaths])[one.swath[kept]]
+        squares = one.weight[kept] * (one.misclosure_m[kept].astype(np.float64) / one.sigma_m[kept]) ** 2
+        square = np.bincount(head, squares, minlength=len(shares))
+        free = np.bincount(head, one.redundancy[kept], minlength=len(shares))
+        enough = free > NOISE_TELLS
+        free = np.where(enough, free, 1.0)
+        shares = np.where(enough, np.sqrt(square / free * (1.0 + 3.0 * np.sqrt(2.0 / free))), 1.0)
+    return np.minimum(shares, 1.0)
 
 
 def _examined(

@@ -344,9 +344,29 @@ def _prior(knots: Knots, covariance: FloatArray, source: str) -> TrajectoryPrior
     notes = [f"{source}; {len(knots)} knots, {knots.apart_s:.3g} s apart"]
     if knots.widened:
         notes.append(f"knots were set {knots.apart_s:.3g} s apart so that they are no more than {MOST_KNOTS}")
-    symmetric = 0.5 * (square + square.T)
-    symmetric[np.diag_indices(size)] *= 1.0 + ROUNDING
-    return TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, symmetric, tuple(notes))
+    return TrajectoryPrior(knots.flown, knots.time_ns, knots.strip, positive(square), tuple(notes))
+
+
+def positive(covariance: FloatArray) -> FloatArray:
+    """Return a covariance (n, n) that has an inverse: what rounding made negative of it is as good as zero.
+
+    Where a heading was known to degrees and is to thousandths once all is seen, its smoothed covariances are small
+    differences of large numbers. Directions in which the correlation is negative by that are raised to `ROUNDING`.
+    """
+    symmetric = 0.5 * (covariance + covariance.T)
+    at, variances = np.diag_indices(len(symmetric)), np.diag(symmetric)
+    raised = symmetric.copy()
+    raised[at] = variances * (1.0 + ROUNDING)
+    try:
+        inverted(raised)
+    except np.linalg.LinAlgError:
+        if not (variances > 0.0).all():
+            return raised
+        scale = np.sqrt(variances)
+        values, vectors = np.linalg.eigh(symmetric / np.outer(scale, scale))
+        vectors *= scale[:, np.newaxis]
+        raised = (vectors * np.maximum(values, ROUNDING * values[-1])) @ vectors.T
+    return raised
 
 
 def draw(prior: TrajectoryPrior, rng: np.random.Generator) -> FloatArray:

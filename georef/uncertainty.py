@@ -70,6 +70,10 @@ class Noise:
     time_s: float = 1e-6
     divergence_rad: float = 3e-4
 
+    def times(self, share: float) -> Noise:
+        """Return all of it so many times as large."""
+        return Noise(self.range_m * share, self.angle_rad * share, self.time_s * share, self.divergence_rad * share)
+
 
 class Uncertainty:
     """Covariances of the points of one scanner, by `georef.sensor_model.SensorModel.rays`."""

@@ -30,6 +30,7 @@ from calib.picked_points import PickedError
 from calib.picked_points import carried as carried_points
 from calib.plane_given import given_planes
 from calib.plane_matching import rematch
+from calib.plane_returns import limited
 from calib.plane_search import find_planes
 from calib.plane_settings import PlaneError, PlaneSettings
 from calib.prealign import PrealignError, PrealignSettings, prealigned
@@ -60,9 +61,13 @@ Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best
 COARSE_SIGMAS = 3.0
 OUTCOME = "calibration.json"  # of a report
-# All returns of a patch share what the attitude does between two knots, some millimetres: the mean of 25 is as good as
-# that, and the mean of thousands would be taken for better than it is.
+# Enough to bring strips together, and for a trajectory of which only sigmas are known: what errors do from one patch to
+# the next is assumed there, and thousands of returns would be taken for better than that is.
 PLANES = PlaneSettings(most_points=25)
+# Where the smoother's own covariance says what errors do: without control the range offset is told by noise averaged
+# over all the ground there is. Beyond 400 returns a patch it is the attitude between two knots that counts.
+EVERY = PlaneSettings(most_points=400, most_planes=4000, ground_planes=100)
+ROWS_MOST = 4_000_000  # in all: some seconds a pass, and 300 MB
 REFUSED = (
     ControlError,
     FlightError,
@@ -174,11 +179,11 @@ def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps
     rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
     picked = Features() if wish.ties is None else ties_of(wish.ties, kept)
 
-    def search() -> Features:
+    def search(settings: PlaneSettings = PLANES) -> Features:
         if rings is not None:
-            return given_planes(flight, rings, PLANES)
+            return given_planes(flight, rings, settings)
         with ThreadPoolExecutor(workers) as pool:
-            return find_planes(flight, PLANES, pool.map)
+            return find_planes(flight, settings, pool.map)
 
     def match() -> Features:
         with ThreadPoolExecutor(workers) as pool:
@@ -202,8 +207,20 @@ def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps
         features = observed()
         return features
 
+    def everything(calibrations: Mapping[str, Calibration]) -> Features | None:
+        nonlocal flight, planes, features
+        if not len(prior.walk_rad2) or "ties" in wish.observe:
+            return None
+        tell("all planes", 0, 1)
+        flight = replaced(kept.flight, calibrations, folder, "entire", workers)
+        planes = limited(search(EVERY), ROWS_MOST)
+        features = observed()
+        return features
+
     tell("adjustment", 0, 1)
-    adjusted = adjust(flight, features, wish.model, prior, rematch=found_anew, first=first, doubted=doubted)
+    adjusted = adjust(
+        flight, features, wish.model, prior, rematch=found_anew, first=first, doubted=doubted, entire=everything
+    )
     _refuse_far(wish, kept.flight, adjusted)
     refuse_lost_control(wish.control, features)
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)

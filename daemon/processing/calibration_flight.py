@@ -39,7 +39,7 @@ from georef.uncertainty import Noise
 if TYPE_CHECKING:
     from georef.navigation.cross_covariance import ErrorChain
 
-KNOT_S = 0.4  # between knots of the trajectory's errors
+KNOT_S = 0.2  # between knots of the trajectory's errors
 TRAJECTORY_MARGIN_NS = 2_000_000_000
 PLACED_ROWS = 1 << 18
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much

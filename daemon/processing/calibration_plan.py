@@ -20,6 +20,7 @@ from calib.plan import Line, Predicted, Scan, Surface, planned, predict
 from calib.trajectory_errors import gauss_markov
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.calibrate_model import of_parameters, tables_in_words
+from daemon.processing.calibrate_run import EVERY, PLANES
 from daemon.processing.planned_navigation import navigated
 from georef.beams import LineGeometry
 from georef.calibration import PARAMETERS, read_calibration
@@ -174,7 +175,9 @@ def plan_calibration(plan: Plan, wish: PlanWish) -> PlannedCalibration:
     surfaces = [*_roofs(survey, frame), *_ground(survey, frame)]
     control = _control(survey, frame, wish.control_sigma_m) if wish.control else []
     try:
-        flight, features = planned(frame, heads, scans, [_trajectory(survey, sigmas)], lines, [*surfaces, *control])
+        most = (PLANES if navigation is None else EVERY).most_points
+        flown = [_trajectory(survey, sigmas)]
+        flight, features = planned(frame, heads, scans, flown, lines, [*surfaces, *control], most)
         prior = gauss_markov(flight) if navigation is None else navigation.prior(flight)
         predicted = predict(flight, features, of_parameters(wish.model), prior)
     except (FlightError, ParameterError, NormalError) as error:

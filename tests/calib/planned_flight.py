@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib.features import Features
 from calib.flight import Flight, Head, Tangent
-from calib.plan import Line, Scan, Surface, planned
+from calib.plan import MOST_MADE, Line, Scan, Surface, planned
 from georef.beams import LineGeometry
 from georef.calibration import Calibration, nominal
 from georef.earth import e_from_geodetic, geodetic_from_e
@@ -83,7 +83,7 @@ def flown(
     """A flight of such lines."""
     trajectory, planned_lines = path(lines, sigma_m, sigma_deg)
     scan = Scan(float(np.radians(30.0)), 100_000.0, 40.0, "sine")
-    return planned(FRAME, [scanner()], [scan], [trajectory], planned_lines, surfaces(roofs=roofs))
+    return planned(FRAME, [scanner()], [scan], [trajectory], planned_lines, surfaces(roofs=roofs), MOST_MADE)
 
 
 def noised(flight: Flight, seed: int) -> Flight:

@@ -25,7 +25,7 @@ from calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
 from georef.calibration import INDEX, PARAMETERS, Calibration, nominal
 from georef.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
-from tests.calib.roofs import LINES, Line, Made, made, roofs
+from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
 from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -362,6 +362,51 @@ def test_correspondences_are_found_anew_until_they_are_stable() -> None:
     more = adjust(built.flight, coarse, Wish(), prior, rematch=rematch)
     np.testing.assert_allclose(more.values, found.values, atol=0.02 * found.sigmas.min())
     assert more.matchings == 3
+
+
+def test_everything_that_was_observed_is_adjusted_once_correspondences_stay() -> None:
+    built = made()
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    part = Features(tuple(built.features.planes[::2]))
+    asked: list[dict[str, Calibration]] = []
+
+    def everything(calibrations: dict[str, Calibration]) -> Features:
+        asked.append(calibrations)
+        return built.features
+
+    found = adjust(built.flight, part, Wish(), prior, rematch=lambda _: part, entire=everything)
+    whole = adjust(built.flight, built.features, Wish(), prior)
+    less = adjust(built.flight, part, Wish(), prior)
+    assert len(asked) == 1
+    np.testing.assert_allclose(asked[0]["left"].parameters, less.calibrations["left"].parameters, atol=1e-6)
+    np.testing.assert_allclose(found.values, whole.values, atol=0.05 * whole.sigmas.min())
+    np.testing.assert_allclose(found.sigmas, whole.sigmas, rtol=1e-3)
+    assert (found.sigmas < less.sigmas).all()
+    same = adjust(built.flight, part, Wish(), prior, entire=lambda _: None)
+    np.testing.assert_array_equal(same.values, less.values)
+
+
+def test_returns_that_scatter_less_than_is_said_are_weighed_by_what_they_scatter() -> None:
+    built = made(noise=0.5, points=30)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior, entire=lambda _: built.features)
+    quieter = replace(built.flight.heads[0], noise=NOISE.times(0.5))
+    known = adjust(replace(built.flight, heads=(quieter,)), built.features, Wish(), prior)
+    said = adjust(built.flight, built.features, Wish(), prior)
+    np.testing.assert_allclose(found.sigmas, known.sigmas, rtol=0.05)
+    assert (found.sigmas < 0.95 * said.sigmas).any()
+    assert found.variance_factor == pytest.approx(1.0, abs=0.1)
+    assert any("scatter 0.5" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("noise", [1.0, 1.5])
+def test_returns_that_scatter_as_is_said_or_more_keep_their_sigmas(noise: float) -> None:
+    built = made(noise=noise, points=30)
+    prior = gauss_markov(built.flight, Taus(), 4.0)
+    found = adjust(built.flight, built.features, Wish(), prior, entire=lambda _: built.features)
+    said = adjust(built.flight, built.features, Wish(), prior)
+    np.testing.assert_allclose(found.sigmas, said.sigmas, rtol=1e-3)
+    assert not any("scatter" in note for note in found.notes)
 
 
 def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:

@@ -13,7 +13,7 @@ from calib.features import ControlPoint
 from calib.flight import FlightError
 from calib.normals import TrajectoryWeight, normals
 from calib.parameters import Wish, unknowns
-from calib.plan import MOST_POINTS, Scan, planned, predict
+from calib.plan import MOST_MADE, Scan, planned, predict
 from calib.rows import Rows
 from calib.tie_rows import Ties
 from calib.trajectory_errors import apply, draw, gauss_markov
@@ -47,7 +47,7 @@ def test_returns_lie_on_the_planes(looks: str) -> None:
     if looks == "back":
         head = replace(head, start=replace(head.start, installation_matrix=np.diag([-1.0, -1.0, 1.0])))
     pieces = surfaces()
-    flight, features = planned(FRAME, [head], [Scan(20.0 * DEG, 1e5)], [trajectory], lines, pieces)
+    flight, features = planned(FRAME, [head], [Scan(20.0 * DEG, 1e5)], [trajectory], lines, pieces, MOST_MADE)
     normals_t = {piece.name: piece.normal_t for piece in pieces}
     seen = 0
     for swath in flight.swaths:
@@ -59,7 +59,7 @@ def test_returns_lie_on_the_planes(looks: str) -> None:
     for plane in features.planes:
         assert len(plane.patches) > 1
         for patch in plane.patches:
-            assert 4 <= len(patch.at) <= MOST_POINTS
+            assert 4 <= len(patch.at) <= MOST_MADE
             away = flight.swaths[patch.swath].points_t[patch.at] - plane.centre_t
             assert np.abs(away @ normals_t[plane.name]).max() < 1e-9
             seen += len(patch.at)
@@ -119,17 +119,17 @@ def test_a_lone_line_has_no_planes_but_with_control() -> None:
     trajectory, lines = path(ONE_HEIGHT[:1])
     scan = Scan(30.0 * DEG, 1e5)
     with pytest.raises(FlightError, match="no roof and no ground is seen from two lines; want lines that overlap"):
-        planned(FRAME, [scanner()], [scan], [trajectory], lines, surfaces())
+        planned(FRAME, [scanner()], [scan], [trajectory], lines, surfaces(), MOST_MADE)
     piece = surfaces()[24]
     controlled = replace(piece, control=(ControlPoint("1", piece.points_t[24], 0.01),))
-    _, features = planned(FRAME, [scanner()], [scan], [trajectory], lines, [controlled])
+    _, features = planned(FRAME, [scanner()], [scan], [trajectory], lines, [controlled], MOST_MADE)
     assert [len(plane.patches) for plane in features.planes] == [1]
-    assert len(planned(FRAME, [scanner()], [scan], [trajectory], lines * 2, surfaces())[1].planes) > 9
+    assert len(planned(FRAME, [scanner()], [scan], [trajectory], lines * 2, surfaces(), MOST_MADE)[1].planes) > 9
     with pytest.raises(FlightError, match="no roof"):  # too few pulses for a patch to be found
-        planned(FRAME, [scanner()], [Scan(30.0 * DEG, 2000.0)], [trajectory], lines * 2, surfaces())
+        planned(FRAME, [scanner()], [Scan(30.0 * DEG, 2000.0)], [trajectory], lines * 2, surfaces(), MOST_MADE)
     near = replace(scanner(), range_gate=(20.0, 300.0))
     with pytest.raises(FlightError, match="no roof"):  # out of range
-        planned(FRAME, [near], [scan], [trajectory], lines * 2, surfaces())
+        planned(FRAME, [near], [scan], [trajectory], lines * 2, surfaces(), MOST_MADE)
 
 
 def test_the_encoder_moves_as_the_scan_does() -> None:

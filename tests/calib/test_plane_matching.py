@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from calib.flight import Flight
 from calib.plane_matching import LOST, rematch
+from calib.plane_returns import limited
 from calib.plane_search import find_planes
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
@@ -165,3 +166,21 @@ def test_a_patch_without_a_plane_is_dropped(flight: Flight) -> None:
     matched = rematch(flight, Features(planes=(nonsense,)))
     assert matched.planes == ()
     assert matched.refused == {LOST: 1}
+
+
+@pytest.mark.parametrize("rows", [16, 60, 190, 240, 1000])
+def test_so_many_returns_in_all_are_taken_from_the_largest_patches(rows: int) -> None:
+    """As many of each as make the limit: no other number that is the same for all patches comes closer."""
+    sizes = [[5, 100], [40], [7, 90]]
+    planes = [
+        Plane(str(at), np.zeros(3), np.array([0.0, 0.0, 1.0]), tuple(Patch(i, np.arange(n)) for i, n in enumerate(own)))
+        for at, own in enumerate(sizes)
+    ]
+    whole = Features(tuple(planes))
+    found = limited(whole, rows)
+    counts = np.array([len(patch.at) for plane in found.planes for patch in plane.patches])
+    every = np.concatenate(sizes)
+    most = counts.max()
+    np.testing.assert_array_equal(counts, np.minimum(every, most))
+    assert counts.sum() <= rows
+    assert np.minimum(every, most + 1).sum() > rows or most == every.max()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from calib.flight import Flight, FlightError, Head, Swath, Tangent
-from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, from_smoother, gauss_markov, knots_of
+from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, from_smoother, gauss_markov, knots_of, positive
 from georef.beams import LineGeometry
 from georef.calibration import nominal
 from georef.earth import geodetic_from_e, rot_e_from_l
@@ -222,6 +222,26 @@ def made(strips: Sequence[tuple[int, int, float, float]], paths: list[Trajectory
         for flown, strip, first, last in strips
     )
     return Flight(Tangent.at(paths[0].position_e[0]), (head,), tuple(paths), swaths)
+
+
+def test_a_covariance_that_rounding_made_negative_has_an_inverse() -> None:
+    """As of a heading that was known to degrees before it was to thousandths: correlations of 1 come out as 1.04."""
+    built = made([(0, 1, 5.0, 15.0)], [level_path(50, begin=int(ns(0.0)))], begin=int(ns(0.0)))
+    sound = gauss_markov(built, Taus(heading_s=1e5), 1.0)
+    joint = sound.covariance.reshape(len(sound), 6, len(sound), 6).copy()
+    noise = 1.0 + 0.04 * np.random.default_rng(1).standard_normal((len(sound), len(sound)))
+    at = np.arange(len(sound))
+    noise[at, at] = 1.0
+    joint[:, 5, :, 5] *= 0.5 * (noise + noise.T)
+    broken = joint.reshape(sound.covariance.shape)
+    assert np.linalg.eigvalsh(broken).min() < 0.0
+    prior = replace(sound, covariance=positive(broken))
+    assert np.isfinite(prior.information).all()
+    np.testing.assert_allclose(prior.sigmas(), sound.sigmas(), rtol=0.05)
+    lines = np.ones(len(sound)) / len(sound)
+    mean = np.einsum("i,iajb,j->ab", lines, prior.covariance.reshape(joint.shape), lines)
+    wanted = np.einsum("i,iajb,j->ab", lines, sound.covariance.reshape(joint.shape), lines)
+    np.testing.assert_allclose(np.diag(mean), np.diag(wanted), rtol=0.05)
 
 
 def test_sigmas_become_processes_of_gauss_and_markov() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections import Counter
 from pathlib import Path
@@ -15,8 +16,12 @@ from numba.core.dispatcher import Dispatcher
 from scipy.spatial import cKDTree
 
 from calib.features import Features, Plane
+from calib.flight import Flight
+from calib.plane_search import find_planes
+from calib.plane_settings import PlaneSettings
 from daemon.cli.main import run_app
 from daemon.errors import ExitCode, UserError
+from daemon.processing import calibrate_run
 from daemon.processing.calibrate_model import model_of
 from daemon.processing.calibrate_run import refuse_no_planes
 from daemon.processing.calibration_plan import PlanWish, plan_calibration
@@ -267,6 +272,26 @@ def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys:
     output = tmp_path / "left.toml"
     line = refused(capsys, output, arguments(made, output, "--control", str(control)))
     assert "orthometric" in line
+
+
+def test_a_navigated_flight_is_calibrated_on_all_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once planes stay, and navigation says what the trajectory errs by."""
+    made = village(tmp_path, prf_hz=4_000.0, lines=(0, 1, 2, 3))
+    searches: list[tuple[PlaneSettings, Features]] = []
+
+    def searched(flight: Flight, settings: PlaneSettings, each: Any) -> Features:
+        searches.append((settings, find_planes(flight, settings, each)))
+        return searches[-1][1]
+
+    monkeypatch.setattr(calibrate_run, "find_planes", searched)
+    given = arguments(made, tmp_path / "left.toml")
+    at = given.index("--trajectory")
+    run_app([*given[:at], *given[at + 2 :]])
+    assert [settings is calibrate_run.EVERY for settings, _ in searches] == [False] * (len(searches) - 1) + [True]
+    part, every = (sum(plane.points for plane in features.planes) for _, features in searches[-2:])
+    assert every > 1.5 * part
+    (told,) = re.findall(r"^redundancy = (.+)$", (tmp_path / "left.toml").read_text(), re.MULTILINE)
+    assert float(told) == pytest.approx(every, rel=0.2)
 
 
 # what intensity does to the range: linear between these, beyond them as at them, which knots there can say exactly
