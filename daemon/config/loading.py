@@ -221,8 +221,13 @@ def _walk(location: Sequence[int | str], tables: type[BaseModel]) -> tuple[type[
 
 def _suggestion(location: Sequence[int | str], tables: type[BaseModel]) -> str:
     model, _ = _walk(location[:-1], tables)
-    known = list(model.model_fields) if model is not None else []
-    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
+    known = dict(model.model_fields) if model is not None else {}
+    key = str(location[-1])
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]}?"
+    for name, field in known.items():
+        below = _model_in(field.annotation)
+        if below is not None and key in below.model_fields and not _is_named(field.annotation):
+            return f"did you mean {name}.{key}?"
     return f"there are: {', '.join(known)}"

@@ -45,6 +45,11 @@ class TrajectoryWish:
     navigate: bool = False
     force: bool = False
 
+    def __post_init__(self) -> None:
+        """UserError where a file is forced that nobody named."""
+        if self.force and self.file is None:
+            raise UserError("--force-trajectory: there is no file to be taken; want --trajectory too", ExitCode.USAGE)
+
 
 @dataclass(frozen=True, slots=True)
 class Chosen:

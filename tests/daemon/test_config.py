@@ -135,6 +135,11 @@ class TestBadFiles:
         assert caught.value.exit_code is ExitCode.USAGE
         assert all("\n" not in line for line in caught.value.lines)
 
+    def test_a_key_of_a_table_below_is_pointed_to(self, tmp_path: Path) -> None:
+        text = with_session('[imu.main]\ntransport = "can:can0"\nprotocol = "dbc"\ndbc = "a.dbc"\ngrade = "mems"\n')
+        with pytest.raises(ConfigError, match=r"imu\.main\.grade: unknown key; did you mean noise\.grade\?"):
+            parse_config(text, tmp_path / "a.toml")
+
     def test_no_such_file(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"nowhere\.toml: No such file or directory") as caught:
             load_config(tmp_path / "nowhere.toml")

@@ -271,6 +271,17 @@ class TestRefusals:
         assert "--overwrite" in capsys.readouterr().err
         assert {path.name: path.stat().st_mtime_ns for path in products.iterdir()} == before
 
+    @pytest.mark.parametrize("command", ["georef", "calibrate", "validate", "strips"])
+    def test_no_trajectory_cannot_be_forced(
+        self, command: str, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        arguments = [command, str(flown.log), "-o", str(tmp_path / "out"), "--force-trajectory"]
+        if command == "validate":
+            arguments.insert(1, str(flown.folder / "left.true.toml"))
+        assert run_app(arguments) == 2
+        assert "--force-trajectory: there is no file to be taken; want --trajectory too" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
     def test_a_trajectory_in_the_folder_is_not_replaced_unasked_and_never_where_it_is_read(
         self, flown: Flown, products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
