@@ -198,7 +198,8 @@ def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple
     """Return the held parameters with their sigmas; where the flight contradicts one, with what the flight says.
 
     The score of the held ones has the covariance f I + I S I, with I their information and S what is plausible of them.
-    The one that is farthest beyond is taken to be wrong by what the flight says, until none is.
+    The one that is farthest beyond is taken to be wrong by what the flight says, until none is. Who holds one and gives
+    no sigma says that it is right, whatever is plausible: of that one its own part of S does not count.
 
     Args:
         asked: whose `considered` they are.
@@ -211,10 +212,14 @@ def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple
     seen = own * likely**2 > 1e-2  # else the flight knows it to ten times what is plausible, and rounding as much
     told = np.where(seen, effects.score / np.where(seen, own, 1.0), np.nan)
     wrong = np.zeros(len(sigmas), np.bool_)
+    words = {(one.scanner, one.name) for one in asked.held if not one.remedy}
+    at_word = np.array([tuple(item.name.split(".", 1)) in words for item in asked.considered], np.bool_)
+    at_word &= sigmas == likely
     while True:
         spread = np.diag(factor * information + (information * sigmas**2) @ information)
-        spread = np.sqrt(np.maximum(spread, 0.0)) / np.where(seen, own, 1.0)
-        beyond = np.where(seen & ~wrong, np.abs(told) / np.where(seen, spread, 1.0), 0.0)
+        spread = spread / np.where(seen, own, 1.0) ** 2 - np.where(seen & at_word, sigmas, 0.0) ** 2
+        spread = np.sqrt(np.maximum(spread, 0.0))
+        beyond = np.where(seen & ~wrong, np.abs(told) / np.where(seen & (spread > 0.0), spread, 1.0), 0.0)
         worst = int(np.argmax(beyond)) if len(beyond) else -1
         if worst < 0 or beyond[worst] <= CONTRADICTED:
             break

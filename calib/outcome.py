@@ -43,7 +43,7 @@ class Considered:
         value: at which it is held, SI.
         sigma: one sigma of its error, SI: what is plausible, or what the flight says where that is more.
         told: by how much the flight would change it if it were free, SI; nan: the flight says nothing.
-        told_sigma: of that, with what is plausible of all that is held.
+        told_sigma: of that, with what is plausible of all that is held; of what is held without a sigma: of all else.
         contradicted: whether that is more than its sigmas allow.
     """
 

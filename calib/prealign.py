@@ -39,6 +39,9 @@ _BACK = 0.5  # share of a step that the next one takes back where steps go to an
 _HELD = 1e-9  # rad, or m, by which what is held may move
 _STEP_MOST_RAD = np.radians(2.0)
 _NO_POINTS = "a swath has no points; want a trajectory and a calibration that place them"
+# By what share of the finest smoothing surfaces come to lie beside each other, one sigma: what one strip sees behind a
+# house and the other does not leans all one way. 0.01 to 0.25 on six flights from 20 m to 600 m above houses.
+_LEANS = 0.15
 _REWEIGHTINGS, _HUBER, _SIGMA_LEAST_M = 3, 2.0, 0.02
 
 
@@ -102,8 +105,8 @@ class Prealigned:
 
     Attributes:
         calibrations: by scanner.
-        sigmas: (4,) of `NAMES` by scanner, SI, as far as heights of the strips tell; of what they do not tell, those of
-            the settings. Formal ones: what heights alone cannot show is not in them.
+        sigmas: (4,) of `NAMES` by scanner, SI, as far as heights of the strips tell, with what houses that hide the
+            ground behind them do; of what heights do not tell, those of the settings.
     """
 
     calibrations: dict[str, Calibration]
@@ -144,6 +147,8 @@ def prealigned(
     if improved is None:
         raise PrealignError("prealignment: the swaths do not overlap; want strips over the same ground")
     _refuse(found, began, step, settings)
+    arms_m = np.array([scale.height_m, scale.height_m, 0.5 * scale.width_m])
+    sigma[:, :3] = np.hypot(sigma[:, :3], _LEANS * levels[-1] / arms_m)
     return Prealigned(found, {head.name: one for head, one in zip(flight.heads, sigma, strict=True)})
 
 

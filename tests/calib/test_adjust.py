@@ -498,6 +498,22 @@ def test_a_flight_that_contradicts_what_is_held_says_so() -> None:
     assert not any(one.contradicted for one in plain.considered)
 
 
+@pytest.mark.parametrize("name", ["kappa_rad", "scan_angle_scale"])
+def test_what_is_held_at_the_user_s_word_is_said_to_be_wrong_where_the_flight_knows_better(name: str) -> None:
+    """However plausible its error is; its sigma stays what is plausible."""
+    built = made(truth=SCALED)
+    prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
+    wish, away = Wish(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
+    right = adjust(built.flight, built.features, wish, prior, PLAIN, start)
+    assert not any(one.contradicted for one in right.considered)
+    off = {"left": start["left"].changed(**{name: built.truth.value(name) + away})}
+    found = adjust(built.flight, built.features, wish, prior, PLAIN, off)
+    (one,) = (one for one in found.considered if one.contradicted)
+    assert one.name == name
+    assert abs(one.told + away) < 4.0 * one.told_sigma < away
+    assert one.sigma == pytest.approx(PARAMETERS[INDEX[name]].plausible)
+
+
 def test_where_nothing_is_determined_all_is_held() -> None:
     built = made(lines=LINES[:1], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)

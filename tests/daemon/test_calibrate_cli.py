@@ -167,11 +167,25 @@ def test_a_warm_up_leaves_no_loop_to_be_compiled(products: Path) -> None:
     assert (products / "new_loops").read_text() == ""
 
 
-def test_the_plan_says_beforehand_what_the_flight_gives(made: Made, tmp_path: Path) -> None:
-    """Sigmas, the log's own IMU and GNSS navigated, within a quarter of those that were predicted."""
+def test_a_navigated_flight_is_calibrated_on_all_the_ground_as_the_plan_says_beforehand(
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once planes stay, as navigation says what the trajectory errs by; sigmas within a quarter of those predicted."""
     output, control = tmp_path / "left.toml", str(made.flown.folder / "control.csv")
+    searches: list[tuple[PlaneSettings, Features]] = []
+
+    def searched(flight: Flight, settings: PlaneSettings, each: Any) -> Features:
+        searches.append((settings, find_planes(flight, settings, each)))
+        return searches[-1][1]
+
+    monkeypatch.setattr(calibrate_run, "find_planes", searched)
     given = ("--model", "basic", *KNOWN, "--control", control, "--trajectory-datum", "same", "--workers", "1")
     assert run_app(["calibrate", str(made.flown.log), "-o", str(output), *given]) == 0
+    assert [settings is calibrate_run.EVERY for settings, _ in searches] == [False] * (len(searches) - 1) + [True]
+    part, every = (sum(plane.points for plane in features.planes) for _, features in searches[-2:])
+    assert every > 1.5 * part
+    (told,) = re.findall(r"^redundancy = (.+)$", output.read_text(), re.MULTILINE)
+    assert float(told) == pytest.approx(every, rel=0.2)
     found = read_calibration(output.read_text(), "left.toml")
     planned = plan_calibration(parse_plan(made.plan, tmp_path), PlanWish(model_of("basic", KNOWN[1], "", KNOWN[3::2])))
     names = planned.predicted.names
@@ -272,26 +286,6 @@ def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys:
     output = tmp_path / "left.toml"
     line = refused(capsys, output, arguments(made, output, "--control", str(control)))
     assert "orthometric" in line
-
-
-def test_a_navigated_flight_is_calibrated_on_all_the_ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once planes stay, and navigation says what the trajectory errs by."""
-    made = village(tmp_path, prf_hz=4_000.0, lines=(0, 1, 2, 3))
-    searches: list[tuple[PlaneSettings, Features]] = []
-
-    def searched(flight: Flight, settings: PlaneSettings, each: Any) -> Features:
-        searches.append((settings, find_planes(flight, settings, each)))
-        return searches[-1][1]
-
-    monkeypatch.setattr(calibrate_run, "find_planes", searched)
-    given = arguments(made, tmp_path / "left.toml")
-    at = given.index("--trajectory")
-    run_app([*given[:at], *given[at + 2 :]])
-    assert [settings is calibrate_run.EVERY for settings, _ in searches] == [False] * (len(searches) - 1) + [True]
-    part, every = (sum(plane.points for plane in features.planes) for _, features in searches[-2:])
-    assert every > 1.5 * part
-    (told,) = re.findall(r"^redundancy = (.+)$", (tmp_path / "left.toml").read_text(), re.MULTILINE)
-    assert float(told) == pytest.approx(every, rel=0.2)
 
 
 # what intensity does to the range: linear between these, beyond them as at them, which knots there can say exactly
