@@ -74,7 +74,7 @@ def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
     )
     report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
     verdict = judge(report)
-    source = _trajectory_of(wish, done)
+    source = done.kept.logged[0].source
     headers = {
         name: replace(_judged(header, done, name, verdict), trajectory=source) for name, header in headers.items()
     }
@@ -189,13 +189,6 @@ def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Heade
         variance_factor=done.adjusted.variance_factor,
         redundancy=done.adjusted.redundancy,
     )
-
-
-def _trajectory_of(wish: CalibrateWish, done: Calibrated) -> str:
-    """Return the word of a calibration file for the trajectory that it was made with."""
-    if wish.logs.trajectory.file is not None:
-        return "file"
-    return "navigated" if done.kept.logged[0].navigated is not None else "ins"
 
 
 def method_of(done: Calibrated) -> str:

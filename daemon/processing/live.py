@@ -81,7 +81,8 @@ class LiveSession:
     ) -> None:
         """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
         self.info = info
-        self.verdict = verdict_entry(list(calibration_verdicts(setup)), accepted=accept_verdict)
+        source = "navigated" if setup.ins_source is None else "ins"
+        self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
         self.now_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)

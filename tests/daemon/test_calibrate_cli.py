@@ -75,6 +75,8 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (logs / "begun_0.mcap").touch()  # as a power cut leaves it at a part's beginning
     given = arguments(made, folder / "left.toml", *report)
     given[given.index(str(made.flown.log))] = str(logs)
+    summary = Path(given[given.index("--trajectory") + 1]).with_suffix(".json")
+    summary.write_text('{"format": "swath.trajectory", "solution": "smoothed", "sessions": []}')
     assert run_app(given) == 0
     (folder / "new_loops").write_text("\n".join(sorted(loops() - warm)))
     return folder
@@ -83,6 +85,11 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_of_a_directory_is_no_log_is_passed_over_and_told(products: Path) -> None:
     record = json.loads((products / "report" / "calibration.json").read_text())
     assert record["notes"][0] == f"passed over: {products / 'logs' / 'begun_0.mcap'}: is no MCAP file"
+
+
+def test_the_file_says_where_the_trajectory_came_from(products: Path) -> None:
+    """By the summary beside it, as `swath trajectory` writes one."""
+    assert read_calibration((products / "left.toml").read_text(), "left.toml").header["trajectory"] == "navigated"
 
 
 def refused(capsys: pytest.CaptureFixture[str], output: Path, given: list[str]) -> str:

@@ -8,6 +8,7 @@ import random
 import re
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace as replaced
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -29,7 +30,7 @@ from daemon.parts import RECORDING_SIGN
 from daemon.processing import live as live_module
 from daemon.processing import live_follow
 from daemon.processing.feed import TICK_BYTES, TICK_NS
-from daemon.processing.live import Live, Told, replay
+from daemon.processing.live import Live, LiveSession, Told, replay
 from daemon.processing.live_points import POINT_DTYPE
 from daemon.processing.live_status import LiveStatus, sentence
 from daemon.processing.setup import Options, Setup
@@ -312,6 +313,20 @@ class TestStatus:
         status.navigation = "aligned with dual-antenna heading"
         assert status.plain(None, 0)["trajectory"]["source"] == "navigated"
 
+    @pytest.mark.parametrize(("made_with", "other"), [("navigated", True), ("ins", False), ("file", False)])
+    def test_a_calibration_made_with_another_kind_of_trajectory_is_told(
+        self, flown: Flown, tmp_path: Path, made_with: str, other: bool
+    ) -> None:
+        """The receiver's own INS is what points come from here."""
+        setup = flown.setup()
+        assert setup.ins_source is not None
+        for name, one in setup.calibrations.items():
+            setup.calibrations[name] = replaced(one, method="planes", header={"trajectory": made_with})
+        session = LiveSession(setup, flown.session().info, tmp_path, LiveConfig(), None)
+        told = [one["what"] for one in session.verdict["reasons"]]
+        assert len(told) == (len(setup.calibrations) if other else 0)
+        assert all("here is the device's own INS, whose alignment is another" in one for one in told)
+
     def test_the_folder_cannot_be_written_to(self, flown: Flown, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         with pytest.raises(UserError, match=r"Not a directory|File exists"):
@@ -327,7 +342,11 @@ class TestCommand:
         for path in flown.paths:
             (logs / path.name).symlink_to(path.absolute())
         (logs / "empty.mcap").touch()  # as a power cut leaves one
-        done = swath("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json", "--accept-verdict")
+        given = ("live", "--replay", str(logs), str(config), "-o", str(tmp_path), "--json")
+        refused = swath(*given)
+        assert refused.returncode == 1
+        assert "is nominal: points may lie" in refused.stderr
+        done = swath(*given, "--accept-verdict")
         assert done.returncode == 0, done.stderr
         assert f"passed over: {logs}/empty.mcap: " in done.stderr
         found = json.loads(done.stdout)
