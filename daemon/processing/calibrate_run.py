@@ -226,7 +226,7 @@ def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps
     flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
     tell("profiles", 0, 1)
     checked = check(flight, adjusted, prior, points)
-    told = (*kept.holes, *notes, *adjusted.notes)
+    told = (*kept.notes, *notes, *adjusted.notes)
     findings = prealigned_otherwise(away, adjusted)
     return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, told, findings)
 

@@ -75,9 +75,10 @@ class KeptFlight:
     results: list[JobResult]
 
     @property
-    def holes(self) -> list[str]:
-        """What is missing of what was asked for, a line each."""
-        return [line for flight in self.logged for line in flight.holes]
+    def notes(self) -> list[str]:
+        """What is missing of what was asked for, then what is doubtful of what is there, a line each."""
+        holes = [line for flight in self.logged for line in flight.holes]
+        return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.doubts)]
 
 
 def refuse_without_noise(kept: KeptFlight) -> None:

@@ -136,6 +136,12 @@ class Flight:
         return self.session.parts[0].path
 
     @property
+    def doubts(self) -> list[str]:
+        """What its user should know of its data, its time and its trajectory, a line each."""
+        lost = [f"{self.log}: the recorder lost {count:,} units of {source}" for source, count in self.lost.items()]
+        return [*lost, *self.troubles]
+
+    @property
     def clock(self) -> str | None:
         """The source that shows the host's time."""
         devices = self.clocks.clocks.host.plan.devices

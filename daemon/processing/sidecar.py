@@ -214,8 +214,7 @@ def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
         if (line := air_of(config, config.scanner[name]).warning(above_m, angle_rad, ground_m)) is not None
     ]
     lines += unit_doubts(flight)
-    lines += [f"{flight.log}: the recorder lost {count:,} units of {source}" for source, count in flight.lost.items()]
-    lines += flight.troubles
+    lines += flight.doubts
     lines += unread_lines(str(flight.log), count_unread(results))[1]
     sigma, unknown, intensity = (
         sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")

@@ -192,7 +192,7 @@ def _of_flight(wish: AdjustWish, kept: KeptFlight, folder: Path, tell: Steps) ->
     adjusted = adjust_strips(flight, features, calibrations, wish.settings)
     tell("strips before and after", 0, 1)
     before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
-    notes += [*kept.holes, *_notes(wish, kept, features, before.cells.frame.cell_m), *adjusted.notes]
+    notes += [*kept.notes, *_notes(wish, kept, features, before.cells.frame.cell_m), *adjusted.notes]
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 

@@ -127,7 +127,7 @@ def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> 
     carried = verdicts_of(kept.logged)
     with told_before(carried, FlightError):
         strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
-    strips.notes.extend(kept.holes)
+    strips.notes.extend(kept.notes)
     strips.carried.extend(carried)
     return strips
 

@@ -165,7 +165,7 @@ def _against_flight(wish: ValidateWish, found: _Found, kept: KeptFlight, folder:
     found.logs = [(path.name, sha256_of(path)) for path in paths]
     dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
     found.validation = replace(validation, dependent=dependent)
-    found.notes += [*kept.holes, *notes]
+    found.notes += [*kept.notes, *notes]
 
 
 def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:

@@ -198,6 +198,19 @@ def test_no_command_takes_a_trajectory_of_another_place(
     assert not (tmp_path / "out.toml").exists()
 
 
+@pytest.mark.parametrize("command", ["validate", "strips"])
+def test_a_trajectory_of_another_place_is_warned_of_where_it_is_forced(
+    judged: Judged, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In its own place all strips are moved alike, so that nothing else says it."""
+    capsys.readouterr()
+    assert run_app([*on_log(judged, command, tmp_path / "out", "away"), "--force-trajectory"]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if ELSEWHERE in line]
+    assert len(told) == 1
+    (record,) = (tmp_path / "out").glob("*.json")
+    assert told[0] in json.loads(record.read_text())["notes"]
+
+
 def on_log(judged: Judged, command: str, output: Path, trajectory: str) -> list[str]:
     """A command on the log with a trajectory's file."""
     log, out = str(judged.flown.log), ("-o", str(output))

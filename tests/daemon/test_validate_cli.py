@@ -116,6 +116,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         flight = replace(made.flight, heads=(replace(head, start=start),)).placed({"left": start})
         profile = SimpleNamespace(installation=PLACE)
         logged: Any = SimpleNamespace(
+            doubts=[],
             holes=[],
             log=path,
             navigated=None,
