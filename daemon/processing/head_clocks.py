@@ -114,7 +114,10 @@ class _Reader:
 def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | None:
     """Return what stamps count from; None where the head itself says whether it is locked, or nobody knows the time."""
     assert plan.stamps is not None
-    if plan.stamps is StampScale.AUTO and ((rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)).any():
+    says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
+    if plan.past_utc_hour and plan.stamps is StampScale.AUTO:
+        rows, says = rows[~says], says[~says]
+    if plan.stamps is StampScale.AUTO and (says.any() or not len(rows)):
         return None
     gps_ns, sigma_ns = host.gps_from_host(plan.clock, rows["host_time_ns"])
     sigma_ns = np.where(sigma_ns <= COARSE_MAX_SIGMA_NS, sigma_ns, np.inf)

@@ -227,8 +227,12 @@ class DeviceClock:
         """Keep the least delayed stamp of each second; every so often judge what they count from."""
         says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
         if self._wanted is StampScale.AUTO and says.any():  # it says itself
-            self._judges, self.stamps = False, None
-            return
+            if not self._past_utc_hour:
+                self._judges, self.stamps = False, None
+                return
+            device, host = device[~says], host[~says]
+            if not len(device):
+                return
         second, late = host // SECOND_NS, host - device
         order = np.lexsort((late, second))
         first = np.append(0, np.flatnonzero(np.diff(second[order])) + 1)

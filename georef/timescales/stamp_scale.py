@@ -9,7 +9,7 @@ head's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -77,8 +77,14 @@ def judge(
     device, near, sigma = device_ns[known], near_gps_ns[known], near_sigma_ns[known]
     if not len(device) or int(near.max() - near.min()) < LEAST_SPAN_S * SECOND_NS:
         return None
-    if not past_hour and int(device.min()) < ABSOLUTE_FROM_NS:
-        return Stamps(StampScale.FREE, "its stamps count from its own start")
+    begun = ""
+    if not past_hour:
+        own = device < ABSOLUTE_FROM_NS
+        if own.all() or int(np.ptp(near[~own])) < LEAST_SPAN_S * SECOND_NS:
+            return Stamps(StampScale.FREE, "its stamps count from its own start")
+        if own.any():
+            begun = f"but for {100.0 * own.mean():.0f} % of them, which count from its own start, "
+            device, near, sigma = device[~own], near[~own], sigma[~own]
     if past_hour:
         ahead = (device % HOUR_NS + leap_seconds * SECOND_NS - near + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
     else:
@@ -87,7 +93,8 @@ def judge(
     slack_ns = SIGMAS * float(np.median(sigma))
     if past_hour:
         return _of_hour(at, quickest, slack_ns, wanted)
-    return _absolute(at, quickest, slack_ns, leap_seconds, wanted)
+    found = _absolute(at, quickest, slack_ns, leap_seconds, wanted)
+    return replace(found, text=begun + found.text)
 
 
 def _quickest(near: Int64Array, ahead: Int64Array) -> tuple[Int64Array, Int64Array]:
@@ -131,8 +138,12 @@ def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_second
         other = "" if scale is wanted else "; the whole seconds are those of the arrival"
         return Stamps(wanted, f"configured so; {told}{other}", offset_ns, sigma_ns)
     within = (beside >= -GREATEST_LATENCY_NS - slack_ns) & (beside <= AHEAD_NS + slack_ns)
-    if scale is None or not within.all():
+    if int(np.ptp(beside)) > SECOND_NS // 2:
+        return Stamps(StampScale.FREE, f"{told}: they change their scale on the way")
+    if scale is None:
         return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, say so (clock)")
+    if not within.all():
+        return Stamps(StampScale.FREE, f"{told}: want at most 100 ms, and none after; if PTP set them, say so (clock)")
     if drift_ns > GREATEST_DRIFT_NS:
         return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that PTP has lost")
     return Stamps(scale, told, offset_ns, sigma_ns)

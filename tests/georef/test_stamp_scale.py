@@ -206,3 +206,41 @@ def test_stamps_that_jump_away_from_their_arrival_are_refused() -> None:
     assert sigma[:half].max() == 20_000.0
     assert sigma[half:].min() > 1e6
     assert clock.status().refused["stamp_jump"] == len(gps) - half
+
+
+def test_a_head_that_is_set_by_ptp_after_its_start_has_the_time_from_then_on() -> None:
+    gps = truth_ns()
+    stamps = absolute(gps, 19)
+    begun = len(gps) // 3
+    stamps[:begun] = gps[:begun] - gps[0] + 7 * NS
+    found = judged(stamps, gps)
+    assert found.scale is StampScale.TAI
+    assert np.array_equal((stamps + found.offset_ns)[begun:], gps[begun:])
+    assert "but for 33 % of them, which count from its own start" in found.text
+    stamps[:-10] = gps[:-10] - gps[0] + 7 * NS  # too few to know a scale by
+    assert judged(stamps, gps).scale is StampScale.FREE
+
+
+def test_stamps_that_change_their_scale_on_the_way_are_none() -> None:
+    gps = truth_ns()
+    stamps = np.where(np.arange(len(gps)) < len(gps) // 2, absolute(gps, 19), absolute(gps, -LEAP))
+    found = judged(stamps, gps)
+    assert found.scale is StampScale.FREE
+    assert "they change their scale on the way" in found.text
+    assert "neither" not in found.text
+
+
+@pytest.mark.parametrize("later", [0, 1])
+def test_what_a_head_says_late_of_its_lock_leaves_the_stamps_before_to_their_own_judgement(later: int) -> None:
+    """Position packets that begin in the middle: the hour's stamps before them hold, whatever is said afterwards."""
+    gps = truth_ns(60)
+    rows, half = rows_of(hour_stamps(gps), gps), len(gps) // 2
+    rows["locked"][half:] = later
+    clock = DeviceClock(host_clock(70), past_utc_hour=True, wanted=StampScale.AUTO, keep_history=True)
+    clock.add(rows)
+    error, sigma = errors(clock, rows, gps)
+    assert clock.stamps is not None
+    assert clock.stamps.scale is StampScale.HOUR
+    assert np.abs(error[:half]).max() < 1_000
+    assert sigma[:half].max() == 20_000.0
+    assert (sigma[half:].max() == 20_000.0) == later
