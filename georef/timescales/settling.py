@@ -21,6 +21,7 @@ from georef.timescales.labelling import LATE_AGE_S, MIN_VOTES, VOTES, LeapTrust,
 
 JOINED_WITHIN = 0.25  # of a second: trains further from whole seconds of each other were pulses of another phase
 TAG_REACH_NS = 2 * SECOND_NS  # a tag belongs to the vote that arrived nearest to it, so near
+SURE_SHARE = 0.75  # of messages that name one second: fewer may be the wrong ones, as where a leap count comes late
 
 
 @dataclass(slots=True)
@@ -160,8 +161,9 @@ def _tell(found: Settlement, named: dict[VoterKey, _Named], winner: int) -> None
         found.errors[source, utc] = TagErrors(one.host_ns, error_s)
         agree, total = int((error_s == 0).sum()), len(error_s)
         differ = ", ".join(f"{count} one {error:+d} s from it" for error, count in others.most_common(3))
+        doubt = "" if agree >= SURE_SHARE * total else "; so narrow a majority may be wrong by that, as a whole"
         found.lines.append(
-            f"{source}: {agree} of {total} messages name the second that is taken; {differ}: these are set right"
+            f"{source}: {agree} of {total} messages name the second that is taken; {differ}: these are set right{doubt}"
         )
 
 
