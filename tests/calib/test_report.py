@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from calib.features import Features
 from calib.need import Need
 from calib.outcome import Adjusted, Considered, ControlFit, GroupFit, Held
+from calib.profile_check import Check, Comparison
 from calib.report import PairDifference, Profile, ReportInput, html, judge, pdf
 from calib.report_canvas import NARROW, PAPER
 from calib.report_cut_plots import cuts_of
@@ -136,6 +137,32 @@ def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
     (reason,) = judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.03))).reasons
     assert reason.what == "the calibration leaves 4.0\u00a0cm in points, 3.0\u00a0cm is wanted"
     assert judge(replace(sound(report), need=replace(need, wanted={}, point_m=0.003))).level is Level.UNUSABLE
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "level"),
+    [
+        (2.9, Level.GOOD),
+        (-2.9, Level.GOOD),
+        (3.0, Level.CARE),
+        (-3.0, Level.CARE),
+        (-8.0, Level.CARE),
+        (8.25, Level.UNUSABLE),
+        (-8.25, Level.UNUSABLE),
+    ],
+)
+def test_profiles_that_say_otherwise_are_a_reason(report: ReportInput, sigmas: float, level: Level) -> None:
+    """Of eight pairs, by how many sigmas of the difference they are off together, to either side."""
+    sigma = 2.0**-16
+    one = Comparison("left", "omega_rad", 8, sigmas * sigma, sigma, 0.0, sigma, sigma)
+    fine = replace(one, parameter="phi_rad", told=0.25, adjusted=0.25)
+    verdict = judge(replace(sound(report), check=Check((), (fine, one))))
+    assert verdict.level is level
+    size = f"{math.degrees(abs(sigmas) * sigma):.4f}°"
+    told = f"{'−' if sigmas < 0.0 else '+'}{size} from the adjustment ({'−' if sigmas < 0.0 else '+'}{abs(sigmas):.1f}"
+    words = f"8 profiles put boresight ω (roll) {told} sigmas)"
+    assert [reason.what for reason in verdict.reasons] == ([words] if level else [])
+    assert level is Level.GOOD or verdict.sentence.startswith(f"{level.words}: {words}. Boresight to ")
 
 
 def test_findings_are_reasons(report: ReportInput) -> None:

@@ -1,0 +1,116 @@
+"""What strips, a validation and profiles say against a calibration is told in its verdict, in their own words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from calib.profile_check import Check, Comparison
+from daemon.processing.calibrate_model import model_of
+from daemon.processing.calibrate_products import strips_say, validation_says, write_products
+from daemon.processing.calibrate_run import Calibrated, CalibrateWish, calibrate
+from daemon.processing.flights import Wish
+from daemon.processing.flown import TrajectoryWish
+from daemon.processing.setup import Options
+from georef.calibration import INDEX, Calibration, read_calibration
+from tests.calib.village import KNOWN, Made, village
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
+
+CELL_M = 8.0
+ROLL_RAD = math.radians(0.02)
+
+
+def quiet(what: str, done: int, total: int) -> None:
+    """Tell nobody how far it is."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return village(tmp_path_factory.mktemp("village"), lines=(0, 1, 2))
+
+
+@pytest.fixture(scope="module")
+def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrateWish:
+    folder = made.flown.folder
+    true = folder / "left.true.toml"
+    options = Options(datum="same", calibrations={"left": (true.read_text(), str(true))}, uncertainty=False)
+    output = tmp_path_factory.mktemp("out") / "left.toml"
+    logs = Wish([made.flown.log], output, TrajectoryWish(folder / "true_trajectory.csv"), options)
+    return CalibrateWish(logs, output, model_of("basic", KNOWN[1], "", KNOWN[3::2]), overwrite=True)
+
+
+@pytest.fixture(scope="module")
+def done(wish: CalibrateWish, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
+    """The outcome before it is written; nothing is wrong with it."""
+    return calibrate(wish, tmp_path_factory.mktemp("returns"), quiet)
+
+
+def wrong(done: Calibrated, sigma_rad: float = 1e-5, **by: float) -> Calibrated:
+    """With a calibration that is wrong by so much, knows nothing of it and says such sigmas of its angles."""
+    calibrations: dict[str, Calibration] = {}
+    for name, found in done.adjusted.calibrations.items():
+        sigmas = found.sigmas.copy()
+        sigmas[[INDEX[angle] for angle in ("omega_rad", "phi_rad", "kappa_rad")]] = sigma_rad
+        changed = found.changed(**{key: found.value(key) + value for key, value in by.items()})
+        calibrations[name] = replace(changed, sigmas=sigmas)
+    adjusted = replace(done.adjusted, calibrations=calibrations)
+    return replace(done, adjusted=adjusted, flight=done.flight.placed(calibrations))
+
+
+def test_nothing_speaks_against_what_was_found(done: Calibrated) -> None:
+    assert strips_say(done, CELL_M) == []
+    assert validation_says(done) == []
+
+
+def test_strips_speak_against_a_roll_that_is_off(done: Calibrated) -> None:
+    (said,) = strips_say(wrong(done, omega_rad=ROLL_RAD), CELL_M)
+    assert said.what.startswith("strips still show roll: ")
+    assert "to omega_deg" in said.what
+    assert "swath strips" in said.change
+    assert said.excess > 1.0
+    assert not said.unusable
+
+
+def test_an_effect_that_the_calibration_does_not_claim_to_know_better_speaks_against_nothing(done: Calibrated) -> None:
+    """Three sigmas of both together."""
+    assert strips_say(wrong(done, ROLL_RAD / 2.0, omega_rad=ROLL_RAD), CELL_M) == []
+    assert strips_say(wrong(done, ROLL_RAD / 4.0, omega_rad=ROLL_RAD), CELL_M) != []
+
+
+def test_a_validation_speaks_against_a_roll_that_is_off(done: Calibrated) -> None:
+    """Both of its methods that compare strips: all that such a flight has."""
+    said = validation_says(wrong(done, omega_rad=ROLL_RAD))
+    assert [one.what.split(": ")[1] for one in said] == ["crossStripFlight (002)", "other (006)"]
+    for one in said:
+        assert one.what.startswith("validation: ")
+        assert "as an error of roll would leave" in one.what
+        assert "swath validate" in one.change
+        assert not one.unusable
+
+
+def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wish: CalibrateWish) -> None:
+    """Eight pairs of one sign, three sigmas off together: on the terminal, in the record and in the file."""
+    sigma = 2.0**-16
+    comparison = Comparison("left", "phi_rad", 8, -3.0 * sigma, sigma, 0.0, sigma, sigma)
+    bad = wrong(done, omega_rad=ROLL_RAD)
+    bad = replace(bad, check=Check((), (comparison,)))
+    words = [
+        "strips still show roll: ",
+        "validation: crossStripFlight (002): ",
+        "8 profiles put boresight φ (pitch) −0.0026° from the adjustment (−3.0 sigmas)",
+    ]
+    told = write_products(wish, bad, quiet)
+    assert told.record["verdict"]["level"] in ("care", "unusable")
+    reasons = [one["what"] for one in told.record["verdict"]["reasons"]]
+    in_file = read_calibration(wish.output.read_text(), "left.toml").header["verdict_reasons"]
+    assert isinstance(in_file, list)
+    for word in words:
+        assert any(reason.startswith(word) for reason in reasons), reasons
+        assert any(str(reason).startswith(word) for reason in in_file)
+        assert any(word in line for line in told.lines)
+    sound = write_products(wish, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), quiet)
+    for word in words:
+        assert not any(one["what"].startswith(word) for one in sound.record["verdict"]["reasons"])
