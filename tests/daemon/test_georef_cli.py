@@ -322,7 +322,14 @@ class TestRefusals:
         assert said.count("\n") == 1
         assert [path.name for path in tmp_path.iterdir()] == [there.name]
 
-    @pytest.mark.parametrize(("shift_s", "words"), [(18, "UTC"), (-7 * 86_400, "week"), (3 * 3600, "do not overlap")])
+    @pytest.mark.parametrize(
+        ("shift_s", "words"),
+        [
+            (18, "its time is UTC, not GPS: +18 s would be right"),
+            (-7 * 86_400, "its week is another: -1 would be right"),
+            (3 * 3600, "do not overlap; want the trajectory of this flight, or --week"),
+        ],
+    )
     def test_a_trajectory_of_another_time_is_named(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_s: int, words: str
     ) -> None:
