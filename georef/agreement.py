@@ -45,7 +45,7 @@ MEDIAN = 1.2533  # sigma of a median over that of a mean
 SHORTEST_STEPS = round(8 * SECOND_NS / STEP_NS)
 SECOND_STEPS = SECOND_NS // STEP_NS
 SLOW_STEPS = 20  # a second: attitude noise and vibration are averaged out
-MUCH_BETTER = 0.5  # residual of another convention over that of the attitude as it is
+MUCH_BETTER = 0.5  # what another convention, time or datum leaves of a difference, over that as it is
 SURE = 4.0  # sigmas
 LIKE = 0.7  # share of a motion below which it is surely another, SURE sigmas included
 FEWEST_TURNS = 10.0  # seconds with horizontal acceleration, for a heading
@@ -188,7 +188,8 @@ def _apart(of: Compared) -> Apart:
 def time_that_explains(apart: Apart) -> float | None:
     """Return the seconds by which the trajectory would be late if time alone were wrong; None where it is not that.
 
-    The antenna's way by the trajectory is moved in time, by whole steps and then along its velocity, until it fits.
+    The antenna's way by the trajectory is moved in time, by whole steps and then along its velocity, until it fits;
+    what no time makes much better, as a height, is nothing of time, however badly the fixes are known.
     """
     of = apart.of
     step = max(1, len(of.time_ns) // MOST_FITTED)
@@ -209,7 +210,9 @@ def time_that_explains(apart: Apart) -> float | None:
             # farther than to the next step a straight way would be a guess: any place ahead could be so reached
             within = abs(share) <= 1.0
             left = float(np.median(np.linalg.norm(rest - share * moved, axis=1))) if within else np.inf
-    return late_s if left < max(3.0 * float(apart.fix_sigma_l.max()), 0.05 * apart.metres) else None
+    most = max(3.0 * float(apart.fix_sigma_l.max()), 0.05 * apart.metres)
+    as_it_is = float(np.median(np.linalg.norm(way_l - fix_l, axis=1)))
+    return late_s if left < min(most, MUCH_BETTER * as_it_is) else None
 
 
 def _way_at(way_l: FloatArray, time_s: FloatArray, at_s: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.processing.navigation_observations import fix_observations, gps_times
-from georef.agreement import Apart, apart_from_fixes, compare_motion, heading_offset, time_that_explains
+from georef.agreement import MUCH_BETTER, Apart, apart_from_fixes, compare_motion, heading_offset, time_that_explains
 from georef.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
 from georef.earth import e_from_geodetic, geodetic_from_e
 from georef.navigation.inputs import Kind
@@ -195,6 +195,7 @@ def _reasons(given: Given, apart: Apart, undulation_m: float | None, setup: Setu
     size_e = np.median(apart.of.apart_e, axis=0)
     if np.linalg.norm(size_e) < DATUMS_APART_M and float(np.max(apart.scatter_l)) < 0.3 * apart.metres + 0.05:
         tolerance = max(0.15 * float(np.linalg.norm(size_e)), 3.0 * float(np.linalg.norm(apart.fix_sigma_l)))
+        tolerance = min(tolerance, MUCH_BETTER * float(np.linalg.norm(size_e)))
         fix_e = np.median(apart.of.fix_e, axis=0)
         named = datum_that_explains(fix_e, size_e, min(tolerance, 15.0), _epoch(given, setup))
         if named:

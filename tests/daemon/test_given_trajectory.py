@@ -14,8 +14,9 @@ from pyproj import Transformer
 from daemon.config import Config
 from daemon.config.tables import GnssConfig
 from daemon.processing.feed import LogClocks, read_clocks
-from daemon.processing.given_trajectory import Belonging, Given, judge_given, points_of
+from daemon.processing.given_trajectory import Belonging, Given, _nearest, judge_given, points_of
 from daemon.processing.setup import Options, Setup
+from georef.agreement import Apart
 from georef.earth import geodetic_from_e
 from georef.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short, two_lines
@@ -108,6 +109,59 @@ def test_the_right_trajectory_is_taken_without_a_word(log: Log, single: Log) -> 
 def test_metres_that_single_fixes_are_wrong_by_are_no_reason_to_refuse(single: Log) -> None:
     found = single.judged(raised(single.truth, lambda lat, lon, height: (lat + 1.5 / 6.4e6, lon, height - 4.0)))
     assert found.refused == []
+
+
+def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float | None = None) -> Trajectory:
+    """The truth lifted until it lies so far off the fixes, or so many sigmas; it says one sigma of its own."""
+    sure = replace(one.truth, position_sigma_l=np.full((len(one.truth), 3), own_m))
+
+    def lifted(up_m: float) -> Trajectory:
+        high = raised(sure, lambda lat, lon, height: (lat, lon, height + up_m))
+        return replace(high, position_sigma_l=sure.position_sigma_l)
+
+    def apart(up_m: float) -> Apart:
+        given = Given("x.out", lifted(up_m), (0.0, 0.0, 0.0), points_of(one.setup), False)
+        found, _, _ = _nearest(given, one.setup, one.clocks)
+        assert found is not None
+        return found
+
+    tried_m = 3.0
+    there = apart(tried_m)
+    wanted_m = metres if sigmas is None else sigmas * there.metres / there.sigmas
+    assert wanted_m is not None
+    up_m = tried_m + wanted_m - there.metres
+    assert apart(up_m).metres == pytest.approx(wanted_m, abs=1e-4)
+    return lifted(up_m)
+
+
+@pytest.mark.parametrize(
+    ("own_m", "limit", "warned", "refused"),
+    [
+        (0.1, {"sigmas": 4.98}, False, False),
+        (0.1, {"sigmas": 5.02}, True, False),
+        (0.1, {"sigmas": 19.95}, True, False),  # 2.3 m
+        (0.1, {"sigmas": 20.05}, False, True),
+        (0.5, {"metres": 2.99}, True, False),  # 6 sigmas
+        (0.5, {"metres": 3.01}, False, True),
+        (2.0, {"metres": 2.99}, False, False),
+        (2.0, {"metres": 3.01}, False, True),  # 1.5 sigmas, but 60 of the fixes alone
+    ],
+)
+def test_limits(log: Log, own_m: float, limit: dict[str, float], warned: bool, refused: bool) -> None:
+    """Refused from 3 m or 20 sigmas on, warned of from 5 sigmas on, and not a word below."""
+    found = log.judged(up_by(log, own_m, **limit))
+    assert (len(found.warnings), len(found.refused)) == (int(warned), int(refused))
+    for line in [*found.warnings, *found.refused]:
+        assert line.startswith("x.out: lies ")
+
+
+@pytest.mark.parametrize(("metres", "warned"), [(2.99, False), (3.01, True), (5.0, True), (8.0, True)])
+def test_metres_off_fixes_that_are_no_better_are_a_doubt_of_both(single: Log, metres: float, warned: bool) -> None:
+    """Not called the time's or a datum's fault, which such fixes cannot exclude and nothing speaks for."""
+    found = single.judged(up_by(single, 0.1, metres=metres))
+    assert found.refused == []
+    assert len(found.warnings) == int(warned)
+    assert all(line.endswith(": such fixes may be wrong by that, or the trajectory is") for line in found.warnings)
 
 
 def test_a_trajectory_48_m_low_is_above_the_geoid(log: Log, single: Log) -> None:
