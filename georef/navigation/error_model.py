@@ -248,6 +248,22 @@ def decays(drive: Drive, span_s: float, decay: FloatArray) -> None:
         decay[i] = last
 
 
+@kernel
+def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
+    """Bring the estimates of lasting errors of observations nearer to zero (STATE_SIZE,), as their expectation goes.
+
+    Not of the unit's biases, of which most was there at turn-on and stays: observed within minutes, they hardly fade.
+    """
+    for first, count, column in (
+        (layout.slow, 3, SLOW),
+        (layout.slow_velocity, 3, SLOW_VELOCITY),
+        (layout.height_bias, 1, HEIGHT_BIAS),
+    ):
+        if first >= 0:
+            for i in range(count):
+                x[column + i] *= decay[first + i]
+
+
 @kept
 def propagate(p: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray) -> None:
     """P ← Φ P Φᵀ.

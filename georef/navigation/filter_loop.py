@@ -24,6 +24,7 @@ from georef.navigation.error_model import (
     add_noise,
     begin_accumulation,
     decays,
+    fade,
     inject,
     propagate,
     transition,
@@ -105,11 +106,12 @@ def level_sigmas(x: FloatArray, p: FloatArray, sigma: FloatArray) -> None:
 
 @kept
 def end_step(run: Running, model: Model) -> None:
-    """Bring the covariance to now."""
+    """Bring the covariance to now, and the expectation of errors that die away."""
     if run.sums[SUM_TIME] <= 0.0:
         return
     transition(run.sums, run.x, run.top)
     decays(model.drive, run.sums[SUM_TIME], run.decay)
+    fade(run.x, run.decay, model.layout)
     propagate(run.p, run.top, run.decay, run.work)
     add_noise(run.p, run.sums, model.drive, run.decay, run.bridge)
     accumulate(run.total, run.total_decay, run.top, run.decay, run.work)

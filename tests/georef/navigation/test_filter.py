@@ -15,6 +15,7 @@ from georef.navigation.gravity import EARTH_RATE_RADPS, gravity_e
 from georef.navigation.inputs import GRADES, Fate, ImuNoise, Inertial, Kind, Start
 from georef.navigation.smoother import difference, forward
 from georef.navigation.stores import LATEST_ROWS
+from georef.navigation.strapdown import SLOW, SLOW_VELOCITY
 from georef.records import FixType, StructArray
 from georef.rotations import attitude_of
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
@@ -51,6 +52,21 @@ def test_the_reference_flight_is_filtered_as_well_as_by_others(name: str) -> Non
     lost = forward(run_filter(flown.inertial, without(rows, spans), flown.setup, start))
     t, off = flight_errors(name, lost, (spans.min(), spans.max() + 1.0))
     assert of_maxima(t, np.linalg.norm(off[:, :3], axis=1), spans) < 1.15 * OUTAGES_M[name][0]
+
+
+def test_what_is_known_of_a_lasting_error_dies_away_as_the_error_does() -> None:
+    """Half a minute without observations: of the positions' error, and of the velocities', what decay leaves."""
+    truth, noise = fly(survey(), 60.0, 50.0), GRADES["mems"]
+    inertial, rows = noised(truth, noise, Fixes(share=0.5, tau_s=20.0, velocity_mps=0.03), ARM, 3)
+    setup = replace(setup_for(noise, ARM), gnss_correlated_share=0.5, gnss_correlation_s=20.0)
+    setup = replace(setup, gnss_velocity_share=0.5, gnss_velocity_correlation_s=8.0)
+    run = run_filter(inertial, rows[rows["time_ns"] < ns(30.0)], setup, drawn_start(truth, 3))
+    time_ns, after = (np.concatenate([getattr(one, name) for one in run.nodes]) for name in ("time_ns", "after"))
+    begin, end = after[np.searchsorted(time_ns, ns(30.0))], after[-1]
+    for first, tau_s in ((SLOW, 20.0), (SLOW_VELOCITY, 8.0)):
+        there = begin[first : first + 3]
+        assert np.abs(there).min() > 0.0
+        np.testing.assert_allclose(end[first : first + 3], np.exp(-30.0 / tau_s) * there, rtol=1e-3)
 
 
 def test_however_the_input_is_cut_the_numbers_are_the_same() -> None:

@@ -47,3 +47,20 @@ def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
             assert honesty.holds, (what, name, honesty)
             assert honesty.independent > 40.0, (what, name, honesty)
     assert 0.95 < np.mean(moments) < 1.05
+
+
+def test_errors_of_a_quick_receiver_that_last_for_seconds_are_as_large_as_their_sigmas() -> None:
+    """Half of the positions' variance for 10 s, told of it: estimates of such errors have to die away as they do."""
+    fixes = Fixes((0.014, 0.014, 0.02), 0.5, 10.0, 5.0, 0.03)
+    setup = replace(setup_for(GRADES["tactical"], ARM), gnss_correlated_share=0.5, gnss_correlation_s=10.0)
+    setup = replace(setup, position_floor_m=0.001)
+    squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
+    for seed in range(12):
+        inertial, rows = noised(flight(), GRADES["tactical"], fixes, ARM, seed)
+        run = run_filter(inertial, rows, setup, drawn_start(flight(), seed))
+        for what, solution in (("filtered", forward(run)), ("smoothed", smooth(run))):
+            squared[what].append(squares(flight(), solution, 30.0, 0.5))
+    for what, flights in squared.items():
+        position = judge(flights)["position"]
+        assert position.holds, (what, position)
+        assert position.independent > 40.0, (what, position)
