@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -233,7 +233,7 @@ def _sampled(times: ImuTimes, sources: NavigationSources, storage: Storage) -> t
 
 
 def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_hz: float) -> list[Stretch]:
-    """Return, by time, what of the samples no leg holds; a gap that samples without a time explain is told once."""
+    """Return, by time, what of the samples no leg holds; a gap that samples left out explain is told once."""
     rows = times.rows
     finite = np.isfinite(rows["specific_force_b"]).all(axis=1) & np.isfinite(rows["angular_rate_b"]).all(axis=1)
     dropped = [*times.dropped]
@@ -247,29 +247,36 @@ def _missing(times: ImuTimes, sampler: Sampler, short: Sequence[Stretch], rate_h
             for one in dropped
         )
     ]
-    return sorted([*dropped, *gaps, *_misplaced(sampler, rate_hz), *short], key=lambda part: part.begin_ns)
+    return sorted([*dropped, *_explained(gaps, sampler, rate_hz), *short], key=lambda part: part.begin_ns)
 
 
-def _misplaced(sampler: Sampler, rate_hz: float) -> list[Stretch]:
-    """Return the runs of samples whose stamps lie before those that came earlier, by these stamps."""
+def _explained(gaps: Sequence[Stretch], sampler: Sampler, rate_hz: float) -> list[Stretch]:
+    """Return the gaps, and the runs of samples that their stamps let drop: as the gap that they leave, or by them."""
     words = {
         "time_jumped_back": "samples whose time jumped back",
         "out_of_order": "samples out of order",
         "duplicate": "samples of a time that another had",
         "stamp_outlier": "samples whose time stands alone",
     }
-    runs: list[list[tuple[int, str]]] = []
-    for stamp_ns, reason in sampler.left_out:
-        follows = runs and runs[-1][-1][1] == reason and abs(stamp_ns - runs[-1][-1][0]) < LEAST_HOLE_S * SECOND_NS
-        if follows:
-            runs[-1].append((stamp_ns, reason))
+    runs: list[list[tuple[int, int, str]]] = []
+    for one in sampler.left_out:
+        before = runs[-1][-1] if runs else (-1, -1, "")
+        near = one[1] == before[1] or abs(one[0] - before[0]) < LEAST_HOLE_S * SECOND_NS
+        if near and one[2] == before[2]:
+            runs[-1].append(one)
         else:
-            runs.append([(stamp_ns, reason)])
-    return [
-        Stretch(run[0][0], run[0][0] + round(len(run) / rate_hz * SECOND_NS), words[run[0][1]])
-        for run in runs
-        if len(run) / rate_hz > LEAST_HOLE_S
-    ]
+            runs.append([one])
+    left, found = {gap.begin_ns: gap for gap in gaps}, []
+    for run in runs:
+        (stamp_ns, after_ns, reason), length_s = run[0], len(run) / rate_hz
+        if length_s <= LEAST_HOLE_S:
+            continue
+        gap = left.get(after_ns)
+        if gap is not None and length_s > 0.5 * gap.seconds:
+            found.append(replace(left.pop(after_ns), why=words[reason]))
+        else:
+            found.append(Stretch(stamp_ns, stamp_ns + round(length_s * SECOND_NS), words[reason]))
+    return [*found, *left.values()]
 
 
 def _legs(inertial: Inertial, observations: StructArray) -> tuple[list[Leg], list[Stretch]]:

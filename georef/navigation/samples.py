@@ -55,7 +55,7 @@ class Sampler:
         counts: rows by what was wrong with them: not_finite, duplicate, out_of_order, time_jumped_back,
             stamp_outlier (all dropped), saturated (kept, marked); and bridged, intervals made up.
         gaps: (begin, end) GPS ns of what was not bridged.
-        left_out: (GPS ns of its stamp, reason) of each sample that its stamp let drop.
+        left_out: (GPS ns of its stamp, of the end of the last sample taken, reason) of each that its stamp let drop.
 
     Raises:
         NavigationError: a rate that is not positive, no rotation, or another word than those above.
@@ -78,7 +78,7 @@ class Sampler:
             raise NavigationError(f'stamp: got "{stamp}", want "end", "middle" or "start"')
         self.counts: Counter[str] = Counter()
         self.gaps: list[tuple[int, int]] = []
-        self.left_out: list[tuple[int, str]] = []
+        self.left_out: list[tuple[int, int, str]] = []
         self._nominal_s = 1.0 / rate_hz
         self._nominal_ns = SECOND_NS / rate_hz
         self._sample = sample
@@ -118,9 +118,9 @@ class Sampler:
         if number:
             self.counts[reason] += number
 
-    def _leave_out(self, end_ns: int, reason: str) -> None:
+    def _leave_out(self, end_ns: int, last_ns: int | None, reason: str) -> None:
         self._count(reason, 1)
-        self.left_out.append((end_ns, reason))
+        self.left_out.append((end_ns, end_ns if last_ns is None else last_ns, reason))
 
     def _in_order(self, ends_ns: Int64Array, values: FloatArray, saturated: BoolArray) -> NDArray[np.intp]:
         """Which rows to take; counts the others, holds the one that only the next can judge."""
@@ -136,13 +136,12 @@ class Sampler:
                     kept.append(held)
                     last = int(ends_ns[held])
                 else:
-                    self._leave_out(int(ends_ns[held]), "stamp_outlier")
+                    self._leave_out(int(ends_ns[held]), last, "stamp_outlier")
                 held = -1
             if last is not None and end <= last:
                 late = last - end
-                self._leave_out(
-                    end, "duplicate" if not late else "time_jumped_back" if late > _BACK else "out_of_order"
-                )
+                reason = "duplicate" if not late else "time_jumped_back" if late > _BACK else "out_of_order"
+                self._leave_out(end, last, reason)
             elif last is None or end - last > self._max_gap_ns:
                 held = row
             else:

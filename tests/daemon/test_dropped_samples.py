@@ -1,0 +1,84 @@
+"""Samples that are left out for their values or their stamps are holes of the trajectory where they last."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.processing.navigation_inputs import _missing
+from daemon.processing.navigation_times import ImuTimes, Stretch
+from georef.navigation.samples import Sampler
+from georef.records import IMU_DTYPE, Int64Array
+
+S = 1_000_000_000
+RATE_HZ = 100.0
+BEGIN_NS = 1_479_297_618 * S
+FIRST = 400  # sample from which they are spoilt
+Spoil = Callable[[NDArray[np.void], Int64Array, slice], None]
+
+
+def holes(spoil: Spoil, count: int) -> list[Stretch]:
+    """What is missing of 20 s at 100 Hz of which so many samples, from the fourth second on, are spoilt."""
+    rows = np.zeros(2000, IMU_DTYPE)
+    rows["specific_force_b"] = [0.0, 0.0, -9.81]
+    stamps_ns = BEGIN_NS + np.arange(2000) * (S // 100)
+    rows["host_time_ns"] = stamps_ns + 7 * S
+    spoil(rows, stamps_ns, slice(FIRST, FIRST + count))
+    sampler = Sampler(RATE_HZ)
+    sampler.feed(rows, stamps_ns)
+    return _missing(ImuTimes(rows, stamps_ns, 0.0, "gps", Counter()), sampler, (), RATE_HZ)
+
+
+def no_numbers(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    rows["angular_rate_b"][at, 1] = np.nan
+
+
+def far_back(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    stamps_ns[at] -= 200 * S
+
+
+def again(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    """A clock that is set back by as much as it takes: from there on the same times come twice."""
+    stamps_ns[at.start :] -= (at.stop - at.start) * (S // 100)
+
+
+def stuck(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    stamps_ns[at] = stamps_ns[at.start - 1]
+
+
+def lone(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+    """Stamps that no other comes near to, each farther away than the one before."""
+    stamps_ns[at] += np.arange(1, at.stop - at.start + 1) * 600 * S
+
+
+@pytest.mark.parametrize(
+    ("spoil", "begin_s", "why"),
+    [
+        (no_numbers, 3.99, "samples that are not numbers"),
+        (far_back, 3.99, "samples whose time jumped back"),
+        (again, 3.3, "samples out of order"),
+        (stuck, 3.99, "samples of a time that another had"),
+        (lone, 3.99, "samples whose time stands alone"),
+    ],
+)
+def test_samples_left_out_for_longer_than_may_be_bridged_are_one_hole(spoil: Spoil, begin_s: float, why: str) -> None:
+    """Told once, with the reason, as long as the samples last: 0.7 s."""
+    (hole,) = holes(spoil, 70)
+    assert hole.why == why
+    assert (hole.begin_ns - BEGIN_NS) / S == pytest.approx(begin_s, abs=0.001)
+    assert hole.seconds == pytest.approx(0.7, abs=0.011)
+    assert holes(spoil, 40) == []
+
+
+def test_a_gap_that_samples_left_out_explain_a_small_part_of_is_told_beside_them() -> None:
+    def stuck_then_silent(rows: NDArray[np.void], stamps_ns: Int64Array, at: slice) -> None:
+        stuck(rows, stamps_ns, at)
+        stamps_ns[at.stop :] += 5 * S
+
+    silent, same = sorted(holes(stuck_then_silent, 70), key=lambda one: -one.seconds)
+    assert (silent.why, same.why) == ("no samples", "samples of a time that another had")
+    assert silent.seconds == pytest.approx(5.7, abs=0.011)
