@@ -333,6 +333,48 @@ def test_comparisons_that_contradict_each_other_claim_nothing() -> None:
     assert not replace(lone, sigma=0.12).is_wrong
 
 
+def component_late(rows: StructArray, component: str, late_s: float) -> StructArray:
+    """Velocities of which one part alone, ``course`` or ``down``, comes later than the rest, as one filtered alone."""
+    rows, at = rows.copy(), np.flatnonzero(rows["kind"] == Kind.VELOCITY)
+    t = (rows["time_ns"][at] - rows["time_ns"][at[0]]) / 1e9
+    north, east, down = rows["value"][at].T
+    course = np.unwrap(np.arctan2(east, north))
+    if component == "course":
+        course = np.interp(t - late_s, t, course)
+    else:
+        down = np.interp(t - late_s, t, down)
+    speed = np.hypot(north, east)
+    rows["value"][at] = np.column_stack([speed * np.cos(course), speed * np.sin(course), down])
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("recording", "component", "late_s", "compared"),
+    [
+        (car, "course", 0.5, "turn"),
+        (car, "course", -0.7, "turn"),
+        (lambda: reference("tactical"), "down", 1.0, "force"),
+    ],
+    ids=["course late", "course early", "down late"],
+)
+def test_motion_that_is_late_in_part_is_no_offset_but_unclear(
+    recording: Callable[[], Recording], component: str, late_s: float, compared: str
+) -> None:
+    """What is compared with that part says so, the speed denies it; late as a whole, all of them say so."""
+    sound = recording()
+    rows = component_late(sound.rows, component, late_s)
+    found = time_offset(sound.inertial, rows)
+    assert found is not None
+    assert (found.compared, found.is_certain, found.is_wrong) == (compared, False, False)
+    assert found.seconds == pytest.approx(late_s, abs=0.16)  # a car's course turns 0.14 s after its nose
+    assert re.fullmatch(r"by the speed [+-]\d+ ± \d+ ms", found.contradiction)
+    (finding,) = diagnose(sound.inertial, rows, sound.setup)
+    assert (finding.code, finding.severity) == ("time_unclear", "warning")
+    assert f"by the {compared} {1000 * found.seconds:+.0f} ± " in finding.text
+    assert found.contradiction in finding.text
+    assert codes(moved(late_s)((sound.inertial, sound.rows, sound.setup))) == ["time_offset"]
+
+
 def test_the_sigma_of_an_offset_is_honest() -> None:
     """Of stretches of 250 s the offsets scatter no more than their sigmas say; the worst is within four."""
     whole = reference("mems")
