@@ -1,0 +1,84 @@
+"""What the pre-alignment says against the start of an angle that is held: it is told, and its sigma is doubted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.adjust import adjust
+from calib.features import Features
+from calib.flight import Flight
+from calib.outcome import Considered
+from calib.parameters import Wish
+from calib.plane_search import find_planes
+from calib.report_input import Finding
+from calib.trajectory_errors import Taus, gauss_markov
+from daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
+from georef.calibration import INDEX
+from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
+
+pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
+
+LINES: tuple[Line, ...] = ((-200, 0, 200, 0, 850), (200, 60, -200, 60, 850))
+KNOWN_RAD = math.radians(0.02)  # one sigma that the start says of its heading
+NOBODY: frozenset[str] = frozenset()
+
+
+@pytest.fixture(scope="module")
+def cast() -> Cast:
+    """One line there and another back, over houses on level ground."""
+    return cast_flight(VILLAGE.replace("relief_m = 8.0", "relief_m = 0.0"), LINES, prf_hz=12_000.0)
+
+
+def begun(cast: Cast, heading_off_deg: float) -> Flight:
+    """Start from an earlier calibration: the truth, but for a heading that is off and counts as known."""
+    sigmas = np.zeros(len(INDEX))
+    sigmas[INDEX["kappa_rad"]] = KNOWN_RAD
+    off = cast.truth.value("kappa_rad") + math.radians(heading_off_deg)
+    start = replace(cast.truth.changed(kappa_rad=off), method="combined", sigmas=sigmas)
+    return replace(cast.flight, heads=(replace(cast.flight.heads[0], start=start),)).placed({"left": start})
+
+
+def held_heading(flight: Flight) -> tuple[dict[str, float], Considered, tuple[Finding, ...]]:
+    """Adjust on the one level place nearest to the middle, which tells no heading; what is said against the start."""
+    first, away = _aligned(flight, NOBODY)
+    aligned = flight.placed(first)
+    level = [plane for plane in find_planes(aligned).planes if plane.normal_t[2] > 0.9995]
+    nearest = min(level, key=lambda plane: abs(plane.centre_t[1] - 30.0))
+    doubted = {name: abs(apart) for name, apart in away.items()}
+    prior = gauss_markov(flight, Taus(), 4.0)
+    found = adjust(aligned, Features((nearest,)), Wish("basic"), prior, first=first, doubted=doubted)
+    assert "kappa_rad" in [one.name for one in found.held]
+    (heading,) = (one for one in found.considered if one.name == "kappa_rad")
+    assert heading.value == found.calibrations["left"].value("kappa_rad") == flight.heads[0].start.value("kappa_rad")
+    return away, heading, prealigned_otherwise(away, found)
+
+
+def test_a_held_heading_that_houses_contradict_is_told_and_makes_the_calibration_unusable(cast: Cast) -> None:
+    away, heading, findings = held_heading(begun(cast, -0.6))
+    assert set(away) == {"left.kappa_rad"}
+    assert math.degrees(away["left.kappa_rad"]) == pytest.approx(0.6, abs=0.05)
+    assert heading.sigma >= away["left.kappa_rad"] > 10.0 * KNOWN_RAD
+    (one,) = findings
+    assert one.unusable
+    assert f"boresight κ (heading) {math.degrees(away['left.kappa_rad']):+.2f}° from the start" in one.what
+    assert one.excess == pytest.approx(away["left.kappa_rad"] / COARSE_RAD)
+
+
+def test_a_held_heading_that_is_right_is_not_contradicted(cast: Cast) -> None:
+    away, heading, findings = held_heading(begun(cast, 0.0))
+    assert (away, findings) == ({}, ())
+    assert heading.sigma < 0.5 * math.radians(0.6)
+
+
+def test_an_angle_that_is_fixed_keeps_its_start_and_leaves_the_others_to_be_found(cast: Cast) -> None:
+    """Neither is it contradicted here: of what is held at the user's word the adjustment tells."""
+    flight = begun(cast, -0.6)
+    first, away = _aligned(flight, frozenset({"left.kappa_rad"}))
+    start = flight.heads[0].start
+    assert away == {}
+    assert first["left"].value("kappa_rad") == pytest.approx(start.value("kappa_rad"), abs=1e-9)
+    assert first["left"].value("range_offset_m") == start.value("range_offset_m")
