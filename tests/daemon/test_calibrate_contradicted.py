@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,8 @@ from daemon.processing.flights import Wish
 from daemon.processing.flown import TrajectoryWish
 from daemon.processing.setup import Options
 from georef.calibration import INDEX, Calibration, read_calibration
+from georef.formats.trajectory_csv import csv_text
+from georef.trajectory import Trajectory
 from tests.calib.village import KNOWN, Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
@@ -114,3 +117,23 @@ def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wi
     sound = write_products(wish, replace(done, check=Check((), (replace(comparison, told=-2.75 * sigma),))), quiet)
     for word in words:
         assert not any(one["what"].startswith(word) for one in sound.record["verdict"]["reasons"])
+
+
+def test_a_trajectory_of_another_place_is_noted_where_it_is_forced(
+    made: Made, wish: CalibrateWish, tmp_path: Path
+) -> None:
+    """All strips are moved alike, so that nothing else says it."""
+    true, file = made.trajectory, tmp_path / "away.csv"
+    lat, lon, height = true.geodetic()
+    away = Trajectory.from_geodetic(
+        true.time_ns, lat, lon + math.radians(0.1), height, true.velocity_l(), *true.attitude(), name="away"
+    )
+    sigmas = {name: getattr(true, name) for name in ("position_sigma_l", "attitude_sigma_rad")}
+    file.write_text(csv_text(replace(away, **sigmas)))
+    elsewhere = replace(wish.logs, trajectory=TrajectoryWish(file, force=True))
+    output = tmp_path / "left.toml"
+    forced = replace(wish, logs=elsewhere, output=output)
+    told = write_products(forced, calibrate(forced, tmp_path, quiet), quiet)
+    (note,) = (line for line in told.record["notes"] if line.startswith(f"{file}: "))
+    assert "lies 7.6 km off the fixes of gnss/rover" in note
+    assert f"note: {note}" in told.lines
