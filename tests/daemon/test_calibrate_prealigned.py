@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from calib.adjust import adjust
+from calib.calibration_file import Header, calibration_text
 from calib.features import Features
 from calib.flight import Flight
 from calib.outcome import Considered
@@ -17,7 +19,7 @@ from calib.plane_search import find_planes
 from calib.report_input import Finding
 from calib.trajectory_errors import Taus, gauss_markov
 from daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
-from georef.calibration import INDEX
+from georef.calibration import INDEX, Calibration, read_calibration
 from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
@@ -27,6 +29,12 @@ KNOWN_RAD = math.radians(0.02)  # one sigma that the start says of its heading
 NOBODY: frozenset[str] = frozenset()
 
 
+def through_a_file(calibration: Calibration) -> Calibration:
+    """As a calibration file hands it on."""
+    header = Header("2026-11-21T10:15:00Z-ab12", dt.datetime(2026, 11, 21, 10, 15, tzinfo=dt.UTC))
+    return read_calibration(calibration_text(calibration, header), "left.toml")
+
+
 @pytest.fixture(scope="module")
 def cast() -> Cast:
     """One line there and another back, over houses on level ground."""
@@ -34,11 +42,12 @@ def cast() -> Cast:
 
 
 def begun(cast: Cast, heading_off_deg: float) -> Flight:
-    """Start from an earlier calibration: the truth, but for a heading that is off and counts as known."""
+    """Start from an earlier calibration's file: the truth, but for a heading that is off and counts as known."""
     sigmas = np.zeros(len(INDEX))
     sigmas[INDEX["kappa_rad"]] = KNOWN_RAD
     off = cast.truth.value("kappa_rad") + math.radians(heading_off_deg)
-    start = replace(cast.truth.changed(kappa_rad=off), method="combined", sigmas=sigmas)
+    told = cast.truth.changed(kappa_rad=off, scan_angle_scale=1.7e-4, time_offset_s=3.1e-5)
+    start = through_a_file(replace(told, method="combined", sigmas=sigmas))
     return replace(cast.flight, heads=(replace(cast.flight.heads[0], start=start),)).placed({"left": start})
 
 
@@ -53,7 +62,10 @@ def held_heading(flight: Flight) -> tuple[dict[str, float], Considered, tuple[Fi
     found = adjust(aligned, Features((nearest,)), Wish("basic"), prior, first=first, doubted=doubted)
     assert "kappa_rad" in [one.name for one in found.held]
     (heading,) = (one for one in found.considered if one.name == "kappa_rad")
-    assert heading.value == found.calibrations["left"].value("kappa_rad") == flight.heads[0].start.value("kappa_rad")
+    start, written = flight.heads[0].start, through_a_file(found.calibrations["left"])
+    for one in found.considered:  # in the file too, bit for bit
+        assert written.value(one.name) == start.value(one.name) == one.value, one.name
+    assert written.value("omega_rad") != start.value("omega_rad")
     return away, heading, prealigned_otherwise(away, found)
 
 
