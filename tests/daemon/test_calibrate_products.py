@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
-from daemon.processing.calibrate_products import _header, trajectory_says
+from calib.need import POINT, need_of
+from calib.report_verdict import Level as CalibrationLevel
+from calib.report_verdict import judge, wanted_of
+from daemon.config import parse_config
+from daemon.processing.calibrate_products import _header, _wanted, trajectory_says
 from daemon.processing.calibrate_run import Calibrated
 from daemon.processing.carried_verdict import Carried
 from daemon.processing.navigation_verdict import Level
+from tests.calib.made_outcome import made_outcome, made_report
+
+pytestmark = pytest.mark.xdist_group("kernels")
 
 
 def session(installation: str, **serials: str) -> Any:
@@ -32,3 +42,36 @@ def test_what_was_judged_of_the_trajectory_speaks_against_the_calibration_before
     bad, care = trajectory_says([Carried(Level.UNUSABLE, "lever arm"), Carried(Level.CARE, "few fixes")])
     assert (bad.what, bad.unusable, bad.excess) == ("lever arm", True, np.inf)
     assert (care.what, care.unusable) == ("few fixes", False)
+
+
+def wanted(text: str) -> dict[str, float]:
+    """By a configuration, as a run of `swath calibrate` takes it."""
+    config = parse_config(f'[session]\nname = "x"\n{text}', Path("swath.toml"))
+    kept = SimpleNamespace(logged=[SimpleNamespace(setup=SimpleNamespace(config=config))])
+    return _wanted(cast(Calibrated, SimpleNamespace(kept=kept)))
+
+
+def test_what_a_configuration_wants_is_what_the_verdict_goes_by() -> None:
+    """From TOML in the units of people, through what points need, to the words and the level."""
+    table = "[calibration.wanted]\npoint_m = {point_m}\nkappa_deg = {kappa_deg}\nrange_scale_ppm = 7.5\n"
+    outcome = made_outcome()
+    adjusted, report = outcome.adjusted, made_report(outcome)
+    kappa_deg = float(np.degrees(adjusted.sigmas[adjusted.names.index("left.kappa_rad")]))
+    found: dict[str, Any] = {}
+    for words, times in (("met", 2.0), ("not met", 0.5), ("far from met", 0.05)):
+        asked = wanted(table.format(point_m=50.0, kappa_deg=times * kappa_deg))
+        assert asked == pytest.approx({POINT: 50.0, "kappa_rad": np.radians(times * kappa_deg), "range_scale": 7.5e-6})
+        need = need_of(outcome.flight, adjusted.calibrations, adjusted.trajectory, asked)
+        whole = replace(report, need=need)
+        assert wanted_of(whole)["kappa_rad"] == pytest.approx(np.radians(times * kappa_deg))
+        found[words] = judge(whole)
+        told = [one for one in found[words].reasons if one.what.startswith("boresight κ (heading) is known to")]
+        if words == "met":
+            assert told == []
+        else:
+            (one,) = told
+            assert one.what.endswith(" is wanted")
+            assert one.level is (CalibrationLevel.CARE if words == "not met" else CalibrationLevel.UNUSABLE)
+            assert one.excess > 1.0
+    assert found["far from met"].level is CalibrationLevel.UNUSABLE
+    assert wanted("") == {}
