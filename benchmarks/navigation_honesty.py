@@ -1,6 +1,6 @@
 """Whether sigmas are what errors are, over many flights: NEES of position, velocity, attitude; innovations.
 
-python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …]]
+python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …] | --lasting]
 
 Made flights of ten minutes at 60 m/s, 50 Hz, fixes at 1 Hz with white errors and with errors that last a minute (70 %
 of the variance), the filter told of it. Truth and inertial samples are the simulator's. The interval is that of χ² at
@@ -12,6 +12,10 @@ innovations there is the second moment and the largest correlation of neighbours
 NEES of what it makes, there is the largest ratio of its errors, RMS over the flights, to those of the smoother that
 knows; and, as "known", the NEES of that smoother on the same flights, which shows what their draws amount to. A flight
 is drawn once for the three sigmas, and takes some 2 s.
+
+``--lasting``: instead of that, the UBX receiver with the tactical unit where another part of the positions' variance
+lasts than `solve` assumes, or for another time: NEES of position, errors over those of the smoother that knows, and
+sigmas over that smoother's, RMS, the worst of three components and all three together.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ from tests.georef.navigation.receivers import RECEIVERS, compared
 
 FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
+LASTING = ((0.5, 60.0), (0.0, 60.0), (0.2, 60.0), (0.5, 10.0), (0.5, 300.0))  # share, s
 OPTIMISMS = {"honest": 1.0, "optimistic by 3": 3.0, "pessimistic by 3": 1.0 / 3.0}
 
 
@@ -72,14 +77,43 @@ def with_receivers(names: list[str], seeds: int) -> None:
                 print(f"{f'{name}, {grade}, {words}':<34}{told}  {worst}", flush=True)
 
 
+def with_lasting(seeds: int) -> None:
+    """Fly a receiver whose errors last otherwise than is assumed, and print a line each."""
+    receiver = RECEIVERS["UBX"]
+    print(f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<30}{'position':>24}   known   error / best   sigma / best")
+    for share, tau_s in LASTING:
+        found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        errors, variances = np.zeros((2, 9)), np.zeros((2, 3))
+        other = replace(receiver, fixes=replace(receiver.fixes, share=share, tau_s=tau_s))
+        for seed in range(2000, 2000 + seeds):
+            (one,) = compared(flight(), other, "tactical", seed, (1.0,))
+            errors += one.squares(flight())
+            for row, solution in enumerate((one.solved.smoothed, one.best)):
+                found[row].append(squares(flight(), solution, 5.0, 0.5))
+                variances[row] += np.square(solution.position_sigma_l).mean(axis=0)
+        told, known = (judge(squared)["position"] for squared in found)
+        ratio = float(np.sqrt(errors[0] / errors[1])[:3].max())
+        wider = float(np.sqrt(variances[0].sum() / variances[1].sum()))
+        interval = f"({told.low:.2f} … {told.high:.2f})"
+        print(
+            f"{f'{share:.0%} lasting {tau_s:.0f} s':<30}{told.mean:>8.2f} {interval}{known.mean:>8.2f}{ratio:>15.3f}"
+            f"{wider:>15.2f}",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Fly and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="flights of each kind")
     parser.add_argument("--receivers", nargs="*", choices=RECEIVERS, help="these receivers (none named: all)")
+    parser.add_argument("--lasting", action="store_true", help="errors that last otherwise than is assumed")
     arguments = parser.parse_args()
     if arguments.receivers is not None:
         with_receivers(arguments.receivers or list(RECEIVERS), arguments.seeds)
+        return
+    if arguments.lasting:
+        with_lasting(arguments.seeds)
         return
     print(f"{'':<28}{'part':<10} {'NEES':>6} {'interval':>14} {'independent':>12}")
     for grade in ("tactical", "mems"):

@@ -72,7 +72,10 @@ class Compared:
 
 
 def compared(truth: Truth, receiver: Receiver, grade: str, seed: int, optimisms: Iterable[float]) -> Iterator[Compared]:
-    """Fly one flight of a receiver, and navigate it for each factor by which its sigmas are too small."""
+    """Fly one flight of a receiver, and navigate it for each factor by which its sigmas are too small.
+
+    Assumed is that `SHARE` of the positions' variance lasts for `TAU_S`, whatever is true of the receiver.
+    """
     inertial, rows = noised(truth, GRADES[grade], receiver.fixes, ARM, seed)
     start = drawn_start(truth, seed)
     setup = Setup(GRADES[grade], ARM[None], gnss_correlated_share=SHARE, gnss_correlation_s=TAU_S)
@@ -80,6 +83,8 @@ def compared(truth: Truth, receiver: Receiver, grade: str, seed: int, optimisms:
         setup,
         position_floor_m=1e-3,
         velocity_floor_mps=1e-3,
+        gnss_correlated_share=receiver.fixes.share,
+        gnss_correlation_s=receiver.fixes.tau_s,
         gnss_velocity_share=receiver.fixes.velocity_share,
         gnss_velocity_correlation_s=receiver.fixes.velocity_tau_s,
     )
