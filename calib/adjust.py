@@ -138,7 +138,7 @@ def _of_noise(told: Flight, found: Flight) -> tuple[str, ...]:
     """Return by how much scanners' returns scatter less than was told, a line each."""
     lines = []
     for head, own in zip(told.heads, found.heads, strict=True):
-        share = sum(astuple(own.noise)) / sum(astuple(head.noise))
+        share = sum(astuple(own.noise)) / sum(astuple(head.noise))  # all are scaled alike, and some may be 0
         if share < 1.0:
             lines.append(
                 f"returns of {head.name} scatter {share:.2f} times what range_sigma_m, angle_sigma_deg and "
@@ -214,7 +214,7 @@ def considered_of(asked: Unknowns, effects: HeldEffects, factor: float) -> tuple
     wrong = np.zeros(len(sigmas), np.bool_)
     words = {(one.scanner, one.name) for one in asked.held if not one.remedy}
     at_word = np.array([tuple(item.name.split(".", 1)) in words for item in asked.considered], np.bool_)
-    at_word &= sigmas == likely
+    at_word &= sigmas == likely  # else the user, or an earlier calibration, gave a sigma
     while True:
         spread = np.diag(factor * information + (information * sigmas**2) @ information)
         spread = spread / np.where(seen, own, 1.0) ** 2 - np.where(seen & at_word, sigmas, 0.0) ** 2

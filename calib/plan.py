@@ -221,7 +221,7 @@ class _Shots:
 def _shots(
     frame: Tangent, head: Head, scan: Scan, trajectory: Trajectory, line: Line, surfaces: Sequence[Surface]
 ) -> tuple[_Shots, FloatArray]:
-    """Where a line's scan meets the surfaces, when each point lies in the plane of the scan; by surface, how often."""
+    """Return where and when a line's scan meets the surfaces' points, and by surface how many returns would be."""
     surface = np.concatenate([np.full(len(one.points_t), index) for index, one in enumerate(surfaces)])
     points_t = np.concatenate([one.points_t for one in surfaces])
     points_e = frame.e_from_t(points_t)

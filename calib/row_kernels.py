@@ -122,8 +122,10 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
     What takes a point off its plane is an error of its range above all, and this stands in its coefficients, too: with
     those as measured, Σ aᵀ p f has the expectation Σ (∂a/∂ρ) / (∂f/∂ρ), which for the range scale is the number of
     rows, for the scan angle's scale Σ θ tan i. Where a million rows share a trajectory that is worth a few millimetres
-    that is several sigmas. As if the beam began where the range does and swung along a great circle: what of its swing
-    is not so is errors of angles alone, the smaller part.
+    that is several sigmas.
+
+    The beam is taken to begin where its range does and to swing along a great circle. Where it does not, the small
+    part of the coefficients that errors of the angle leave is a little wrong.
     """
     first, second = vector_at(planes.first_e, at), vector_at(planes.second_e, at)
     longer, wider = 1.0 + head.value[SCALE], (1.0 + head.value[ENCODER_SCALE])

@@ -76,7 +76,7 @@ class KeptFlight:
 
     @property
     def notes(self) -> list[str]:
-        """What is missing of what was asked for, then what is doubtful of what is there, a line each."""
+        """Holes in what was asked for, then doubts of what is there, a line each."""
         holes = [line for flight in self.logged for line in flight.holes]
         return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.doubts)]
 

@@ -137,7 +137,7 @@ class Flight:
 
     @property
     def doubts(self) -> list[str]:
-        """What its user should know of its data, its time and its trajectory, a line each."""
+        """Doubts of its data, its time and its trajectory, a line each."""
         lost = [f"{self.log}: the recorder lost {count:,} units of {source}" for source, count in self.lost.items()]
         return [*lost, *self.troubles]
 

@@ -161,7 +161,7 @@ def _tell(found: Settlement, named: dict[VoterKey, _Named], winner: int) -> None
         found.errors[source, utc] = TagErrors(one.host_ns, error_s)
         agree, total = int((error_s == 0).sum()), len(error_s)
         differ = ", ".join(f"{count} one {error:+d} s from it" for error, count in others.most_common(3))
-        doubt = "" if agree >= SURE_SHARE * total else "; so narrow a majority may be wrong by that, as a whole"
+        doubt = "" if agree >= SURE_SHARE * total else "; the majority is narrow: all times may be off by that"
         found.lines.append(
             f"{source}: {agree} of {total} messages name the second that is taken; {differ}: these are set right{doubt}"
         )

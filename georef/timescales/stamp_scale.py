@@ -143,7 +143,7 @@ def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_second
     if scale is None:
         return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, say so (clock)")
     if not within.all():
-        return Stamps(StampScale.FREE, f"{told}: want at most 100 ms, and none after; if PTP set them, say so (clock)")
+        return Stamps(StampScale.FREE, f"{told}: of PTP they stand 0 to 100 ms before; if it set them, say so (clock)")
     if drift_ns > GREATEST_DRIFT_NS:
         return Stamps(StampScale.FREE, f"{told}: they drift as those of a head that PTP has lost")
     return Stamps(scale, told, offset_ns, sigma_ns)

@@ -170,7 +170,7 @@ def test_a_patch_without_a_plane_is_dropped(flight: Flight) -> None:
 
 @pytest.mark.parametrize("rows", [16, 60, 190, 240, 1000])
 def test_so_many_returns_in_all_are_taken_from_the_largest_patches(rows: int) -> None:
-    """As many of each as make the limit: no other number that is the same for all patches comes closer."""
+    """Take as many of each as make the limit: no other number that is the same for all patches comes closer."""
     sizes = [[5, 100], [40], [7, 90]]
     planes = [
         Plane(str(at), np.zeros(3), np.array([0.0, 0.0, 1.0]), tuple(Patch(i, np.arange(n)) for i, n in enumerate(own)))

@@ -152,7 +152,7 @@ def test_the_verdict_goes_by_what_is_wanted(report: ReportInput) -> None:
     ],
 )
 def test_profiles_that_say_otherwise_are_a_reason(report: ReportInput, sigmas: float, level: Level) -> None:
-    """Of eight pairs, by how many sigmas of the difference they are off together, to either side."""
+    """Vary by how many sigmas of the difference eight pairs are off together, to either side."""
     sigma = 2.0**-16
     one = Comparison("left", "omega_rad", 8, sigmas * sigma, sigma, 0.0, sigma, sigma)
     fine = replace(one, parameter="phi_rad", told=0.25, adjusted=0.25)

@@ -291,7 +291,7 @@ def looks_of(flight: Flight, planes: tuple[Plane, ...], wish: Wish) -> tuple[Flo
 def test_rows_are_those_of_the_observations_as_adjusted(
     name: str, noise: Noise, errors: float, tolerance: float
 ) -> None:
-    """Where only ranges or only angles err, they are the true ones as adjusted, and so are all coefficients."""
+    """Adjust ranges, or angles, where only these err: they are the true ones then, and so are all coefficients."""
     normal = np.array([0.5, -0.3, 0.81])
     planes = [(np.array([150.0, 0.0, 400.0]), normal / np.linalg.norm(normal))]
     still = trajectory(LINES[:1])

@@ -225,7 +225,7 @@ def made(strips: Sequence[tuple[int, int, float, float]], paths: list[Trajectory
 
 
 def test_a_covariance_that_rounding_made_negative_has_an_inverse() -> None:
-    """As of a heading that was known to degrees before it was to thousandths: correlations of 1 come out as 1.04."""
+    """Break correlations of 1 by 4 %, as a heading's that was known to degrees before it was to thousandths."""
     built = made([(0, 1, 5.0, 15.0)], [level_path(50, begin=int(ns(0.0)))], begin=int(ns(0.0)))
     sound = gauss_markov(built, Taus(heading_s=1e5), 1.0)
     joint = sound.covariance.reshape(len(sound), 6, len(sound), 6).copy()

@@ -1,4 +1,4 @@
-"""What strips, a validation and profiles say against a calibration is told in its verdict, in their own words."""
+"""Test that what strips, a validation and profiles say against a calibration is told in its verdict."""
 
 from __future__ import annotations
 
