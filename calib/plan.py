@@ -19,7 +19,9 @@ from calib.features import ControlPoint, Features, Patch, Plane
 from calib.flight import Flight, FlightError, Head, Swath, Tangent
 from calib.outcome import Held
 from calib.parameters import Wish
+from calib.plane_cells import CELL_SHORT_M, CELL_SIZES_M
 from calib.plane_returns import RIM_M
+from calib.plane_settings import PlaneSettings
 from calib.solve import Settings
 from calib.trajectory_errors import TrajectoryPrior
 from georef.calibration import Calibration
@@ -35,6 +37,8 @@ LEAST_MADE, MOST_MADE = 4, 24  # of a patch; each stands for as many as there wo
 STEEPEST_COS = 0.17  # of the incidence: flatter than 80° nothing comes back
 _COARSE_NS = SECOND_NS // 2
 _STEPS = 20
+_PLANES = PlaneSettings()
+_LINES_A_CELL = 1.5  # distances between lines that a cell is wide, for most to have more than one of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +60,9 @@ class Surface:
     kind: str = "roof"
     control: tuple[ControlPoint, ...] = ()
 
-    @property
-    def taken_m2(self) -> float:
-        """Area of which returns are taken: of a roof without its rims."""
-        inner_m = max(float(np.sqrt(self.area_m2)) - 2.0 * RIM_M, 0.0)
+    def taken_m2(self, cell_m: float) -> float:
+        """Area of which returns are taken: of a roof what whole cells of the search have room on, clear of its rims."""
+        inner_m = max(float(np.sqrt(self.area_m2)) - max(cell_m, 2.0 * RIM_M), 0.0)
         return inner_m**2 if self.kind == "roof" else self.area_m2
 
 
@@ -81,14 +84,22 @@ class Scan:
     Attributes:
         half_angle_rad: from the middle.
         rate_hz: pulses a second within the scan.
-        scan_hz: oscillations, or turns, a second.
+        scan_hz: oscillations, or turns, a second; 0: not known.
         motion: ``sine``, ``triangle`` or ``turning``.
+        facets: lines a turn.
     """
 
     half_angle_rad: float
     rate_hz: float
     scan_hz: float = 0.0
     motion: str = "turning"
+    facets: int = 1
+
+    def apart_m(self, per_m2: float, speed_mps: float) -> float:
+        """Metres between lines, or between pulses of one, whichever are farther apart; pulses lie so densely."""
+        lines_hz = self.scan_hz * (self.facets if self.motion == "turning" else 2)
+        along_m = speed_mps / lines_hz if lines_hz else per_m2**-0.5
+        return max(along_m, 1.0 / (per_m2 * along_m))
 
     def encoder_motion(self, angle_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) rate and acceleration of the encoder at angles; one return goes out, the next comes back."""
@@ -176,6 +187,16 @@ def planned(
     return Flight(frame, tuple(heads), tuple(trajectories), tuple(swaths)), Features(planes)
 
 
+def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
+    """Metres a cell of the plane search would have on such a line, as `calib.plane_cells.cell_size` chooses."""
+    if not len(per_m2):
+        return _PLANES.cell_m
+    middling = float(np.median(per_m2))
+    wanted = max(_PLANES.cell_m, float(np.sqrt(_PLANES.cell_points / middling)) - CELL_SHORT_M)
+    wanted = max(wanted, _LINES_A_CELL * scan.apart_m(middling, speed_mps))
+    return next((size for size in CELL_SIZES_M if size >= wanted), CELL_SIZES_M[-1])
+
+
 def predict(
     flight: Flight, features: Features, wish: Wish, prior: TrajectoryPrior | None, settings: Settings = AS_USUAL
 ) -> Predicted:
@@ -234,7 +255,9 @@ def _shots(
     met = crossed & (np.abs(angle) <= scan.half_angle_rad) & (towards < -STEEPEST_COS)
     met &= (range_m >= low_m) & (range_m <= high_m)
     shots = _Shots(surface, time_ns, range_m, angle, points_t).at(met)
-    kept, expected = _thinned(shots, surface, surfaces, _density(trajectory, line, scan, shots))
+    speed_mps = _speed(trajectory, line)
+    per_m2 = _density(scan, speed_mps, shots)
+    kept, expected = _thinned(shots, surface, surfaces, per_m2, search_cell_m(scan, per_m2, speed_mps))
     shots = shots.at(kept)
     return shots.at(np.argsort(shots.time_ns, kind="stable")), expected
 
@@ -298,17 +321,21 @@ def _beams(
     return np.einsum("nij,ni->nj", rot_e_from_s, beam_e), beam_e
 
 
-def _density(trajectory: Trajectory, line: Line, scan: Scan, shots: _Shots) -> FloatArray:
-    """(n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
+def _speed(trajectory: Trajectory, line: Line) -> float:
+    """Metres a second along a line."""
     ends = trajectory.poses(np.array([line.begin_ns, line.end_ns], dtype=np.int64)).position_e
-    speed_mps = float(np.linalg.norm(ends[1] - ends[0])) / ((line.end_ns - line.begin_ns) / SECOND_NS)
+    return float(np.linalg.norm(ends[1] - ends[0])) / ((line.end_ns - line.begin_ns) / SECOND_NS)
+
+
+def _density(scan: Scan, speed_mps: float, shots: _Shots) -> FloatArray:
+    """(n,) pulses a square metre of ground where shots are, evenly over the swath's width."""
     width_m = 2.0 * shots.range_m * np.cos(shots.angle_rad) * np.tan(scan.half_angle_rad)
     per_m2: FloatArray = scan.rate_hz / (speed_mps * width_m)
     return per_m2
 
 
 def _thinned(
-    shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], density: FloatArray
+    shots: _Shots, surface: Int64Array, surfaces: Sequence[Surface], per_m2: FloatArray, cell_m: float
 ) -> tuple[NDArray[np.bool_], FloatArray]:
     """Which to keep, at most `MOST_MADE` a surface, none of what is hardly seen; by surface, how many would come."""
     keep = np.zeros(len(shots.surface), dtype=np.bool_)
@@ -317,7 +344,7 @@ def _thinned(
     for index in np.unique(shots.surface).tolist():
         at = np.flatnonzero(shots.surface == index)
         share = len(at) / asked[index]
-        expected[index] = density[at].mean() * surfaces[index].taken_m2 * share
+        expected[index] = per_m2[at].mean() * surfaces[index].taken_m2(cell_m) * share
         if expected[index] >= LEAST_POINTS and len(at) >= LEAST_MADE:
             wanted = int(min(expected[index], MOST_MADE, len(at)))
             keep[at[np.linspace(0, len(at) - 1, wanted).astype(np.int64)]] = True

@@ -41,6 +41,7 @@ PIECE = 4 << 20  # returns a grid is laid over
 CELLS_MOST = 1 << 24  # of a grid; cells are made larger beyond
 CELL_POINTS = 5.0  # least of a cell, for a plane of its own that says something
 CELL_SIZES_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+CELL_SHORT_M = 0.2  # by which a cell may be smaller than wanted
 WIDTH_LEAST_M, CELLS_LEAST = 1.2, 3  # of a plane
 _FILL_LEAST = 0.5
 _STRETCH = 100_000  # consecutive returns of a swath that are looked at for its pattern
@@ -125,7 +126,7 @@ def cell_size(flight: Flight, settings: PlaneSettings) -> float:
     if not sizes:
         raise PlaneError("planes: the swaths have no points; want a trajectory and a calibration that place them")
     wanted = max(settings.cell_m, float(np.median(sizes)) * np.sqrt(settings.cell_points))
-    large = [size for size in CELL_SIZES_M if size >= wanted - 0.2] or [CELL_SIZES_M[-1]]
+    large = [size for size in CELL_SIZES_M if size >= wanted - CELL_SHORT_M] or [CELL_SIZES_M[-1]]
     return next((size for size in large if _fill(flight, size) > _FILL_LEAST), large[-1])
 
 

@@ -239,7 +239,8 @@ def _heads(plan: Plan) -> tuple[list[Head], list[Scan]]:
         heads.append(Head(name, start, LineGeometry(), noise, (table.range_min_m, table.range_max_m)))
         fan = fan_of(table)
         motion = table.motion if table.kind == "oscillating" else "turning"
-        scans.append(Scan(fan.half_angle_rad, fan.rate_hz, table.scan_hz, motion))
+        facets = table.facets if table.kind == "polygon" else 1
+        scans.append(Scan(fan.half_angle_rad, fan.rate_hz, table.scan_hz, motion, facets))
     return heads, scans
 
 

@@ -13,7 +13,7 @@ from calib.features import ControlPoint
 from calib.flight import FlightError
 from calib.normals import TrajectoryWeight, normals
 from calib.parameters import Wish, unknowns
-from calib.plan import MOST_MADE, Scan, planned, predict
+from calib.plan import MOST_MADE, Scan, planned, predict, search_cell_m
 from calib.rows import Rows
 from calib.tie_rows import Ties
 from calib.trajectory_errors import apply, draw, gauss_markov
@@ -130,6 +130,30 @@ def test_a_lone_line_has_no_planes_but_with_control() -> None:
     near = replace(scanner(), range_gate=(20.0, 300.0))
     with pytest.raises(FlightError, match="no roof"):  # out of range
         planned(FRAME, [near], [scan], [trajectory], lines * 2, surfaces(), MOST_MADE)
+
+
+@pytest.mark.parametrize(
+    ("scan", "speed_mps", "cell_m"),
+    [
+        (Scan(0.5, 1e5), 50.0, 1.0),  # 5 a square metre
+        (Scan(0.5, 1e5, 100.0), 50.0, 1.0),
+        (Scan(0.5, 1e5, 12.5), 50.0, 6.0),  # 4 m between lines
+        (Scan(0.5, 1e5, 12.5, "sine"), 50.0, 3.0),  # two lines an oscillation
+        (Scan(0.5, 1e5, 12.5, "turning", 4), 50.0, 1.5),  # four a turn
+        (Scan(0.5, 1e5, 400.0), 50.0, 3.0),  # lines of pulses 1.6 m apart
+        (Scan(0.5, 1e4), 50.0, 4.0),  # 0.5 a square metre
+    ],
+)  # fmt: skip
+def test_cells_hold_several_lines(scan: Scan, speed_mps: float, cell_m: float) -> None:
+    """A swath 400 m wide, with the sizes of cells that a search chooses from."""
+    per_m2 = scan.rate_hz / (speed_mps * 400.0)
+    assert search_cell_m(scan, np.full(9, per_m2), speed_mps) == cell_m
+
+
+def test_roofs_lose_their_rims_and_the_more_the_larger_the_cells_are() -> None:
+    roof = replace(surfaces()[0], area_m2=100.0, kind="roof")
+    assert [roof.taken_m2(cell_m) for cell_m in (0.5, 1.0, 4.0, 12.0)] == [81.0, 81.0, 36.0, 0.0]
+    assert replace(roof, kind="ground").taken_m2(4.0) == 100.0
 
 
 def test_the_encoder_moves_as_the_scan_does() -> None:
