@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from daemon.config import Config, DeviceEntry
+from daemon.host_clock import ClockDiscipline, read_clock_discipline
 from daemon.identify import Heard, describe_time, not_understood
 from daemon.places import nearest_there
 from drivers.core.registry import find_driver
@@ -30,6 +31,7 @@ from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from drivers.transports.can_link import interface_bitrate
 from drivers.transports.uri import TransportSpec, open_transport, parse_pps
 from georef.records import ChunkBatch, TimeMessage
+from georef.timescales import ahead_s, distance_text
 
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
@@ -132,7 +134,7 @@ class Reading:
         if self.report.bytes:
             self.report.time = describe_time(self.entry, self.heard)
             self.report.problems += _answer_problems(self)
-            self.report.notes += lock_notes(self.entry, self.heard)
+            self.report.notes += lock_notes(self.entry, self.heard) + far_notes(self.heard, read_clock_discipline())
 
 
 class Wire:
@@ -332,6 +334,16 @@ def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
     port = "none came at auxiliary" if entry.auxiliary is not None else "want auxiliary"
     ports = "Velodyne port 8308, Hesai 10110"
     return [f"no position packet ({ports}) tells whether it is locked to its PPS: {port}; without, {taken}"]
+
+
+def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
+    """Say that a device's time is hours or days from this computer's clock: either may be the wrong one."""
+    message = heard.valid_time
+    ahead = None if message is None else ahead_s(message.time, message.host_time_ns)
+    if ahead is None:
+        return []
+    text = distance_text(ahead, kept=discipline.disciplined, clock="this computer's clock")
+    return [text] if text else []
 
 
 def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:

@@ -16,7 +16,7 @@ from daemon.host_clock import ClockDiscipline
 from drivers.core.parser import Parser
 from drivers.transports.base import UnitBlock
 from georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
-from georef.timescales import HostTimeline, PpsClock
+from georef.timescales import HostTimeline, PpsClock, WallComparison
 
 STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for thrice as long as ever before …
 STOPPED_LONGEST_NS = 60_000_000_000  # … or for so long
@@ -59,6 +59,8 @@ class TimeKeeper:
         self._events = events
         self._lock = threading.Lock()
         self._timeline = HostTimeline(host_minus_monotonic_ns)
+        self._beside_wall = WallComparison("this computer's clock")
+        self._far: set[str] = set()  # receivers of which it has been told that their time is far from that clock
         self._clocks: dict[str, PpsClock] = {}  # by the source that shows it: pps/main, gnss/rover
         self._sources: dict[str, _TimeSource] = {}
         self._failed: set[str] = set()
@@ -115,12 +117,21 @@ class TimeKeeper:
                 text = f"time messages again after {pause_ns * 1e-9:.0f} s"
                 self._events.post(Severity.INFO, time_source.source, "time_messages_back", text)
             for message in messages:
+                self._beside_wall.hear(time_source.source, message)
                 names = time_source.names_edge or message.names_edge
                 raw_ns = self._timeline.raw_at(message.host_time_ns)
                 time_source.clock.add_message(
                     time_source.source, replace(message, host_time_ns=raw_ns, names_edge=names)
                 )
+            self._tell_far(time_source.source)
             self._drain(time_source.source, time_source.clock)
+
+    def _tell_far(self, source: str) -> None:
+        """Tell once of a receiver whose time is hours or days from this computer's clock."""
+        text = "" if source in self._far else self._beside_wall.verdict(source)
+        if text:
+            self._far.add(source)
+            self._events.post(Severity.WARNING, source, "time_far_from_host", text)
 
     def _tell_remarks(self, time_source: _TimeSource) -> None:
         """Tell once what the parser takes otherwise than the receiver says it, or refuses."""
@@ -145,6 +156,8 @@ class TimeKeeper:
         raw_ns = int(sample["monotonic_raw_ns"])
         with self._defects_told("clock"), self._lock:
             self._timeline.add(realtime_ns, monotonic_ns, raw_ns)
+            step_ns = realtime_ns - monotonic_ns - self._timeline.host_minus_monotonic_ns
+            self._beside_wall.set_wall(step_ns, kept=discipline.disciplined)
             for clock in set(self._clocks.values()):
                 clock.set_wall_clock(
                     raw_ns, realtime_ns, disciplined=discipline.disciplined, sigma_s=discipline.max_error_s

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from georef.compiled import kept
 from georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
-from georef.timescales import ClockEvent, ClockStatus, DeviceClock, HostTimeline, PpsClock, Stamps, StampScale
+from georef.timescales import (
+    ClockEvent,
+    ClockStatus,
+    DeviceClock,
+    HostTimeline,
+    PpsClock,
+    Stamps,
+    StampScale,
+    WallComparison,
+)
 
 CELL_BITS = 24  # 16.8 ms of device time: within, a device's clock is taken as linear, which is good to 2 ns
 MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turned, are asked row by row
@@ -108,6 +117,7 @@ class HostClocks:
             self.by_source[source] = shared or PpsClock(
                 assumed_leap_seconds=gnss.leap_seconds, keep_history=keep_history
             )
+        self._beside_wall = WallComparison("the recording computer's clock", whole_log=True) if keep_history else None
         self._readings: deque[tuple[int, int, int, float]] = deque()
         self._spoken: list[tuple[int, bool, str, PpsEdge | TimeMessage]] = []
         # by a receiver: a wall clock decides between seconds, and is no time alone unless the caller takes it for one
@@ -138,6 +148,8 @@ class HostClocks:
             if isinstance(said, PpsEdge):
                 self.by_source[source].add_edge(raw_ns, said.sequence)
                 continue
+            if self._beside_wall is not None:
+                self._beside_wall.hear(source, said)
             names = self.plan.gnss[source].names_edge or said.names_edge
             self.by_source[source].add_message(source, replace(said, host_time_ns=raw_ns, names_edge=names))
             self._told.add(self.by_source[source])
@@ -148,7 +160,9 @@ class HostClocks:
         """Tell the clocks what the wall clock said up to a host time: as while recording, it may name a second."""
         readings, host_minus_ns = self._readings, self.timeline.host_minus_monotonic_ns
         while readings and (until_ns is None or readings[0][1] + host_minus_ns <= until_ns):
-            realtime_ns, _, raw_ns, max_error_s = readings.popleft()
+            realtime_ns, monotonic_ns, raw_ns, max_error_s = readings.popleft()
+            if self._beside_wall is not None:
+                self._beside_wall.set_wall(realtime_ns - monotonic_ns - host_minus_ns, kept=max_error_s < math.inf)
             for clock in self._told:
                 clock.set_wall_clock(raw_ns, realtime_ns, disciplined=math.isfinite(max_error_s), sigma_s=max_error_s)
 
@@ -162,8 +176,12 @@ class HostClocks:
         return self.by_source[source].gps_from_host(self.timeline.raw_from_host(host_ns))
 
     def settle(self) -> list[str]:
-        """Take the seconds that most messages of the whole log name, after all has been fed; lines for the user."""
-        return [line for clock in dict.fromkeys(self.by_source.values()) for line in clock.settle()]
+        """Take the seconds that most messages of the whole log name, after all has been fed; lines for the user.
+
+        A line also of each receiver whose time is hours or days from the recording computer's clock.
+        """
+        lines = [line for clock in dict.fromkeys(self.by_source.values()) for line in clock.settle()]
+        return lines + (self._beside_wall.lines() if self._beside_wall is not None else [])
 
     def tag_error_ns(self, source: str, host_ns: Int64Array, *, utc: bool) -> Int64Array:
         """Return by how much (n,) a receiver's tags of one scale were ahead that arrived at host times (n,)."""

@@ -32,6 +32,7 @@ from georef.timescales.gps_time import (
 from georef.timescales.host_timeline import HostTimeline
 from georef.timescales.pps_clock import PpsClock
 from georef.timescales.stamp_scale import Stamps, StampScale, judge
+from georef.timescales.wall_check import WallComparison, ahead_s, distance_text
 
 __all__ = [
     "DAY_NS",
@@ -52,7 +53,10 @@ __all__ = [
     "StampScale",
     "Stamps",
     "TimeState",
+    "WallComparison",
+    "ahead_s",
     "complete_time",
+    "distance_text",
     "full_week",
     "gps_ns_from_unix",
     "gps_ns_from_utc",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import gzip
 import json
 import os
@@ -407,6 +408,19 @@ class TestTime:
             report = check(gnss(path), tmp_path)["gnss/rover"]
         assert report.problems == ["its time is not valid (yet)"]
         assert report.time == "not valid"
+
+    def test_a_receiver_that_says_local_time_is_told_and_not_refused(self, tmp_path: Path) -> None:
+        """Two hours east of UTC, beside a clock that nobody keeps but that is set."""
+
+        def local(_: int) -> bytes:
+            now = dt.datetime.now(dt.UTC) + dt.timedelta(hours=2)
+            return nmea(f"GPRMC,{now:%H%M%S}.00,A,4730.0000,N,00900.0000,E,0.0,0.0,{now:%d%m%y},,,A")
+
+        with pty(local) as path:
+            report = check(gnss(path), tmp_path)["gnss/rover"]
+        assert report.problems == []
+        (note,) = report.notes
+        assert note.startswith("its time is 2 h ahead of this computer's clock")
 
     def test_a_scanner_that_sees_no_pps(self, tmp_path: Path) -> None:
         port = free_udp_port()

@@ -21,6 +21,7 @@ from tests.daemon.rig import session_table
 
 SECONDS = 40
 UNDISCIPLINED = ClockDiscipline(0.0, 0x40, 16.0)
+DISCIPLINED = ClockDiscipline(0.0, 0, 0.001)
 
 
 def assembled(folder: Path, gnss: str = "", pps: str = "") -> Assembly:
@@ -34,7 +35,7 @@ def assembled(folder: Path, gnss: str = "", pps: str = "") -> Assembly:
     return assemble(load_config(config))
 
 
-def play(assembly: Assembly) -> tuple[list[str], int]:
+def play(assembly: Assembly, discipline: ClockDiscipline = UNDISCIPLINED) -> tuple[list[str], int]:
     """Feed the recording; the state of the PPS at each edge, and the last edge's host time."""
     keeper, start_ns = assembly.timekeeper, assembly.clock.now_ns()
     units_seen, edge_seen = keeper.units_seen("gnss/rover"), keeper.edge_seen("pps/main")
@@ -46,7 +47,7 @@ def play(assembly: Assembly) -> tuple[list[str], int]:
         sample = {"realtime_ns": host_ns, "monotonic_ns": monotonic_ns, "monotonic_raw_ns": monotonic_ns}
         if unit.source == "pps/main":
             edge_ns = host_ns
-            keeper.clock_sample(sample, UNDISCIPLINED)
+            keeper.clock_sample(sample, discipline)
             edge_seen(host_ns, len(states) + 1)
             states.append(str(keeper.status("pps/main", host_ns)["time_state"]))
         else:
@@ -77,6 +78,16 @@ def test_recording_and_its_edges_are_locked(tmp_path: Path) -> None:
     assert assembly.timekeeper.status("scanner/left", edge_ns) == {}
     whole_s = gps_of(assembly, edge_ns) / SECOND_NS
     assert abs(whole_s - round(whole_s)) < 1e-6
+
+
+def test_a_receiver_far_from_a_clock_that_is_kept_is_told_once(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    caplog.set_level("INFO", "swath")
+    play(assembled(tmp_path / "x"), DISCIPLINED)  # a recording of another year, beside today's clock
+    (event,) = [event for event in journal_of(caplog) if event.code == "time_far_from_host"]
+    assert (event.source, event.severity) == ("gnss/rover", "warning")
+    assert "days behind this computer's clock (kept by" in event.text
 
 
 def test_delay_and_named_edge_of_the_configuration_are_honoured(tmp_path: Path) -> None:

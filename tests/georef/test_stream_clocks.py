@@ -59,3 +59,17 @@ def test_a_wall_clock_is_no_time_where_no_receiver_speaks() -> None:
     clocks = HostClocks(plan, keep_history=True)
     told(clocks, 100_000_000, 0.01, seconds=60, ticks_s=1)
     assert clocks.status("pps/main", HOST_NS + 60 * SECOND_NS).state is TimeState.NO_TIME
+
+
+def test_a_receiver_in_local_time_is_said_beside_the_clock_that_recorded_it() -> None:
+    plan = ClockPlan(OFFSET_NS - 7200 * SECOND_NS, pps={"pps/main": PpsPlan(18)}, gnss={"gnss/rover": GnssPlan(None)})
+    clocks = HostClocks(plan, keep_history=True)
+    for second in range(30):
+        host_ns = HOST_NS + (second - 7200) * SECOND_NS
+        monotonic_ns = host_ns - plan.host_minus_monotonic_ns
+        clocks.add_reading(host_ns, monotonic_ns, monotonic_ns, 0.01)
+        tag = TimeTag(TimeScale.UTC, 12 * HOUR_NS + second * SECOND_NS, date=DATE)
+        clocks.add_message("gnss/rover", TimeMessage(host_ns, tag, NamesEdge.PREVIOUS, message="RMC"))
+    clocks.update()
+    (line,) = clocks.settle()
+    assert line.startswith("gnss/rover: its time is 2 h ahead of the recording computer's clock")
