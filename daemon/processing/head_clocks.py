@@ -8,9 +8,11 @@ where no receiver is in the log.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.log.reader import PartDamage
 from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
@@ -34,12 +36,14 @@ from georef.timescales import (
     utc_from_gps,
 )
 from georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
+from georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 
 if TYPE_CHECKING:
     from daemon.processing.setup import Setup
 
 LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
 PIECES = 12
+FOLLOWING_NS = 2 * SECOND_NS
 HOUR_NS = 3600 * SECOND_NS
 
 
@@ -115,14 +119,36 @@ def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | N
     """Return what stamps count from; None where the head itself says whether it is locked, or nobody knows the time."""
     assert plan.stamps is not None
     says = (rows["locked"] >= 0) | (rows["pps_time_ns"] >= 0)
+    brief = False
     if plan.past_utc_hour and plan.stamps is StampScale.AUTO:
-        rows, says = rows[~says], says[~says]
+        rows, brief = _before_it_says(rows, says)
+        says = says[:0]
     if plan.stamps is StampScale.AUTO and (says.any() or not len(rows)):
         return None
     gps_ns, sigma_ns = host.gps_from_host(plan.clock, rows["host_time_ns"])
     sigma_ns = np.where(sigma_ns <= COARSE_MAX_SIGMA_NS, sigma_ns, np.inf)
     leap = host.by_source[plan.clock].leap_seconds_at(int(gps_ns[-1])) if len(gps_ns) else 0
-    return judge(rows["device_time_ns"], gps_ns, sigma_ns, leap, past_hour=plan.past_utc_hour, wanted=plan.stamps)
+    found = judge(rows["device_time_ns"], gps_ns, sigma_ns, leap, past_hour=plan.past_utc_hour, wanted=plan.stamps)
+    return found if found is None else replace(found, brief=brief)
+
+
+def _before_it_says(rows: StructArray, says: NDArray[np.bool_]) -> tuple[StructArray, bool]:
+    """Return the rows from before a head says whether it is locked, and whether they are few.
+
+    Few of them show nothing by themselves. Where the head is locked as soon as it says something, and its stamps go on,
+    the rows that follow are judged along: a clock that the pulse set in between would have jumped.
+    """
+    host_ns, before = rows["host_time_ns"], ~says
+    if not before.any() or np.ptp(host_ns[before]) >= LEAST_SPAN_S * SECOND_NS:
+        return rows[before], False
+    following = says & (host_ns <= host_ns[before].max() + FOLLOWING_NS)
+    if not following.any() or (rows["locked"][following] != 1).any():
+        return rows[before], True
+    late_ns = host_ns - rows["device_time_ns"]
+    late_ns = (late_ns - late_ns[following][0] + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2
+    early = before & (host_ns < host_ns[following].min())  # a chunk's returns may be read before its position packets
+    goes_on = not early.any() or abs(late_ns[early].min() - late_ns[following].min()) <= AHEAD_NS
+    return rows[before | following] if goes_on else rows[early], True
 
 
 def _tell_by_stamps(source: str, plan: DevicePlan, rows: StructArray, host: HostClocks) -> None:
@@ -154,7 +180,10 @@ def _leap_at(unix_ns: int) -> int:
 
 
 def stamp_lines(clocks: FrozenClocks) -> list[str]:
-    """Return a line of each scanner whose stamps or sentences are the time, for the user: which, and why."""
+    """Return a line of each scanner whose stamps or sentences are the time, for the user: which, and why.
+
+    None of stamps that only came less than a second before the head said itself that it is locked.
+    """
     host = clocks.host
     own = [source for source, plan in host.plan.devices.items() if plan.clock == source]
     lines = [
@@ -166,5 +195,5 @@ def stamp_lines(clocks: FrozenClocks) -> list[str]:
     return lines + [
         f"{source}: its stamps are taken as {found.scale.value}: {found.text}"
         for source, found in sorted(clocks.stamps.items())
-        if found.scale is not StampScale.FREE
+        if found.scale is not StampScale.FREE and not found.brief
     ]

@@ -44,12 +44,14 @@ class Stamps:
     """What a head's stamps were found, or are configured, to be.
 
     offset_ns: GPS time less stamp, of absolute stamps. sigma_ns: of one stamp. text: why, with the figures.
+    brief: they are of less than a second, before the head itself said what they are.
     """
 
     scale: StampScale
     text: str
     offset_ns: int = 0
     sigma_ns: float = LOCKED_SIGMA_NS
+    brief: bool = False
 
 
 def judge(

@@ -118,7 +118,7 @@ def found(folder: Path, text: str, units: Iterable[tuple[str, int, bytes]]) -> t
     return setup, find_stamps(index_log(session), setup, read_clocks(session, setup).clocks.host)
 
 
-def errors_ns(clocks: FrozenClocks, stamps_ns: list[int], locked: int) -> tuple[list[int], float]:
+def errors_ns(clocks: FrozenClocks, stamps_ns: list[int], locked: int | list[int]) -> tuple[list[int], float]:
     """Errors of stamps every 50 ms over the log, placed as a job places them, and the greatest sigma."""
     times = START_UNIX_NS + np.arange(SECONDS * 20, dtype=np.int64) * NS // 20
     rows = np.zeros(len(times), DEVICE_CLOCK_DTYPE)
@@ -170,6 +170,33 @@ def test_position_packets_are_the_clock_where_no_receiver_is_in_the_log(tmp_path
     (line,) = stamp_lines(clocks)
     assert "scanner/top: no receiver is in the log: GPS time is by the head's own sentences" in line
     assert "18 leap seconds" in line
+
+
+@pytest.mark.parametrize("receives", [False, True])
+def test_stamps_just_before_the_first_position_packet_are_judged_by_what_follows(
+    tmp_path: Path, receives: bool
+) -> None:
+    """The first position packet comes 0.75 s after the first returns and says that the head is locked."""
+    units = [*velodyne(), *positions(), *(receiver() if receives else ())]
+    text = RECEIVER + WITH_AUX + 'pps = "main"\n' if receives else WITH_AUX
+    _, clocks = found(tmp_path, text, units)
+    error, sigma_ns = errors_ns(clocks, HOURS, [-1] * 15 + [1] * (len(HOURS) - 15))
+    assert max(map(abs, error)) < 1_000
+    assert sigma_ns == 20_000.0
+    assert not [line for line in stamp_lines(clocks) if "utc-hour" in line]  # the head says so itself
+
+
+@pytest.mark.parametrize("off_us", [300_000, -40_000])
+def test_stamps_that_jump_where_the_head_says_that_it_is_locked_are_not_taken(tmp_path: Path, off_us: int) -> None:
+    """A counter before the pulse set it, 0.3 s or, by chance, 40 ms beside the hour."""
+    first_said_ns = min(at_ns for _, at_ns, _ in positions())
+    early = [unit for unit in velodyne(off_us) if unit[1] < first_said_ns]
+    units = [*early, *(unit for unit in velodyne() if unit[1] > first_said_ns), *positions(), *receiver()]
+    _, clocks = found(tmp_path, RECEIVER + WITH_AUX + 'pps = "main"\n', units)
+    stamps = [(hour + off_us * 1000) % (3600 * NS) for hour in HOURS[:15]] + HOURS[15:]
+    error, _ = errors_ns(clocks, stamps, [-1] * 15 + [1] * (len(HOURS) - 15))
+    assert max(map(abs, error[15:])) < 1_000
+    assert "scanner/top" not in clocks.stamps or clocks.stamps["scanner/top"].scale is StampScale.FREE
 
 
 def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:
