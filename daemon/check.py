@@ -322,9 +322,16 @@ def _answer_problems(reading: Reading) -> list[str]:
 
 
 def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
-    """Say where nothing tells whether a scanner is locked to its PPS, and so whether its stamps can be used."""
-    if entry.kind != "scanner" or heard.sees_pps is not None or not heard.counts["DeviceClockSamples"]:
+    """Say where a scanner is not locked to its PPS or nothing tells whether it is: whether its stamps can be used."""
+    if entry.kind != "scanner" or not heard.counts["DeviceClockSamples"]:
         return []
+    if heard.sees_pps:
+        void = heard.time_messages and heard.valid_time is None
+        return ["the sentences at its input are void: want their receiver to have a fix"] if void else []
+    if heard.sees_pps is not None:
+        return (
+            [] if entry.pps is not None else ["it says that no pulse reaches it; want the receiver's PPS wired to it"]
+        )
     clock = entry.settings.config.get("clock", "auto")
     if clock != "auto":
         return [f'nothing tells whether it is locked; its stamps are taken as configured (clock = "{clock}")']

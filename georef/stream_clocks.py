@@ -302,6 +302,18 @@ class StreamClocks:
         return self._devices[source].status().refused
 
 
+@dataclass(frozen=True, slots=True)
+class HeadTime:
+    """What a scanner itself says of time in a log.
+
+    messages: sentences or packets that it vouches for. trouble: why its time cannot be used, and the remedy; empty: it
+    can, or it says nothing.
+    """
+
+    messages: int = 0
+    trouble: str = ""
+
+
 @dataclass(frozen=True)
 class FrozenClocks:
     """The host's clocks after all of a log has been fed to them; each stream gets its own devices' clocks beside.
@@ -312,10 +324,17 @@ class FrozenClocks:
     Attributes:
         host: the host's.
         stamps: what devices' stamps count from, by source, as the whole log shows it.
+        heads: what scanners say of time themselves, by source; none that was not asked.
     """
 
     host: HostClocks
     stamps: Mapping[str, Stamps] = field(default_factory=dict)
+    heads: Mapping[str, HeadTime] = field(default_factory=dict)
+
+    def trouble(self, source: str | None) -> str:
+        """Return why what a scanner says of time cannot be used; empty: it can, or it says nothing."""
+        head = self.heads.get(source or "")
+        return "" if head is None else head.trouble
 
     def for_stream(self) -> StreamClocks:
         """Clocks for one stream over any piece of the log."""

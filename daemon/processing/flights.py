@@ -228,7 +228,8 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
-    refusals.refuse_no_time(log, flight.clock, flight.status(flight.host_span[1]), setup.config, clocks.remarks)
+    status, trouble = flight.status(flight.host_span[1]), clocks.clocks.trouble(flight.clock)
+    refusals.refuse_no_time(log, flight.clock, status, setup.config, clocks.remarks, trouble)
     flight.troubles += [f"{log}: {remark}" for remark in [*clocks.remarks, *stamp_lines(clocks.clocks)]]
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)

@@ -21,11 +21,12 @@ from georef.records import (
     DEVICE_CLOCK_DTYPE,
     ChunkBatch,
     DeviceClockSamples,
+    DeviceStatus,
     Record,
     StructArray,
     TimeMessage,
 )
-from georef.stream_clocks import DevicePlan, FrozenClocks, HostClocks
+from georef.stream_clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
 from georef.timescales import (
     SECOND_NS,
     Stamps,
@@ -35,6 +36,7 @@ from georef.timescales import (
     table_leap_seconds,
     utc_from_gps,
 )
+from georef.timescales.coarse import SETTLED_SPAN_NS
 from georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
 from georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
 PIECES = 12
 FOLLOWING_NS = 2 * SECOND_NS
+LEAST_SENTENCES_NS = SETTLED_SPAN_NS
 HOUR_NS = 3600 * SECOND_NS
 
 
@@ -64,6 +67,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
             host.add_message(source, message)
     host.update()
     stamps: dict[str, Stamps] = {}
+    heads: dict[str, HeadTime] = {}
     for source, plan in plans.items():
         rows = read.rows(source)
         if source in own and len(rows):
@@ -71,7 +75,9 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
         found = _judged(plan, rows, host)
         if found is not None:
             stamps[source] = found
-    return FrozenClocks(host, stamps)
+        messages = sum(message.valid for message in read.messages[source])
+        heads[source] = HeadTime(messages, _trouble(read, source, own=source in own))
+    return FrozenClocks(host, stamps, heads)
 
 
 def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
@@ -89,6 +95,7 @@ class _Reader:
 
     def __init__(self, setup: Setup, plans: dict[str, DevicePlan]) -> None:
         self.messages: dict[str, list[TimeMessage]] = {source: [] for source in plans}
+        self.statuses: dict[str, list[DeviceStatus]] = {source: [] for source in plans}
         self._rows: dict[str, list[StructArray]] = {source: [] for source in plans}
         self._parsers = {source: parser for source, parser in setup.scanner_time_parsers().items() if source in plans}
 
@@ -107,12 +114,52 @@ class _Reader:
         for record in records:
             if isinstance(record, TimeMessage):
                 self.messages[source].append(record)
+            elif isinstance(record, DeviceStatus):
+                self.statuses[source].append(record)
             elif isinstance(record, DeviceClockSamples):
                 self._rows[source].append(record.rows)
 
     def rows(self, source: str) -> StructArray:
         """Return all clock samples of a scanner."""
         return np.concatenate(self._rows[source] or [np.empty(0, DEVICE_CLOCK_DTYPE)])
+
+
+def _trouble(read: _Reader, source: str, *, own: bool) -> str:
+    """Return why what a head says of time cannot be used, and the remedy; empty: it can, or it says nothing.
+
+    Args:
+        read: what it says.
+        source: the head.
+        own: no receiver is in the log: the head's sentences would be its clock.
+    """
+    locked = read.rows(source)["locked"]
+    if not (locked >= 0).any():
+        return ""
+    facts = []
+    if not (locked == 1).any():
+        states = {str(status.values["pps_status"]) for status in read.statuses[source] if "pps_status" in status.values}
+        if states <= {"absent"}:
+            facts.append("says that no pulse reaches it; want the receiver's PPS wired to it")
+        else:
+            facts.append(f"says that it is not locked to its pulse ({', '.join(sorted(states))}); want a steady PPS")
+    messages = read.messages[source]
+    valid = [message.host_time_ns for message in messages if message.valid]
+    if own and not messages:
+        facts.append("passes on no NMEA sentence that names a time; want RMC of a receiver with a fix at its input")
+    elif own and not valid and any(is_void(status) for status in read.statuses[source]):
+        facts.append(
+            f"passes on {len(messages):,} sentences, all void (no fix yet); want the receiver's antenna under open "
+            "sky, and a recording that begins with its fix"
+        )
+    elif own and valid and valid[-1] - valid[0] < LEAST_SENTENCES_NS:
+        span_s = (valid[-1] - valid[0]) / SECOND_NS
+        facts.append(f"names the time over {span_s:.0f} s only; want {LEAST_SENTENCES_NS // SECOND_NS} s of sentences")
+    return "; it ".join(facts)
+
+
+def is_void(status: DeviceStatus) -> bool:
+    """Whether a head says that the sentences of its receiver have no fix."""
+    return status.values.get("nmea_valid") is False or status.values.get("gps_status") in ("invalid", "none")
 
 
 def _judged(plan: DevicePlan, rows: StructArray, host: HostClocks) -> Stamps | None:
@@ -187,7 +234,7 @@ def stamp_lines(clocks: FrozenClocks) -> list[str]:
     host = clocks.host
     own = [source for source, plan in host.plan.devices.items() if plan.clock == source]
     lines = [
-        f"{source}: no receiver is in the log: GPS time is by the head's own sentences and stamps, with "
+        f"{source}: no receiver is in the log: GPS time is by {_own_words(clocks, source)}, with "
         f"{host.by_source[source].leap_seconds_at(near_ns)} leap seconds"
         for source in sorted(own)
         if (near_ns := host.by_source[source].coarse_gps_ns()) is not None
@@ -197,3 +244,13 @@ def stamp_lines(clocks: FrozenClocks) -> list[str]:
         for source, found in sorted(clocks.stamps.items())
         if found.scale is not StampScale.FREE and not found.brief
     ]
+
+
+def _own_words(clocks: FrozenClocks, source: str) -> str:
+    """Say what of a head is its clock."""
+    head, found = clocks.heads.get(source), clocks.stamps.get(source)
+    if head is not None and head.messages:
+        return "the head's own sentences and stamps"
+    if found is not None and found.scale is StampScale.HOUR:
+        return "the head's own stamps, as configured, and the hour by the recording computer's clock"
+    return "the head's own stamps, as configured"

@@ -257,7 +257,8 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
                 fates.update(result.fates.get(name, {}))
                 refused.update(result.time_refused.get(name, {}))
             stamps = flight.clocks.clocks.stamps.get(f"scanner/{name}")
-            flight.holes += refusals.time_troubles(flight.log, name, fates, refused, status, stamps)
+            trouble = flight.clocks.clocks.trouble(f"scanner/{name}")
+            flight.holes += refusals.time_troubles(flight.log, name, fates, refused, status, stamps, trouble)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
         lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]

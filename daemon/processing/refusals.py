@@ -173,7 +173,12 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
 
 
 def refuse_no_time(
-    log: Path, clock: str | None, status: ClockStatus | None, config: Config, remarks: Sequence[str] = ()
+    log: Path,
+    clock: str | None,
+    status: ClockStatus | None,
+    config: Config,
+    remarks: Sequence[str] = (),
+    trouble: str = "",
 ) -> None:
     """The log's own clock must be known well enough to say which second a pulse belongs to.
 
@@ -183,10 +188,13 @@ def refuse_no_time(
         status: of that clock at the end.
         config: of the session.
         remarks: what the receivers' parsers have to say.
+        trouble: why what the head says of time cannot be used, where the clock is a head's own.
 
     Raises:
         UserError: it is not, and why.
     """
+    if trouble and status is not None and status.state is TimeState.NO_TIME:
+        raise UserError(f"{log}: {clock}: no receiver is in the log, and the head {trouble}")
     if status is None or clock is None or (clock.startswith("scanner/") and status.state is TimeState.NO_TIME):
         key = "" if clock is None else f"{clock.replace('/', '.')}.clock"
         hint = (
@@ -222,6 +230,7 @@ def time_troubles(
     refused: Mapping[str, int],
     status: ClockStatus | None,
     stamps: Stamps | None = None,
+    trouble: str = "",
 ) -> list[str]:
     """Lines for returns that have no time good enough, and why; empty: few or none.
 
@@ -232,6 +241,7 @@ def time_troubles(
         refused: stamps that its clock did not believe, by reason.
         status: of the host's clock.
         stamps: what its stamps were found to count from; None: it says itself whether it is locked, or nobody knew.
+        trouble: why what it says of time itself cannot be used; empty: it can, or it says nothing.
     """
     total = sum(fates.values())
     lost = fates.get(NO_TIME, 0)
@@ -243,6 +253,8 @@ def time_troubles(
             f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to another "
             "second; want the NMEA sentences and the pulse of one receiver at the head"
         ]
+    if trouble:
+        return [f"{told}: the head {trouble}"]
     if status is not None and status.state not in GOOD_STATES:
         return [f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"]
     if refused.get("spacing"):

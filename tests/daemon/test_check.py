@@ -27,6 +27,7 @@ from daemon.identify import describe_tag, identify
 from drivers.core.can_frames import encode_can_frame
 from drivers.core.parser import DeviceSettings
 from drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
 from drivers.transports.capture_file import read_pcap
 from drivers.transports.uri import parse_transport
 from georef.records import ChunkBatch, TimeScale, TimeTag
@@ -131,6 +132,30 @@ class TestAllWell:
         assert reports["scanner/roof"].time in {"PPS seen", "2016-01-21 08:18:02 UTC (position RMC)"}
         assert reports["scanner/roof"].problems == []
         assert reports["scanner/roof/aux"].bytes == 512 * reports["scanner/roof/aux"].units > 0
+
+    @pytest.mark.parametrize(
+        ("pps", "status", "said"),
+        [
+            (PPS_LOCKED, "V", "the sentences at its input are void: want their receiver to have a fix"),
+            (PPS_ABSENT, "A", "it says that no pulse reaches it; want the receiver's PPS wired to it"),
+        ],
+    )
+    def test_a_head_without_fix_or_pulse_is_said(self, tmp_path: Path, pps: int, status: str, said: str) -> None:
+        data, position = free_udp_port(), free_udp_port()
+        recorded = list(read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz"))
+        packets = [unit.data for unit in recorded if len(unit.data) == 1206]
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
+            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
+        )
+
+        def told(second: int) -> bytes:
+            sentence = nmea(f"GPRMC,1015{second % 60:02}.00,{status},4730.0,N,00900.0,E,0.0,0.0,211126,,,A").decode()
+            return encode_position_packet((15 * 60 + second % 60) * 1_000_000, pps, sentence.strip())
+
+        with udp_sender(data, lambda n: packets[n % len(packets)]), udp_sender(position, told):
+            (note,) = check(text, tmp_path, 0.5)["scanner/roof"].notes
+        assert note == said
 
     def test_it_is_said_where_nothing_tells_whether_a_head_is_locked(self, tmp_path: Path) -> None:
         """The same head with its data port alone: auxiliary is named; a configured clock is named instead."""

@@ -21,11 +21,11 @@ from daemon.log.reader import open_logs
 from daemon.processing.feed import read_clocks
 from daemon.processing.head_clocks import find_stamps, stamp_lines
 from daemon.processing.log_index import index_log
-from daemon.processing.refusals import refuse_no_time
+from daemon.processing.refusals import refuse_no_time, time_troubles
 from daemon.processing.setup import Setup
 from drivers.scanner.hesai import encode_point_packet
 from drivers.scanner.velodyne import encode_data_packet
-from drivers.scanner.velodyne_position import PPS_LOCKED, encode_position_packet
+from drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
 from georef.records import DEVICE_CLOCK_DTYPE
 from georef.stream_clocks import FrozenClocks
 from georef.timescales import StampScale
@@ -79,13 +79,14 @@ def velodyne(off_us: int = 0, *, goes_on: bool = False) -> Units:
     return units
 
 
-def positions(*, goes_on: bool = False) -> Units:
-    """Two position packets a second, locked, with the sentence of the second."""
+def positions(*, goes_on: bool = False, pps: int = PPS_LOCKED, status: str | None = "A") -> Units:
+    """Two position packets a second with the sentence of the second, of a fix or void; None: no sentence."""
     units: Units = []
     for half in range(1, 2 * SECONDS):
         unix_us = START_UNIX_NS // 1000 + half * 500_000 + 250_000
         stamp_us = past_hour_us(unix_us, goes_on=goes_on)
-        data = encode_position_packet(stamp_us, PPS_LOCKED, rmc((half * 500 + 250) // 1000).decode())
+        sentence = "" if status is None else rmc((half * 500 + 250) // 1000, status).decode()
+        data = encode_position_packet(stamp_us, pps, sentence)
         units.append(("scanner/top/aux", unix_us * 1000 + LATENCY_NS, data))
     return units
 
@@ -211,6 +212,49 @@ def test_a_configured_hour_needs_neither_receiver_nor_position_packets(tmp_path:
     _, clocks = found(tmp_path, VLP16 + 'clock = "utc-hour"\n', velodyne())
     error, _ = errors_ns(clocks, HOURS, -1)
     assert max(map(abs, error)) < 1_000
+    (line, _) = stamp_lines(clocks)
+    assert "by the head's own stamps, as configured, and the hour by the recording computer's clock" in line
+    assert "sentences" not in line
+
+
+@pytest.mark.parametrize(
+    ("pps", "status", "words"),
+    [
+        (PPS_LOCKED, "V", r"passes on 20 sentences, all void \(no fix yet\); want the receiver's antenna under open"),
+        (PPS_LOCKED, None, "passes on no NMEA sentence that names a time; want RMC"),
+        (
+            PPS_ABSENT,
+            "V",
+            "says that no pulse reaches it; want the receiver's PPS wired to it; it passes on 19 sen",
+        ),
+        (PPS_SYNCHRONIZING, None, r"says that it is not locked to its pulse \(synchronizing\); want a steady PPS"),
+    ],
+)
+def test_a_head_without_fix_or_pulse_is_refused_by_that(
+    tmp_path: Path, pps: int, status: str | None, words: str
+) -> None:
+    setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(pps=pps, status=status)])
+    plan = clocks.host.plan.devices["scanner/top"]
+    state, trouble = clocks.host.status(plan.clock, START_UNIX_NS + 20 * NS), clocks.trouble(plan.clock)
+    with pytest.raises(UserError, match="no receiver is in the log, and the head " + words) as refused:
+        refuse_no_time(tmp_path, plan.clock, state, setup.config, (), trouble)
+    assert "configuration" not in refused.value.message
+
+
+@pytest.mark.parametrize("status", ["A", "V"])
+def test_a_head_without_pulse_beside_a_receiver_is_told_by_that(tmp_path: Path, status: str) -> None:
+    """What the head's own sentences say does not matter then."""
+    units = [*receiver(), *velodyne(12_345_678), *positions(pps=PPS_ABSENT, status=status)]
+    _, clocks = found(tmp_path, RECEIVER + WITH_AUX + 'pps = "main"\n', units)
+    state = clocks.host.status("pps/main", START_UNIX_NS + 20 * NS)
+    trouble = clocks.trouble("scanner/top")
+    (line,) = time_troubles(tmp_path, "top", {"no_time": 9, "georeferenced": 1}, {}, state, None, trouble)
+    assert line.endswith("the head says that no pulse reaches it; want the receiver's PPS wired to it")
+
+
+def test_a_head_with_fix_and_pulse_is_in_no_trouble(tmp_path: Path) -> None:
+    _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions()])
+    assert clocks.trouble("scanner/top") == ""
 
 
 def test_a_head_that_says_nothing_and_no_receiver_is_refused_with_what_would_do(tmp_path: Path) -> None:
