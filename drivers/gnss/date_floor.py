@@ -127,11 +127,11 @@ class ReceiverDates:
         lines = []
         if self._moved is not None:
             said, taken = self._moved
-            weeks = (taken - said).days // 7
+            behind = (taken - said).days // ROLLOVER_DAYS
             why = "gnss.….add_weeks says so" if self._add_weeks else "the host's clock shows that day"
             lines.append(
-                f"{self._source}: says {said}, {weeks // ROLLOVER_WEEKS} roll-over of {ROLLOVER_WEEKS} weeks behind: "
-                f"taken as {taken}, for {why}"
+                f"{self._source}: says {said}, {behind} roll-over{'s' if behind > 1 else ''} of {ROLLOVER_WEEKS} weeks "
+                f"behind: taken as {taken}, for {why}"
             )
         if self._refused is not None:
             said, host = self._refused

@@ -115,6 +115,39 @@ def test_a_receiver_one_rollover_behind_is_not_believed_and_counted() -> None:
     assert [fix.time.date for fix in fixes(records)] == [None]
 
 
+def test_a_receiver_one_rollover_behind_is_set_right_by_the_hosts_day() -> None:
+    """The same on a computer whose clock is right: the date is the one that gpsd has for the sentence."""
+    (report,) = [report for report in gpsd_reports("nmea", "april6_2019.log") if "time" in report]
+    at = dt.datetime.fromisoformat(str(report["time"]))
+    parser = make()
+    records = parser.feed(Chunk("gnss/test", int(at.timestamp() * S), recording("nmea", "april6_2019.log")))
+    records += parser.close()
+    (message,) = times(records)
+    assert (message.valid, message.time.date) == (True, at.date())
+    assert [fix.time.date for fix in fixes(records) if fix.valid and fix.time.date] == [at.date()]
+    assert parser.counters.errors["date_before_floor"] == 0
+    assert parser.remarks() == [
+        "gnss/test: says 1999-08-22, 1 roll-over of 1024 weeks behind: taken as 2019-04-07, for the host's clock shows "
+        "that day"
+    ]
+
+
+@pytest.mark.parametrize("weeks", [1024, 2048])
+@pytest.mark.parametrize("name", ["RMC", "ZDA"])
+def test_dates_roll_overs_behind_are_set_right(weeks: int, name: str) -> None:
+    """RMC says the year in two digits: 1987 and 2007 before 2026."""
+    said, time = DAY - dt.timedelta(weeks=weeks), 12 * 3600 * S
+    sentences = {"RMC": nmea.encode_rmc(time, said, *POSITION, 1.0, 0.0), "ZDA": nmea.encode_zda(time, said)}
+    host_ns = int(dt.datetime(DAY.year, DAY.month, DAY.day, 12, tzinfo=dt.UTC).timestamp()) * S
+    parser = make()
+    records = parser.feed(Chunk("gnss/test", host_ns, sentences[name])) + parser.close()
+    (message,) = times(records)
+    assert (message.valid, message.time.date) == (True, DAY)
+    (line,) = parser.remarks()
+    behind = "1 roll-over of" if weeks == 1024 else "2 roll-overs of"
+    assert f"says {said}, {behind} 1024 weeks behind: taken as 2026-11-21" in line
+
+
 def test_however_it_is_cut() -> None:
     outcome = check_stream(make, recording("nmea", "ublox-8.log"))
     assert outcome.counters["bad_checksums"] == outcome.counters["bad_messages"] == 0
