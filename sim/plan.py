@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from georef.text_encoding import decoded
 from georef.timescales import gps_ns_from_unix, table_leap_seconds
 from georef.toml_tables import TomlError, toml_tables
 from sim.errors import PlanError
@@ -58,7 +59,7 @@ def load_plan(name: str | Path) -> Plan:
         text = (resources.files("sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
         return parse_plan(text, Path.cwd())
     try:
-        text = path.read_text(encoding="utf-8")
+        text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "is not UTF-8"
         presets = ", ".join(PRESETS)

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = {"daemon": daemon, "drivers": drivers, "georef": georef, "calib": calib, "sim": sim}
 LARGEST_FILE_BYTES = 2_000_000
 LARGEST_CHECKOUT_BYTES = 60_000_000
-SHARED_OF_GEOREF = {"georef.records", "georef.timescales", "georef.toml_tables"}
+SHARED_OF_GEOREF = {"georef.records", "georef.text_encoding", "georef.timescales", "georef.toml_tables"}
 PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "calib"}
 
 

@@ -19,6 +19,7 @@ from daemon.cli.options import (
 )
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
+from daemon.text_files import text_of
 
 
 def command(
@@ -108,11 +109,7 @@ def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
     for entry in given:
         named, equals, rest = entry.partition("=")
         file = Path(rest if equals else entry)
-        try:
-            text = file.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a calibration file"
-            raise UserError(f"{file}: cannot be read: {why}", ExitCode.IO) from error
+        text = text_of(file, "a calibration file")
         scanner = named if equals else _scanner_of(text, file)
         if scanner in found:
             raise UserError(f"{file}: is the second calibration of scanner {scanner}", ExitCode.USAGE)

@@ -13,6 +13,7 @@ import typer
 from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from daemon.errors import ExitCode, UserError, one_line
 from daemon.processing.installed import require_installed
+from daemon.text_files import text_of
 
 
 def command(
@@ -73,7 +74,7 @@ def command(
     if record is not None and not (logs and output):
         raise UserError("--record: is written anew with what logs say; want LOG… and --output DIR", ExitCode.USAGE)
     files = [calibration, *(also or [])]
-    given = {read_file(path).scanner: (path.read_text(encoding="utf-8"), str(path)) for path in files}
+    given = {read_file(path).scanner: (text_of(path, "a calibration file"), str(path)) for path in files}
     if len(given) < len(files):
         raise UserError(f"{files[-1]}: is the second calibration of one scanner; want one a scanner", ExitCode.USAGE)
     wish = ValidateWish(

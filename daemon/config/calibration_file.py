@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.config.tables import ScannerConfig
+from georef.text_encoding import decoded
 from georef.toml_tables import TomlError, toml_tables
 
 CONVENTIONS_VERSION = 1
@@ -30,7 +31,7 @@ NEEDED_PARAMETERS = (
 def check_calibration(path: Path, scanner: str, table: ScannerConfig) -> Iterator[str]:
     """Findings of a calibration file for the scanner of that name: what is wrong, what would be right."""
     try:
-        document = toml_tables(path.read_bytes().decode("utf-8"))
+        document = toml_tables(decoded(path.read_bytes()))
     except UnicodeDecodeError as error:
         yield f"not TOML: {error}"
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import json
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from daemon.config.checks import check_devices
 from daemon.config.config import Config
 from daemon.config.tables import Tables
 from daemon.errors import ConfigError, ExitCode, UserError
+from georef.text_encoding import decoded
 from georef.toml_tables import TomlError, toml_tables
 
 MAX_CONFIG_BYTES = 4 * 1024 * 1024  # no sane configuration is larger; a log given by mistake is not read whole
@@ -54,7 +54,7 @@ def load_config(path: str | Path) -> Config:
     if len(content) > MAX_CONFIG_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_CONFIG_BYTES} bytes; want a TOML file of keys")
     try:
-        text = content.removeprefix(codecs.BOM_UTF8).decode("utf-8")
+        text = decoded(content)
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise ConfigError(f"{file}: line {line}: not UTF-8 text; want a TOML file") from error

@@ -21,8 +21,9 @@ from calib.control_doubts import doubts
 from calib.features import ControlPoint, Features
 from calib.flight import Flight
 from calib.picked_points import picked_ties, read_picked
-from daemon.errors import ExitCode, UserError
+from daemon.errors import UserError
 from daemon.processing.calibration_flight import KeptFlight
+from daemon.text_files import text_of
 
 FloatArray = NDArray[np.float64]
 
@@ -34,15 +35,6 @@ _WANT = 'want "POLYGON ((x y, x y, x y, x y))", one ring, no holes'
 
 class PolygonError(ValueError):
     """A file of polygons that cannot be used; one line for the user."""
-
-
-def text_of(path: Path, want: str = "CSV") -> str:
-    """Of a file that is to be such a one; UserError where there is none."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or f"no text; want {want}"
-        raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
 
 
 def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[tuple[ControlPoint, ...], list[str]]:

@@ -9,10 +9,10 @@ import numpy as np
 from calib.record import RecordError, told_value
 from calib.record_values import Plain, Value
 from daemon.errors import UserError
-from daemon.processing.calibrate_inputs import text_of
 from daemon.processing.calibration_flight import KeptFlight
 from daemon.processing.navigate import Navigated
 from daemon.processing.navigation_series import used_positions
+from daemon.text_files import text_of
 from georef.timescales import SECOND_NS
 from georef.toml_tables import TomlError, key_text, toml_tables
 
@@ -24,7 +24,7 @@ def facts_of(file: Path) -> dict[str, Plain]:
         UserError: it is no such file, or something in it is no attribute or not what the attribute takes.
     """
     try:
-        tables = toml_tables(text_of(file, "TOML"))
+        tables = toml_tables(text_of(file, "a TOML file"))
     except TomlError as error:
         raise UserError(f"{file}: {error}") from error
     facts: dict[str, Plain] = {}

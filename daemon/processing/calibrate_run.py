@@ -40,7 +40,7 @@ from calib.report_input import Finding
 from calib.report_words import number, unknown
 from calib.trajectory_errors import TrajectoryPrior, gauss_markov
 from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_inputs import PolygonError, rings_of, text_of, ties_of
+from daemon.processing.calibrate_inputs import PolygonError, rings_of, ties_of
 from daemon.processing.calibration_flight import (
     KeptFlight,
     read_flight,
@@ -52,6 +52,7 @@ from daemon.processing.carried_verdict import told_before
 from daemon.processing.flights import Wish, trajectory_verdicts_of
 from daemon.processing.strips_run import refuse_installations
 from daemon.processing.user_errors import told_in_a_line
+from daemon.text_files import text_of
 from georef.calibration import Calibration
 from georef.mapping import MappingError
 from georef.strips import StripError

@@ -24,6 +24,7 @@ from daemon.processing.flown import TrajectoryWish, choose_trajectory
 from daemon.processing.head_clocks import find_stamps, stamp_lines
 from daemon.processing.log_index import Listening, LogIndex, index_log
 from daemon.processing.setup import Options, Setup
+from daemon.text_files import text_of
 from georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
 from georef.trajectory import Trajectory
 
@@ -298,12 +299,9 @@ def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
 
 
 def _given_strips(name: str) -> list[Span]:
-    try:
-        return read_strips(Path(name).read_text(encoding="utf-8-sig"), name)
-    except FileNotFoundError:
-        raise UserError(f"--strips {name}: no such file; want auto, whole or a CSV file", ExitCode.IO) from None
-    except UnicodeDecodeError:
-        raise UserError(f"{name}: no text; want a CSV file with start_gps_ns,end_gps_ns", ExitCode.IO) from None
+    if not Path(name).exists():
+        raise UserError(f"--strips {name}: no such file; want auto, whole or a CSV file", ExitCode.IO)
+    return read_strips(text_of(Path(name), "a CSV file with start_gps_ns,end_gps_ns"), name)
 
 
 def _strips(wish: Wish, flight: Flight, given: Sequence[Span] | None) -> list[Span]:

@@ -24,7 +24,7 @@ from pydantic import (
 from daemon.config.loading import describe, shown
 from daemon.config.tables import Section
 from daemon.errors import ConfigError
-from daemon.processing.calibrate_inputs import text_of
+from daemon.text_files import text_of
 from georef.calibration import MOST, PARAMETERS
 from georef.toml_tables import TomlError, toml_tables
 
@@ -141,7 +141,7 @@ def read_model(file: Path) -> ModelTables:
         UserError: it cannot be read; ConfigError: all that is wrong with it, one line each.
     """
     try:
-        return ModelTables.model_validate(toml_tables(text_of(file, "TOML")))
+        return ModelTables.model_validate(toml_tables(text_of(file, "a TOML file")))
     except TomlError as error:
         raise ConfigError(f"{file}: {error}") from error
     except ValidationError as error:

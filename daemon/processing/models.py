@@ -28,6 +28,7 @@ from georef.ranging import PulseRates, ZoneResolver
 from georef.records import InsSolution, Int64Array, StructArray
 from georef.sensor_model import FloatArray, SensorModel
 from georef.stream import GivenMotion, ScannerChain
+from georef.text_encoding import decoded
 from georef.trajectory import Trajectory
 from georef.uncertainty import Noise, Uncertainty
 
@@ -103,7 +104,7 @@ def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = Non
         return line_scanner(None)
     read = None
     if geometry.type == "fibre" and fibres is not None:
-        read = read_fibres(fibres.decode("utf-8", "replace"), geometry.file or "geometry.file")
+        read = read_fibres(decoded(fibres, "replace"), geometry.file or "geometry.file")
     return line_scanner(
         geometry.type,
         facets=geometry.facets,

@@ -40,6 +40,7 @@ from georef.records import InsSolution, NamesEdge, StructArray
 from georef.rotations import attitude_of, rot_l_from_b
 from georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
 from georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
+from georef.text_encoding import decoded
 from georef.timescales import StampScale
 from georef.trajectory import Trajectory
 from georef.trajectory_buffer import TrajectoryBuffer
@@ -426,4 +427,4 @@ class Setup:
         stored = self._attachments.get(attachment_name("calibration", name, Path(table.calibration)))
         if stored is None:
             raise ConfigError(f"scanner.{name}.calibration: {table.calibration} is not in the log; give it by hand")
-        return stored.decode("utf-8", "replace"), table.calibration
+        return decoded(stored, "replace"), table.calibration

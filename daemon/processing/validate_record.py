@@ -11,6 +11,7 @@ from calib.record import Document, RecordError, document_json, document_xml, rea
 from calib.record_values import Plain
 from calib.validation import Validation
 from daemon.errors import ExitCode, UserError
+from daemon.text_files import text_of
 from georef.calibration import Calibration
 
 
@@ -60,10 +61,7 @@ def records_of(files: Sequence[tuple[Path, Calibration]], where: Path | None) ->
 
 def _document(path: Path, file: Path, calibration: Calibration) -> Document:
     try:
-        document = read_document(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a record of swath calibrate"
-        raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
+        document = read_document(text_of(path, "a record of swath calibrate"), str(path))
     except RecordError as error:
         raise UserError(str(error), ExitCode.USAGE) from error
     if document["id"] != calibration.id:

@@ -34,9 +34,11 @@ from daemon.processing.strips_run import refuse_installations
 from daemon.processing.trajectory_files import write_whole
 from daemon.processing.user_errors import told_in_a_line
 from daemon.processing.validate_record import record_files, records_of
+from daemon.text_files import text_of
 from georef.calibration import Calibration, CalibrationError, read_calibration
 from georef.mapping import MappingError
 from georef.strips import StripError
+from georef.text_encoding import decoded
 
 Told = Callable[[str, int, int], None]
 RECORD, PICTURE = "validation.json", "history.png"
@@ -113,10 +115,7 @@ def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
 def read_file(path: Path) -> Calibration:
     """A calibration file; UserError where it cannot be read."""
     try:
-        return read_calibration(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or "no text; want a calibration file"
-        raise UserError(f"{path}: cannot be read: {why}", ExitCode.IO) from error
+        return read_calibration(text_of(path, "a calibration file"), str(path))
     except CalibrationError as error:
         raise UserError(str(error), ExitCode.USAGE) from error
 
@@ -133,7 +132,7 @@ def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple
 
 def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
     """A calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
-    if path in named or "[calibration]" in path.read_text(encoding="utf-8", errors="replace"):
+    if path in named or "[calibration]" in decoded(path.read_bytes(), "replace"):
         return read_file(path)
     return None
 

@@ -8,6 +8,7 @@ from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
 from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
 from georef.formats.trajectory_csv import is_csv
 from georef.formats.waypoint import is_waypoint, read_waypoint
+from georef.text_encoding import decoded
 from georef.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
 
 
@@ -26,7 +27,7 @@ def read_antenna_positions(
     Raises:
         TrajectoryError: in one line what is wrong; a file with attitudes is no antenna's.
     """
-    text = data.decode("utf-8", errors="replace")
+    text = decoded(data, "replace")
     if is_rtklib_pos(text):
         columns = read_rtklib_pos(text, name, leap_seconds=leap_seconds)
     elif is_waypoint(text):

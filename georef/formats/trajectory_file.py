@@ -9,6 +9,7 @@ from georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, rea
 from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
 from georef.formats.trajectory_csv import is_csv, read_csv
 from georef.formats.waypoint import is_waypoint, read_waypoint
+from georef.text_encoding import decoded, encoding_of
 from georef.timescales.gps_time import SECOND_NS
 from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
 
@@ -72,10 +73,12 @@ def _refuse_sparse(trajectory: Trajectory) -> None:
 
 def _text_of(data: bytes) -> str | None:
     """The text; None: these are numbers."""
+    if encoding_of(data[:4]) != "utf-8-sig":
+        return decoded(data, "replace")
     head = data[:LOOKED_AT]
     if not data or any(byte < 9 or 13 < byte < 32 for byte in head):
         return None
-    return data.decode("utf-8", errors="replace")
+    return decoded(data, "replace")
 
 
 def _sbet(data: bytes, name: str, span_ns: Span | None, week: int | None, sigmas: Sigmas | None) -> TrajectoryColumns:

@@ -20,12 +20,13 @@ from calib.history import HistoryError, history
 from calib.picked_points import PickedError, read_picked
 from calib.record import Record, RecordError, document_json, document_xml, read_document, record_json, with_told
 from calib.record_values import Matrix, Value
-from daemon.processing.calibrate_inputs import PolygonError, read_polygons, text_of
+from daemon.processing.calibrate_inputs import PolygonError, read_polygons
 from daemon.processing.calibrate_record import facts_of
 from daemon.processing.flights import _given_strips
 from daemon.processing.model_file import read_model
 from daemon.processing.validate_run import _entry, read_file
 from daemon.sim_plans import Wish
+from daemon.text_files import text_of
 from georef.beams import GeometryError, read_fibres
 from georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 from georef.earth import e_from_geodetic

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import datetime as dt
 import tracemalloc
 from typing import Any
@@ -167,6 +168,22 @@ def calendar(gps_ns: int, leap_s: int = 0) -> dt.datetime:
 
 
 WEEKS = ("Week GPSTime", "(weeks) (sec)")
+
+
+@pytest.mark.parametrize(
+    ("mark", "encoding"),
+    [  # UTF-16 is "Unicode" of Windows' Notepad and PowerShell
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+        (codecs.BOM_UTF32_LE, "utf-32-le"),
+        (codecs.BOM_UTF8, "utf-8"),
+    ],
+)
+def test_texts_are_read_by_their_byte_order_mark(mark: bytes, encoding: str) -> None:
+    trajectory = flown(20)
+    for text in (csv_text(trajectory), export(trajectory, weeks(trajectory), *WEEKS)):
+        got = read_trajectory(mark + text.replace("\n", "\r\n").encode(encoding), "file.txt")
+        same(got, read(text), 0.0, 0.0)
 
 
 def test_waypoint_export_is_read() -> None:

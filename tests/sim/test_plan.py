@@ -131,7 +131,7 @@ class TestRefusals:
             load_plan(tmp_path / "nowhere.toml")
 
     def test_not_text(self, tmp_path: Path) -> None:
-        (tmp_path / "plan.toml").write_bytes(b"\xff\xfe[flight]")
+        (tmp_path / "plan.toml").write_bytes(b"\xfd[flight]")
         with pytest.raises(PlanError, match="is not UTF-8"):
             load_plan(tmp_path / "plan.toml")
 
