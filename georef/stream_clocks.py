@@ -325,11 +325,13 @@ class FrozenClocks:
         host: the host's.
         stamps: what devices' stamps count from, by source, as the whole log shows it.
         heads: what scanners say of time themselves, by source; none that was not asked.
+        remarks: lines for the user on the dates that scanners were given, where one is the clock.
     """
 
     host: HostClocks
     stamps: Mapping[str, Stamps] = field(default_factory=dict)
     heads: Mapping[str, HeadTime] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
     def trouble(self, source: str | None) -> str:
         """Return why what a scanner says of time cannot be used; empty: it can, or it says nothing."""

@@ -227,6 +227,7 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     if not len(first):
         raise UserError(f"{log}: no scanner's data in the log")
     clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
+    clocks.remarks += clocks.clocks.remarks
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
     status, trouble = flight.status(flight.host_span[1]), clocks.clocks.trouble(flight.clock)

@@ -7,7 +7,7 @@ where no receiver is in the log.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -66,6 +66,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
         for message in read.messages[source]:
             host.add_message(source, message)
     host.update()
+    remarks = read.remarks(own) + (host.settle() if own else [])  # a head is the clock where no receiver was settled
     stamps: dict[str, Stamps] = {}
     heads: dict[str, HeadTime] = {}
     for source, plan in plans.items():
@@ -77,7 +78,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
             stamps[source] = found
         messages = sum(message.valid for message in read.messages[source])
         heads[source] = HeadTime(messages, _trouble(read, source, own=source in own))
-    return FrozenClocks(host, stamps, heads)
+    return FrozenClocks(host, stamps, heads, tuple(remarks))
 
 
 def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
@@ -118,6 +119,10 @@ class _Reader:
                 self.statuses[source].append(record)
             elif isinstance(record, DeviceClockSamples):
                 self._rows[source].append(record.rows)
+
+    def remarks(self, sources: Iterable[str]) -> list[str]:
+        """Return what is to be said of the dates that heads were given."""
+        return [line for source in sorted(sources) for line in self._parsers[source].remarks()]
 
     def rows(self, source: str) -> StructArray:
         """Return all clock samples of a scanner."""

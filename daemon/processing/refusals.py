@@ -195,6 +195,8 @@ def refuse_no_time(
     """
     if trouble and status is not None and status.state is TimeState.NO_TIME:
         raise UserError(f"{log}: {clock}: no receiver is in the log, and the head {trouble}")
+    if remarks and clock is not None and clock.startswith("scanner/") and status is not None:
+        _refuse_by_remarks(log, status, remarks)
     if status is None or clock is None or (clock.startswith("scanner/") and status.state is TimeState.NO_TIME):
         key = "" if clock is None else f"{clock.replace('/', '.')}.clock"
         hint = (
@@ -217,10 +219,15 @@ def refuse_no_time(
         )
     if status.leap_doubt:
         raise UserError(f"{log}: {clock}: UTC cannot be brought to GPS time: {status.leap_doubt}")
-    if status.state is TimeState.NO_TIME and remarks:
-        raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
+    _refuse_by_remarks(log, status, remarks)
     if status.state is TimeState.NO_TIME:
         raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
+
+
+def _refuse_by_remarks(log: Path, status: ClockStatus, remarks: Sequence[str]) -> None:
+    """Refuse a log without time by what parsers say of the dates that they did not believe."""
+    if status.state is TimeState.NO_TIME and remarks:
+        raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
 
 
 def time_troubles(

@@ -64,6 +64,7 @@ class ReceiverDates:
         self.floor_week = week_of(self.floor)
         self._name = settings.source.partition("/")[2] or "NAME"
         self._source = settings.source
+        self._is_head = settings.source.startswith("scanner/")  # it hands on a receiver's date, and has no such keys
         weeks = settings.config.get("add_weeks") or 0
         if not isinstance(weeks, int) or weeks % ROLLOVER_WEEKS or weeks < 0:
             raise DriverSettingsError(f"add_weeks: got {weeks!r}, want a multiple of {ROLLOVER_WEEKS}, as 1024")
@@ -136,10 +137,13 @@ class ReceiverDates:
         if self._refused is not None:
             said, host = self._refused
             later = said + dt.timedelta(days=ROLLOVER_DAYS)
+            floor = "" if self._is_head else f" (gnss.{self._name}.date_floor)"
+            remedy = f"want gnss.{self._name}.add_weeks = {ROLLOVER_WEEKS} if that is right, or an older date_floor"
+            if self._is_head:
+                remedy = "want a receiver at the head that knows the date, or a receiver in the log"
             lines.append(
-                f"{self._source}: says {said}, before {self.floor} (gnss.{self._name}.date_floor): probably one "
-                f"roll-over of {ROLLOVER_WEEKS} weeks behind, which makes {later}, and the host's clock says {host}; "
-                f"want gnss.{self._name}.add_weeks = {ROLLOVER_WEEKS} if that is right, or an older date_floor"
+                f"{self._source}: says {said}, before {self.floor}{floor}: probably one roll-over of {ROLLOVER_WEEKS} "
+                f"weeks behind, which makes {later}, and the host's clock says {host}; {remedy}"
             )
         return lines
 

@@ -95,8 +95,8 @@ class HesaiParser(PacketParser):
     """Decodes point cloud and GPS data packets of one head, told apart by their length.
 
     Counts ``bad_length``, ``bad_header``, ``wrong_product`` (another model answers), ``bad_return_mode``,
-    ``bad_azimuth``, ``bad_time``, ``bad_gps``, and of the UDP sequence ``sequence_gap``, ``out_of_order``,
-    ``duplicate`` and ``restart`` (the head's time went back).
+    ``bad_azimuth``, ``bad_time``, ``bad_gps``, ``date_before_floor``, and of the UDP sequence ``sequence_gap``,
+    ``out_of_order``, ``duplicate`` and ``restart`` (the head's time went back).
 
     Args:
         settings: ``geometry.file`` is the head's own angle correction file.
@@ -115,7 +115,7 @@ class HesaiParser(PacketParser):
             self.beams = read_angle_file(settings.files["geometry"], head)
         whole, short = head.packet_dtype(), head.packet_dtype(sequence=False)
         self._dtypes = {whole.itemsize: whole} | ({short.itemsize: short} if head.without_sequence else {})
-        self._gps = GpsReader(self.counters)
+        self._gps = GpsReader(self.counters, settings)
         self._tracker = SequenceTracker(self.counters.errors)
         self._thinner = SampleThinner() if clock_only else None
         self._fill = filler(compiled=settings.compiled and not clock_only)
@@ -144,6 +144,10 @@ class HesaiParser(PacketParser):
             host_time_ns, packets = host_time_ns[fresh], packets[fresh]
             second_ns, number = second_ns[fresh], number[fresh]
         return self._decode(host_time_ns, packets, second_ns, number) if len(packets) else []
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the dates that the head was given."""
+        return self._gps.dates.remarks()
 
     def _check(self, packets: StructArray) -> BoolArray:
         """(n,) True for packets of this model that can be decoded; the others are counted by what is wrong."""

@@ -16,7 +16,8 @@ import struct
 
 import numpy as np
 
-from drivers.core.parser import ParserCounters
+from drivers.core.parser import DeviceSettings, ParserCounters
+from drivers.gnss.date_floor import ReceiverDates
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     ByteRows,
@@ -57,18 +58,24 @@ def encode_gps_packet(time: dt.datetime, sentence: str = "", status: bytes = b"A
 
 
 class GpsReader:
-    """Reads the GPS data packets of one head, in order; counts ``bad_gps``.
+    """Reads the GPS data packets of one head, in order; counts ``bad_gps`` and ``date_before_floor``.
+
+    The date is that of the receiver at the head: one a roll-over behind is moved in the time message, one before the
+    floor is not valid. Device times stay as the head counts them.
 
     Args:
         counters: the parser's.
+        settings: of the head, whose source the remarks on dates name.
 
     Attributes:
+        dates: what the head's dates were taken for.
         locked: what the latest packet said: 1 PPS locked, 0 not, −1 before the first packet (and with PTP, where
             the head sends none).
     """
 
-    def __init__(self, counters: ParserCounters) -> None:
+    def __init__(self, counters: ParserCounters, settings: DeviceSettings) -> None:
         self._counters = counters
+        self.dates = ReceiverDates(settings)
         self._status: tuple[bytes, bool] | None = None
         self.locked = -1
 
@@ -100,7 +107,13 @@ class GpsReader:
     def _events(self, host_ns: int, time: dt.datetime, status: bytes, *, locked: bool) -> list[Record]:
         of_day_ns = (time.hour * 3600 + time.minute * 60 + time.second) * NS
         valid = locked and _STATUS_NAMES[status] == "valid"
-        tag = TimeTag(TimeScale.UTC, of_day_ns, date=time.date())
+        date = time.date()
+        if valid:  # else it is the head's own virtual date
+            date = self.dates.date(date, host_ns)
+            if date < self.dates.floor:
+                self._counters.errors["date_before_floor"] += 1
+                valid = False
+        tag = TimeTag(TimeScale.UTC, of_day_ns, date=date)
         events: list[Record] = [TimeMessage(host_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="GPS data packet")]
         if (status, locked) != self._status:
             self._status = (status, locked)

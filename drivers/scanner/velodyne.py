@@ -88,8 +88,8 @@ class VelodyneParser(PacketParser):
 
     Counts ``bad_length``, ``bad_block_flag``, ``bad_azimuth``, ``bad_return_mode``, ``wrong_product`` (another model
     answers), ``cadence_gap`` (packets missing by the stamps), ``out_of_order`` (late, counted as missing before),
-    ``stamp_jump`` (the head's clock was set), ``duplicate``, and the position packets' ``bad_nmea`` and
-    ``nmea_second_mismatch``.
+    ``stamp_jump`` (the head's clock was set), ``duplicate``, and the position packets' ``bad_nmea``,
+    ``nmea_second_mismatch`` and ``date_before_floor``.
 
     Args:
         settings: ``geometry.file`` is the head's own calibration, db.xml or YAML.
@@ -107,7 +107,7 @@ class VelodyneParser(PacketParser):
         if "geometry" in settings.files:
             self.beams = read_calibration(settings.files["geometry"], head)
         self._flags = [head.used_block_flags(dual=dual) for dual in (False, True)]
-        self._position = PositionReader(self.counters)
+        self._position = PositionReader(self.counters, settings)
         self._thinner = SampleThinner() if clock_only else None
         self._fill = filler(compiled=settings.compiled and not clock_only)
         self._stamps = StampTracker(self.counters.errors, HOUR_US, MAX_SILENCE_US)
@@ -134,6 +134,10 @@ class VelodyneParser(PacketParser):
         if not fresh.all():
             host_time_ns, packets, turn = host_time_ns[fresh], packets[fresh], turn[fresh]
         return self._decode(host_time_ns, packets, turn) if len(packets) else []
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the dates that the head was given."""
+        return self._position.dates.remarks()
 
     def _decode(self, host_time_ns: Int64Array, packets: StructArray, turn: FloatArray) -> list[Record]:
         clock = _clock_samples(host_time_ns, packets["stamp_us"], packets["mode"], self._head)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import datetime as dt
 import struct
+from dataclasses import replace
 
 import numpy as np
 
-from drivers.core.parser import ParserCounters
+from drivers.core.parser import DeviceSettings, ParserCounters
+from drivers.gnss.date_floor import ReceiverDates
 from georef.records import (
     DEVICE_CLOCK_DTYPE,
     ByteRows,
@@ -50,17 +52,21 @@ class PositionReader:
 
     A packet repeats the last sentence the head got until the next one comes, also beyond the next edge. So a
     `TimeMessage` is made only of the first packet with a new sentence and, while the head is locked, only if the
-    sentence's second is the one the head's own clock stands in (else ``nmea_second_mismatch`` is counted).
+    sentence's second is the one the head's own clock stands in (else ``nmea_second_mismatch`` is counted). Its date is
+    read as a receiver's own: one a roll-over behind is moved, one before the floor not valid (``date_before_floor``).
 
     Args:
         counters: the parser's.
+        settings: of the head, whose source the remarks on dates name.
 
     Attributes:
+        dates: what the sentences' dates were taken for.
         locked: what the latest packet said: 1 PPS locked, 0 not, −1 before the first packet.
     """
 
-    def __init__(self, counters: ParserCounters) -> None:
+    def __init__(self, counters: ParserCounters, settings: DeviceSettings) -> None:
         self._counters = counters
+        self.dates = ReceiverDates(settings)
         self._sentence: bytes | None = None
         self._status: tuple[int, bool] | None = None
         self.locked = -1
@@ -102,7 +108,7 @@ class PositionReader:
             if named is None and sentence:
                 self._counters.errors["bad_nmea"] += 1
             elif named is not None and self._is_of_this_second(named[0], stamp_us, pps_status):
-                events.append(TimeMessage(host_ns, named[0], NamesEdge.PREVIOUS, valid=valid, message="position RMC"))
+                events.append(self._time_message(host_ns, named[0], valid=valid))
             self._sentence = sentence
         if (pps_status, valid) != self._status:
             self._status = (pps_status, valid)
@@ -114,6 +120,15 @@ class PositionReader:
             }
             events.append(DeviceStatus(host_ns, values, message="position"))
         return events
+
+    def _time_message(self, host_ns: int, said: TimeTag, *, valid: bool) -> TimeMessage:
+        """Return the message of a sentence, with the date that its receiver means."""
+        if valid and said.date is not None:  # without a fix many a receiver says any date
+            said = replace(said, date=(date := self.dates.date(said.date, host_ns)))
+            if date < self.dates.floor:
+                self._counters.errors["date_before_floor"] += 1
+                valid = False
+        return TimeMessage(host_ns, said, NamesEdge.PREVIOUS, valid=valid, message="position RMC")
 
     def _is_of_this_second(self, time: TimeTag, stamp_us: int, pps_status: int) -> bool:
         """Whether the sentence belongs to the edge just past: by the locked clock, else by being new."""

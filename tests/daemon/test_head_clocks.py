@@ -35,6 +35,7 @@ START = dt.datetime(2026, 6, 15, 9, 59, 50, tzinfo=dt.UTC)  # the hour turns ten
 START_UNIX_NS = int(START.timestamp()) * NS
 UNIX_MINUS_GPS_S, LEAP = 315_964_800, 18
 SECONDS, LATENCY_NS = 20, 2_000_000
+ROLLOVER = dt.timedelta(weeks=1024)
 CLOCK_WRONG_NS = 300_000_000  # of the recording computer, which nobody kept
 HEAD = 'transport = "udp:0.0.0.0:2368"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
 RECEIVER = (
@@ -45,8 +46,8 @@ RECEIVER = (
 Units = list[tuple[str, int, bytes]]  # source, time of arrival, bytes
 
 
-def rmc(second: int, status: str = "A") -> bytes:
-    at = START + dt.timedelta(seconds=second)
+def rmc(second: int, status: str = "A", off: dt.timedelta = dt.timedelta()) -> bytes:
+    at = START + dt.timedelta(seconds=second) + off
     body = f"GPRMC,{at:%H%M%S}.00,{status},4724.0,N,00830.0,E,0.0,0.0,{at:%d%m%y},,,A"
     return f"${body}*{reduce(xor, body.encode()):02X}".encode()
 
@@ -79,13 +80,18 @@ def velodyne(off_us: int = 0, *, goes_on: bool = False) -> Units:
     return units
 
 
-def positions(*, goes_on: bool = False, pps: int = PPS_LOCKED, status: str | None = "A") -> Units:
-    """Two position packets a second with the sentence of the second, of a fix or void; None: no sentence."""
+def positions(
+    *, goes_on: bool = False, pps: int = PPS_LOCKED, status: str | None = "A", off: dt.timedelta = dt.timedelta()
+) -> Units:
+    """Two position packets a second with the sentence of the second, of a fix or void; None: no sentence.
+
+    off: that the sentences' time is wrong by.
+    """
     units: Units = []
     for half in range(1, 2 * SECONDS):
         unix_us = START_UNIX_NS // 1000 + half * 500_000 + 250_000
         stamp_us = past_hour_us(unix_us, goes_on=goes_on)
-        sentence = "" if status is None else rmc((half * 500 + 250) // 1000, status).decode()
+        sentence = "" if status is None else rmc((half * 500 + 250) // 1000, status, off).decode()
         data = encode_position_packet(stamp_us, pps, sentence)
         units.append(("scanner/top/aux", unix_us * 1000 + LATENCY_NS, data))
     return units
@@ -198,6 +204,31 @@ def test_stamps_that_jump_where_the_head_says_that_it_is_locked_are_not_taken(tm
     error, _ = errors_ns(clocks, stamps, [-1] * 15 + [1] * (len(HOURS) - 15))
     assert max(map(abs, error[15:])) < 1_000
     assert "scanner/top" not in clocks.stamps or clocks.stamps["scanner/top"].scale is StampScale.FREE
+
+
+def test_a_roll_over_of_the_heads_receiver_is_moved_as_one_of_a_receivers_own(tmp_path: Path) -> None:
+    """Sentences 1024 weeks old: 2006 has another count of leap seconds, so that points lay 4 s off within the week."""
+    _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER)])
+    error, _ = errors_ns(clocks, HOURS, 1)
+    assert max(map(abs, error)) < 1_000
+    (line,) = clocks.remarks
+    assert line.startswith("scanner/top: says 2006-10-30, 1 roll-over of 1024 weeks behind: taken as 2026-06-15, for")
+
+
+def test_a_heads_date_that_nobody_believes_is_refused_and_named(tmp_path: Path) -> None:
+    setup, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=-ROLLOVER - dt.timedelta(days=9))])
+    (line,) = clocks.remarks
+    assert line.startswith("scanner/top: says 2006-10-21, before 2009-01-01: probably one roll-over of 1024 weeks")
+    assert "want a receiver at the head that knows the date" in line
+    status = clocks.host.status("scanner/top", START_UNIX_NS + 20 * NS)
+    with pytest.raises(UserError, match="scanner/top: says 2006-10-21"):
+        refuse_no_time(tmp_path, "scanner/top", status, setup.config, clocks.remarks, clocks.trouble("scanner/top"))
+
+
+def test_a_head_that_was_given_local_time_is_told(tmp_path: Path) -> None:
+    _, clocks = found(tmp_path, WITH_AUX, [*velodyne(), *positions(off=dt.timedelta(hours=2))])
+    (line,) = clocks.remarks
+    assert line.startswith("scanner/top: its time is 2 h ahead of the recording computer's clock, as by a time zone")
 
 
 def test_counters_that_go_on_beyond_the_hour_are_modulo_the_hour_in_both_packets(tmp_path: Path) -> None:

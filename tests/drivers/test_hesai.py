@@ -455,6 +455,28 @@ def test_only_a_locked_head_with_a_position_is_believed(status: bytes, locked: b
     assert [r.values["gps_status"] for r in records if isinstance(r, DeviceStatus)] == [name]
 
 
+def test_a_date_a_roll_over_behind_is_moved_in_the_time_message() -> None:
+    """2006-11-06 is 1024 weeks before 2026-06-22. Device times stay as the head counts them."""
+    parser = HesaiParser(DeviceSettings("scanner/left"), XT32)
+    host_ns = int(dt.datetime(2026, 6, 22, 12, tzinfo=dt.UTC).timestamp()) * 10**9
+    records = [
+        record
+        for day in (dt.datetime(2006, 11, 6, 12, tzinfo=dt.UTC), dt.datetime(2005, 1, 1, 12, tzinfo=dt.UTC))
+        for record in parser.feed(Chunk("scanner/left", host_ns, encode_gps_packet(day)))
+    ]
+    moved, refused = [record for record in records if isinstance(record, TimeMessage)]
+    assert (moved.time.date, moved.valid) == (dt.date(2026, 6, 22), True)
+    assert (refused.time.date, refused.valid) == (dt.date(2005, 1, 1), False)
+    assert parser.counters.errors == {"date_before_floor": 1}
+    assert (
+        clock_of(records)["device_time_ns"][0] == int(dt.datetime(2006, 11, 6, 12, tzinfo=dt.UTC).timestamp()) * 10**9
+    )
+    assert [line.partition(",")[0] for line in parser.remarks()] == [
+        "scanner/left: says 2006-11-06",
+        "scanner/left: says 2005-01-01",
+    ]
+
+
 @pytest.mark.parametrize(
     ("at", "new"),
     [(0, b"\xfe"), (2, b"A"), (4, b"31"), (8, b"16"), (12, b"52"), (506, b"?"), (507, b"\x02")],

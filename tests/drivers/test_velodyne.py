@@ -431,6 +431,27 @@ def test_a_receiver_that_warns_is_not_believed() -> None:
     assert [r.values["nmea_valid"] for r in records if isinstance(r, DeviceStatus)] == [False]
 
 
+def test_a_date_a_roll_over_behind_is_moved_and_an_older_one_is_not_valid() -> None:
+    """What pucks said on 2019-04-07, when the 10-bit week had begun anew: 1999-08-22, 1024 weeks before."""
+    parser, host_ns = make_parser(), int(dt.datetime(2019, 4, 7, tzinfo=dt.UTC).timestamp()) * 10**9
+    said = [(1_000_200_000, rmc("081640.00", date="220899")), (1_001_200_000, rmc("081641.00", date="210898"))]
+    units = [encode_position_packet(stamp_us, 2, sentence) for stamp_us, sentence in said]
+    records = [record for unit in units for record in parser.feed(Chunk("scanner/left", host_ns, unit))]
+    moved, refused = [r for r in records if isinstance(r, TimeMessage)]
+    assert (moved.time.date, moved.valid) == (dt.date(2019, 4, 7), True)
+    assert (refused.time.date, refused.valid) == (dt.date(1998, 8, 21), False)
+    assert parser.counters.errors == {"date_before_floor": 1}
+    first, second = parser.remarks()
+    assert "1 roll-over of 1024 weeks behind: taken as 2019-04-07" in first
+    assert "says 1998-08-21, before 2009-01-01" in second
+
+
+def test_a_date_without_a_fix_is_not_remarked_on() -> None:
+    parser, _ = positions((1_000_200_000, 2, rmc("081640.00", "V", "060180")))
+    assert parser.remarks() == []
+    assert not parser.counters.errors
+
+
 def test_damaged_sentences_are_counted_once() -> None:
     bad = rmc("081640.00").replace("A,3649", "A,3648")
     parser, records = positions((1_000_200_000, 2, bad), (1_000_210_000, 2, bad))
