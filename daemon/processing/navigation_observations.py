@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.earth import e_from_geodetic
+from georef.navigation.alignment_noise import white_factor
 from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from georef.records import FixType, GnssFix, GnssHeading, Int64Array, StructArray, TimeScale, TimeTag
+from georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
 from georef.stream_clocks import HostClocks
 from georef.timescales import complete_time
 
@@ -38,9 +39,8 @@ DEFAULT_INS_SIGMAS_RAD = (math.radians(0.05), math.radians(0.05), math.radians(0
 HEADING_REACH_NS = 500_000_000  # a heading without time belongs to the fix that arrives nearest to it, so near
 BLENDED_BY_INS = {"BESTPOS": "BESTGNSSPOS", "BESTVEL": "BESTGNSSVEL"}  # message: the one of satellites alone
 
-# Errors of headings (multipath) and of an INS's attitude last: neighbours repeat each other. One every so often is
-# taken, with the sigma of a white error that averages as slowly: share of sigma that is correlated, and for how long.
-HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S = 5_000_000_000, 0.6, 60.0
+# Errors of an INS's attitude last: neighbours repeat each other. One every so often is taken, with the sigma of a white
+# error that averages as slowly: share of sigma that is correlated, and for how long.
 INS_STEP_NS, INS_SHARE, INS_TAU_S = 20_000_000_000, 1.0, 120.0
 RANK = {FixType.RTK_FIXED: 5, FixType.PPP: 4, FixType.RTK_FLOAT: 3, FixType.DIFFERENTIAL: 2, FixType.SINGLE: 1}
 
@@ -212,35 +212,16 @@ def heading_observations(
             refused["repeated_in_epoch"] += 1
         else:
             best[at_ns] = heading
-    taken = _spaced(np.array(sorted(best), np.int64), HEADING_STEP_NS)
-    refused["repeats_neighbours"] = len(best) - len(taken)
-    more_careful = white_factor(HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S)
     usual = DEFAULT_HEADING_SIGMA_RAD if baseline_m is None else math.atan(DEFAULT_BASELINE_SIGMA_M / baseline_m)
-    rows = np.zeros(len(taken), OBSERVATION_DTYPE)
-    for row, time in zip(rows, taken.tolist(), strict=True):
-        heading = best[time]
+    rows = np.zeros(len(best), OBSERVATION_DTYPE)
+    for row, (time, heading) in zip(rows, best.items(), strict=True):
         row["time_ns"], row["kind"] = time, Kind.HEADING
         pitch = math.nan if heading.pitch_rad is None else heading.pitch_rad
         row["value"] = (heading.heading_rad, pitch, math.nan)
         sigma = _angle_sigma(heading.heading_sigma_rad, usual), _angle_sigma(heading.pitch_sigma_rad, 2.0 * usual)
-        row["sigma"] = (more_careful * sigma[0], more_careful * sigma[1], math.nan)
+        row["sigma"] = (*sigma, math.nan)
         assumed["heading"] += heading.heading_sigma_rad is None
     return Observed(sort_observations(rows), +refused, +assumed)
-
-
-def white_factor(step_ns: int, share: float, tau_s: float) -> float:
-    """Factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
-
-    With it the mean of many has the variance that it really has, as if their errors were white.
-    """
-    stays = math.exp(-step_ns * 1e-9 / tau_s)
-    return math.sqrt(1.0 - share**2 + share**2 * (1.0 + stays) / (1.0 - stays))
-
-
-def _spaced(time_ns: Int64Array, step_ns: int) -> Int64Array:
-    """Those of rising times (n,) that are the first of their step."""
-    found: Int64Array = time_ns[np.unique(time_ns // step_ns, return_index=True)[1]]
-    return found
 
 
 def _angle_sigma(said: float | None, usual: float) -> float:

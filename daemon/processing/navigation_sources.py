@@ -16,7 +16,6 @@ from daemon.errors import ConfigError, ExitCode, UserError
 from daemon.log.format import LogError, SessionInfo
 from daemon.log_parsers import stored_config
 from daemon.processing.models import gimbal_sources
-from daemon.processing.navigation_observations import HEADING_SHARE, HEADING_STEP_NS, HEADING_TAU_S, white_factor
 from daemon.processing.setup import Options
 from daemon.processing.setup import Setup as PointSetup
 from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
@@ -32,6 +31,7 @@ FloatArray = NDArray[np.float64]
 # Receivers' sigmas of positions are taken for those of all their error. Half of its variance lasts for a minute or so:
 # multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`georef.navigation.noise`).
 CORRELATED_SHARE, CORRELATION_S = 0.5, 60.0
+HEADING_SHARE, HEADING_CORRELATION_S = 0.36, 60.0  # the same of dual-antenna headings (multipath)
 
 
 class NavigationSources:
@@ -206,7 +206,8 @@ def filter_setup(noise: ImuNoise, arms_b: Sequence[FloatArray], *, time_sigma_s:
         estimate_time_offset_s=time_sigma_s,
         gnss_correlation_s=CORRELATION_S,
         gnss_correlated_share=CORRELATED_SHARE,
-        heading_repeats=white_factor(HEADING_STEP_NS, HEADING_SHARE, HEADING_TAU_S),
+        gnss_heading_correlation_s=HEADING_CORRELATION_S,
+        gnss_heading_share=HEADING_SHARE,
     )
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from daemon.errors import UserError
 from daemon.processing.navigation_observations import (
-    HEADING_STEP_NS,
     fix_observations,
     gps_times,
     heading_observations,
@@ -208,11 +207,11 @@ class Navigator:
         return rows[fresh]
 
     def _directions(self, headings: list[GnssHeading], time_ns: list[int | None]) -> StructArray:
-        """Of a baseline, as far apart as their common errors ask for."""
+        """Of a baseline, later than those handed on before."""
         if self._setup.baseline_b is None:
             return np.empty(0, OBSERVATION_DTYPE)
         found = heading_observations(headings, time_ns, float(np.linalg.norm(self._setup.baseline_b))).rows
-        rows = found[found["time_ns"] >= self._latest_heading_ns + HEADING_STEP_NS]
+        rows = found[found["time_ns"] > self._latest_heading_ns]
         if len(rows):
             self._latest_heading_ns = int(rows["time_ns"][-1])
         return rows

@@ -24,6 +24,7 @@ from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.alignment_blocks import Felt
 from georef.navigation.alignment_frame import RATE_IE_E, Frame
 from georef.navigation.alignment_noise import covariances as noise_covariances
+from georef.navigation.alignment_noise import spaced_headings
 from georef.navigation.inputs import Kind, Setup
 from georef.quaternions import rotation_vector
 from georef.records import Int64Array, StructArray
@@ -117,7 +118,7 @@ class Problem:
         self._arm = np.einsum("nij,nj->ni", self._place.rot, setup.lever_arms_b[place["antenna"]])
         self._place_seen = self._frame.place(place) - pull.place(place["time_ns"])
         self._observed = speed, place, setup
-        self._heading = heading if setup.baseline_b is not None else heading[:0]
+        self._heading = spaced_headings(heading, setup) if setup.baseline_b is not None else heading[:0]
         self._heading_felt = felt.at(self._heading["time_ns"])
         self._baseline_b = np.zeros(3) if setup.baseline_b is None else setup.baseline_b
         self._attitude, self._attitude_felt = attitude, felt.at(attitude["time_ns"])

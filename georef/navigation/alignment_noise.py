@@ -1,10 +1,12 @@
 """Noise by which GNSS's velocities and positions differ from what was felt: the covariance of alignment's residuals.
 
 White noise of the sensors is integrated into walks that neighbouring residuals share; an accelerometer's error wanders
-besides, under vibration and road, by a share of its bias.
+besides, under vibration and road, by a share of its bias. Headings are few enough, and white.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ FloatArray = NDArray[np.float64]
 
 G_MPS2 = 9.80665
 STILL_MPS = 0.003  # what a vehicle that stands still moves
+HEADING_STEP_NS = 5_000_000_000  # between headings whose errors last: those between say little that is new
 WANDER, WANDER_S = 0.25, 5.0  # share of its bias by which an accelerometer's error changes under way, and how fast
 
 
@@ -79,3 +82,23 @@ def _powers(rest: FloatArray, degree: FloatArray) -> list[FloatArray]:
         np.select(cases, [zero, one, rest]),
         np.select(cases, [zero, zero, 0.5 * one]),
     ]
+
+
+def spaced_headings(rows: StructArray, setup: Setup) -> StructArray:
+    """Thin headings, sorted by time, whose errors last, with the sigma of a white error that averages as slowly."""
+    if setup.gnss_heading_share <= 0.0 or not len(rows):
+        return rows
+    spaced = rows[np.unique(rows["time_ns"] // HEADING_STEP_NS, return_index=True)[1]]
+    spaced["sigma"] *= white_factor(
+        HEADING_STEP_NS, math.sqrt(setup.gnss_heading_share), setup.gnss_heading_correlation_s
+    )
+    return spaced
+
+
+def white_factor(step_ns: int, share: float, tau_s: float) -> float:
+    """Factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
+
+    With it the mean of many has the variance that it really has, as if their errors were white.
+    """
+    stays = math.exp(-step_ns * 1e-9 / tau_s)
+    return math.sqrt(1.0 - share**2 + share**2 * (1.0 + stays) / (1.0 - stays))

@@ -36,6 +36,7 @@ from georef.navigation.strapdown import (
     LEVER_ARM,
     POSITION,
     SLOW,
+    SLOW_HEADING,
     SLOW_VELOCITY,
     SUM_FORCE,
     SUM_FORCE_ACROSS,
@@ -67,6 +68,7 @@ class Layout(NamedTuple):
         time_offset: 1, of GNSS.
         slow: 3, the time-correlated part of GNSS positions, in units of its sigma.
         slow_velocity: 3, the same of GNSS velocities.
+        slow_heading: 2, the same of the heading and the pitch of a baseline.
         height_bias: 1, of a barometer.
     """
 
@@ -76,6 +78,7 @@ class Layout(NamedTuple):
     time_offset: int
     slow: int
     slow_velocity: int
+    slow_heading: int
     height_bias: int
 
     @property
@@ -113,6 +116,7 @@ def layout_of(setup: Setup, *, heights: bool = False) -> Layout:
         (setup.estimate_time_offset_s > 0.0, 1),
         (setup.gnss_correlated_share > 0.0, 3),
         (setup.gnss_velocity_share > 0.0, 3),
+        (setup.gnss_heading_share > 0.0 and setup.baseline_b is not None, 2),
         (heights and setup.height_bias_m > 0.0, 1),
     ):
         places.append(size if asked else -1)
@@ -137,6 +141,7 @@ def prior_variance(setup: Setup, layout: Layout) -> FloatArray:
         (layout.time_offset, 1, setup.estimate_time_offset_s),
         (layout.slow, 3, 1.0),
         (layout.slow_velocity, 3, 1.0),
+        (layout.slow_heading, 2, 1.0),
         (layout.height_bias, 1, setup.height_bias_m),
     ):
         if first >= 0:
@@ -152,6 +157,8 @@ def drive_of(setup: Setup, layout: Layout) -> Drive:
         correlation_s[layout.slow : layout.slow + 3] = setup.gnss_correlation_s
     if layout.slow_velocity >= 0:
         correlation_s[layout.slow_velocity : layout.slow_velocity + 3] = setup.gnss_velocity_correlation_s
+    if layout.slow_heading >= 0:
+        correlation_s[layout.slow_heading : layout.slow_heading + 2] = setup.gnss_heading_correlation_s
     if layout.height_bias >= 0:
         correlation_s[layout.height_bias] = setup.height_correlation_s
     variance = np.where(np.isfinite(correlation_s), prior_variance(setup, layout), 0.0)
@@ -257,6 +264,7 @@ def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
     for first, count, column in (
         (layout.slow, 3, SLOW),
         (layout.slow_velocity, 3, SLOW_VELOCITY),
+        (layout.slow_heading, 2, SLOW_HEADING),
         (layout.height_bias, 1, HEIGHT_BIAS),
     ):
         if first >= 0:
@@ -396,6 +404,7 @@ def inject(x: FloatArray, error: FloatArray, layout: Layout) -> None:
         (layout.time_offset, 1, TIME_OFFSET),
         (layout.slow, 3, SLOW),
         (layout.slow_velocity, 3, SLOW_VELOCITY),
+        (layout.slow_heading, 2, SLOW_HEADING),
         (layout.height_bias, 1, HEIGHT_BIAS),
     ):
         if first >= 0:

@@ -208,6 +208,7 @@ class Setup:
         gnss_correlation_s: e-folding time of the GNSS positions' common error.
         gnss_correlated_share: share (0 … 1) of the positions' variance that is time-correlated; 0: white.
         gnss_velocity_correlation_s, gnss_velocity_share: the same of the velocities.
+        gnss_heading_correlation_s, gnss_heading_share: the same of dual-antenna headings and their pitch.
         height_bias_m: prior sigma of a barometer's bias; 0: heights are taken as they are.
         height_correlation_s: e-folding time of it.
         position_floor_m, velocity_floor_mps: the least sigma believed; of positions more where the fix is no fixed one.
@@ -223,7 +224,6 @@ class Setup:
             (as found by an earlier pass).
         gnss_vertical_scale, gnss_velocity_vertical_scale: by fix type, a further factor on those of the vertical.
         gnss_heading_scale: factor on those of headings.
-        heading_repeats: factor by which headings' sigmas were made larger because their errors last.
     """
 
     noise: ImuNoise
@@ -235,6 +235,8 @@ class Setup:
     gnss_correlated_share: float = 0.0
     gnss_velocity_correlation_s: float = 2.0
     gnss_velocity_share: float = 0.0
+    gnss_heading_correlation_s: float = 60.0
+    gnss_heading_share: float = 0.0
     height_bias_m: float = 10.0
     height_correlation_s: float = 3600.0
     position_floor_m: float = 0.005
@@ -251,7 +253,6 @@ class Setup:
     gnss_vertical_scale: dict[int, float] = field(default_factory=dict)
     gnss_velocity_vertical_scale: dict[int, float] = field(default_factory=dict)
     gnss_heading_scale: float = 1.0
-    heading_repeats: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

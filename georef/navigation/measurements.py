@@ -5,7 +5,7 @@ and velocities (components north, east, down). With l the lever arm, C = rot_e_f
 
     position    r + C l + v τ + ½ a τ² + L √share c      τ the time offset, c the slow error, L Lᵀ its covariance
     velocity    v + C (ω_eb × l) + a τ + L √share c
-    heading     direction of C · baseline in l
+    heading     direction of C · baseline in l, + σ √share c
     attitude    roll, pitch, heading of C in l
     zero        v = 0 ;  non-holonomic: y and z of Cᵀ v are 0 ;  height: of r, + the barometer's bias
 """
@@ -46,6 +46,7 @@ from georef.navigation.strapdown import (
     LEVER_ARM,
     POSITION,
     SLOW,
+    SLOW_HEADING,
     SLOW_VELOCITY,
     TIME_OFFSET,
     VELOCITY,
@@ -77,7 +78,7 @@ class Rules(NamedTuple):
 
     Attributes:
         arms_b: (k, 3) lever arms; baseline_b: (3,), nan: none.
-        share, velocity_share: of GNSS positions' and velocities' variance that is slow.
+        share, velocity_share, heading_share: of GNSS positions', velocities' and headings' variance that is slow.
         position_floor_m: (fix types,).
         position_scale, velocity_scale: (fix types, 2) of the horizontal and the vertical, floors included.
         heading_scale: likewise.
@@ -91,6 +92,7 @@ class Rules(NamedTuple):
     baseline_b: FloatArray
     share: float
     velocity_share: float
+    heading_share: float
     position_floor_m: FloatArray
     position_scale: FloatArray
     velocity_scale: FloatArray
@@ -112,6 +114,7 @@ def rules_of(setup: Setup) -> Rules:
         baseline,
         float(setup.gnss_correlated_share),
         float(setup.gnss_velocity_share),
+        float(setup.gnss_heading_share),
         np.array(floors),
         _scales_of(setup.gnss_sigma_scale, setup.gnss_vertical_scale),
         _scales_of(setup.gnss_velocity_scale, setup.gnss_velocity_vertical_scale),
@@ -270,7 +273,13 @@ def _velocity(
 
 @kernel
 def _heading(
-    x: FloatArray, rules: Rules, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray
+    x: FloatArray,
+    rules: Rules,
+    layout: Layout,
+    figures: FloatArray,
+    nu: FloatArray,
+    rows: FloatArray,
+    noise: FloatArray,
 ) -> None:
     """Direction of the baseline: heading and pitch."""
     axes = level_axes(x)
@@ -291,6 +300,12 @@ def _heading(
     nu[2] = np.nan
     floor, scale = rules.attitude_floor_rad, rules.heading_scale
     _set_noise(noise, (scale * max(figures[3], floor), scale * max(figures[4], floor), 1.0), figures, 6)
+    if layout.slow_heading >= 0:
+        for i in range(2):
+            rows[i, layout.slow_heading + i] = math.sqrt(rules.heading_share * noise[i, i])
+            nu[i] -= rows[i, layout.slow_heading + i] * x[SLOW_HEADING + i]
+            for j in range(2):
+                noise[i, j] *= 1.0 - rules.heading_share
 
 
 @kernel
@@ -369,7 +384,7 @@ def predict(
     elif kind == _VELOCITY:
         _velocity(x, sums, rules, layout, antenna, fix, figures, nu, rows, noise)
     elif kind == _HEADING:
-        _heading(x, rules, figures, nu, rows, noise)
+        _heading(x, rules, layout, figures, nu, rows, noise)
     elif kind == _ATTITUDE:
         _attitude(x, rules, figures, nu, rows, noise)
     elif kind == _ZERO:

@@ -32,6 +32,7 @@ from georef.navigation.inputs import Fate, Kind, Setup
 from georef.records import StructArray
 
 BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
 Run = Callable[[Setup], StructArray]
 
 ENOUGH = 120  # components of one source: 60 positions' horizontal ones
@@ -107,6 +108,8 @@ class NoiseFound:
         count: by source, components that this is of.
         evidence: ln likelihood won by the first scale of each source; of the share `share_evidence`.
         velocity_evidence: of the share of velocities' errors that lasts; 0: none was found.
+        heading_evidence: of what was found of headings' errors (`heading_noise`); 0: they are as assumed.
+        doubted: positions are too far off to be noise; nothing was found.
     """
 
     setup: Setup
@@ -116,6 +119,8 @@ class NoiseFound:
     evidence: dict[Source, float] = field(default_factory=dict)
     share_evidence: float = 0.0
     velocity_evidence: float = 0.0
+    heading_evidence: float = 0.0
+    doubted: bool = False
 
     @property
     def share(self) -> float:
@@ -171,7 +176,13 @@ def _not_outlying(rows: StructArray) -> BoolArray:
 
 def log_likelihood(innovations: StructArray) -> float:
     """Return −½ Σ (ln |S| + χ²) of innovations; a χ² beyond `GREATEST` counts as that."""
-    return float(-0.5 * (innovations["log_det"] + np.minimum(innovations["chi2"], GREATEST)).sum())
+    return float(log_likelihoods(innovations).sum())
+
+
+def log_likelihoods(innovations: StructArray) -> FloatArray:
+    """(n,) ln likelihood of each innovation, as `log_likelihood` adds them up."""
+    each: FloatArray = -0.5 * (innovations["log_det"] + np.minimum(innovations["chi2"], GREATEST))
+    return each
 
 
 def rescaled(setup: Setup, innovations: StructArray) -> tuple[Setup, dict[Source, float]]:
@@ -183,8 +194,6 @@ def rescaled(setup: Setup, innovations: StructArray) -> tuple[Setup, dict[Source
     factors: dict[Source, float] = {}
     won: dict[Source, float] = {}
     for source, moment in moments.items():
-        if source[0] == Kind.HEADING:
-            moment *= setup.heading_repeats**2
         gain = 0.5 * counts[source] * (moment - 1.0 - math.log(moment)) if moment > 0.0 else 0.0
         enough = counts[source] >= ENOUGH and abs(moment - 1.0) >= NEAR and gain >= EVIDENCE
         factors[source] = math.sqrt(moment) if enough else 1.0
@@ -246,7 +255,7 @@ def find_noise(innovations: StructArray, stretch: Run, setup: Setup) -> NoiseFou
     gain = best.log_likelihood - first.log_likelihood
     told = tuple(replace(one, log_likelihood=one.log_likelihood - first.log_likelihood) for one in tried)
     if _too_large(best.setup, setup, counts):
-        return NoiseFound(setup, told, moments, counts)
+        return NoiseFound(setup, told, moments, counts, doubted=True)
     return NoiseFound(best.setup, told, moments, counts, evidence, gain, of_speeds)
 
 
@@ -310,14 +319,18 @@ class Judged:
         self._stretch = stretch
         self._kept: BoolArray | None = None
 
+    def innovations(self, setup: Setup) -> StructArray:
+        """Return those of a run with a setup."""
+        found = self._stretch(setup)
+        if self._kept is None:
+            self._kept = not_blunders(found) & _usable(found)
+            self._kept[self._kept] = _not_outlying(found[self._kept])
+        return found[self._kept]
+
     def matched(self, setup: Setup) -> Hypothesis:
         """Return a setup with the scales that go with its shares."""
         for left in reversed(range(ROUNDS)):
-            found = self._stretch(setup)
-            if self._kept is None:
-                self._kept = not_blunders(found) & _usable(found)
-                self._kept[self._kept] = _not_outlying(found[self._kept])
-            found = found[self._kept]
+            found = self.innovations(setup)
             other, won = rescaled(setup, found)
             if not won or not left:
                 break

@@ -30,7 +30,8 @@ GYRO_BIAS, ACCEL_BIAS, GYRO_SCALE, ACCEL_SCALE = 10, 13, 16, 19
 LEVER_ARM, TIME_OFFSET, SLOW, HEIGHT_BIAS = 22, 25, 26, 29
 GYRO_LEAN, ACCEL_LEAN = 30, 33  # rad, of axes y and z, z and x, x and y towards each other
 SLOW_VELOCITY = 36
-STATE_SIZE = 39
+SLOW_HEADING = 39  # of the heading and of the pitch of a baseline
+STATE_SIZE = 41
 
 # Sums over a step of the covariance: ∫ C dt, ∫ C diag(ω) dt, ∫ C diag(f) dt by rows, ∫ dt, and the means of last
 SUM_TURN, SUM_RATE, SUM_FORCE, SUM_TIME = 0, 9, 18, 27

@@ -29,7 +29,6 @@ from daemon.processing.navigation_observations import (
     heading_observations,
     heading_times,
     ins_observations,
-    white_factor,
 )
 from daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
 from daemon.processing.navigation_times import counted_arrivals, imu_times
@@ -38,6 +37,7 @@ from drivers.core.parser import DeviceSettings
 from drivers.gnss.nmea import NmeaParser
 from drivers.gnss.nmea_sentences import encode_gga
 from georef.formats.antenna_positions import read_antenna_positions
+from georef.navigation.alignment_noise import white_factor
 from georef.navigation.diagnosis_data import Finding
 from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Kind
 from georef.records import (
@@ -141,7 +141,7 @@ class TestOfALog:
         rows = inputs.legs[0].observations
         rows, truth = rows[rows["kind"] == Kind.HEADING], flown.truth()
         rows = rows[truth.fates(rows["time_ns"]) == 0]
-        assert len(rows) == 5
+        assert len(rows) == 90
         assert inputs.setup.baseline_b == pytest.approx(BASELINE)
         _, _, heading = truth.attitude()
         at = np.interp(rows["time_ns"] - truth.time_ns[0], truth.time_ns - truth.time_ns[0], np.unwrap(heading))
@@ -177,7 +177,7 @@ class TestOfALog:
 
     def test_nothing_is_doubted_and_nothing_missing(self, inputs: NavigationInputs) -> None:
         assert (inputs.doubts, inputs.holes) == ([], [])
-        assert set(inputs.refused) == {"heading_repeats_neighbours"}
+        assert inputs.refused == {}
 
     def test_the_logs_own_configuration_needs_no_file_beside_it(
         self, flown: Flown, inputs: NavigationInputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -370,7 +370,7 @@ class TestHeadings:
         short, long = (heading_observations([self.heading()], [5], length).rows["sigma"][0, 0] for length in (0.5, 5.0))
         assert short / long == pytest.approx(10.0, rel=1e-3)
         said = heading_observations([self.heading(heading_sigma_rad=0.1)], [5], 1.0)
-        assert said.rows["sigma"][0, 0] == pytest.approx(0.1 * white_factor(5 * S, 0.6, 60.0))
+        assert said.rows["sigma"][0, 0] == 0.1
         assert np.isnan(said.rows["value"][0, 1])
 
     def test_one_without_time_is_of_the_fix_that_came_with_it(self) -> None:
@@ -390,12 +390,14 @@ def test_correlated_errors_average_as_slowly_as_white_ones_with_their_factor(
     assert white_factor(round(step_s * S), share, tau_s) ** 2 / n == pytest.approx(covariance.mean(), rel=0.02)
 
 
-def test_headings_that_repeat_their_neighbours_are_thinned() -> None:
-    headings = [GnssHeading(at, TimeTag(TimeScale.GPS, 0), 0.01 * at) for at in range(60)]
-    found = heading_observations(headings, [at * 200_000_000 for at in range(60)], 1.0)
-    assert found.rows["time_ns"].tolist() == [0, 5 * S, 10 * S]
-    assert found.rows["value"][:, 0] == pytest.approx([0.0, 0.25, 0.5])
-    assert found.refused == {"repeats_neighbours": 57}
+def test_each_heading_is_taken_once() -> None:
+    """However quickly they follow each other: the filter knows that their errors last."""
+    headings = [GnssHeading(at, TimeTag(TimeScale.GPS, 0), 0.01 * at, heading_sigma_rad=2e-3) for at in range(60)]
+    found = heading_observations([*headings, headings[7]], [at * 200_000_000 for at in [*range(60), 7]], 1.0)
+    assert found.rows["time_ns"].tolist() == [at * 200_000_000 for at in range(60)]
+    assert found.rows["value"][:, 0] == pytest.approx(0.01 * np.arange(60))
+    assert found.rows["sigma"][:, 0] == pytest.approx(2e-3)
+    assert found.refused == {"repeated_in_epoch": 1}
 
 
 def test_attitudes_of_an_ins_are_few_and_only_of_solutions() -> None:

@@ -20,6 +20,7 @@ from tests.georef.navigation.vehicles import Motion, ns, observed
 
 FloatArray = NDArray[np.float64]
 PLACE = (np.radians(47.0), np.radians(8.0), 900.0)
+BASELINE_B = np.array([2.0, 0.0, 0.0])
 
 
 def survey(speed_mps: float = 60.0, line_s: float = 40.0) -> Motion:
@@ -89,7 +90,10 @@ def fly(motion: Motion, seconds: float, rate_hz: float) -> Truth:
 
 @dataclass(frozen=True)
 class Fixes:
-    """GNSS of the made flight: sigmas of position and velocity, shares of their variances that last, for how long."""
+    """GNSS of the made flight: sigmas of position, velocity and heading, shares of their variances that last, how long.
+
+    Pitch of the baseline, forward `BASELINE_B`, errs twice as much as heading; 0: there is no second antenna.
+    """
 
     sigma_m: tuple[float, float, float] = (0.01, 0.01, 0.02)
     share: float = 0.0
@@ -99,6 +103,9 @@ class Fixes:
     first_s: float = 0.3217
     velocity_share: float = 0.0
     velocity_tau_s: float = 2.0
+    heading_rad: float = 0.0
+    heading_share: float = 0.0
+    heading_tau_s: float = 60.0
 
 
 def markov(rng: np.random.Generator, steps: int, columns: int, step_s: float, tau_s: float) -> FloatArray:
@@ -148,7 +155,23 @@ def noised(
         speed = speed + fixes.velocity_mps * error
         sigma = np.full(3, fixes.velocity_mps)
         rows = np.concatenate([rows, observed(Kind.VELOCITY, t, speed, sigma, FixType.RTK_FIXED)])
+    if fixes.heading_rad:
+        line = np.einsum("nji,nj->ni", here, at.rot_e_from_b @ BASELINE_B)
+        rows = np.concatenate([rows, _directions(t, line, fixes, np.random.default_rng([seed, 7]))])
     return inertial, rows
+
+
+def _directions(t: FloatArray, line_l: FloatArray, fixes: Fixes, rng: np.random.Generator) -> StructArray:
+    """Headings and pitches of a baseline (n, 3) north, east, down, with their errors."""
+    sigma = fixes.heading_rad * np.array([1.0, 2.0])
+    lasting = markov(rng, len(t), 2, 1.0 / fixes.rate_hz, fixes.heading_tau_s)
+    error = np.sqrt(fixes.heading_share) * lasting + np.sqrt(1.0 - fixes.heading_share) * rng.standard_normal(
+        (len(t), 2)
+    )
+    north, east, down = line_l.T
+    angles = np.stack([np.arctan2(east, north), -np.arctan2(down, np.hypot(north, east))], axis=1) + sigma * error
+    unsaid = np.full(len(t), np.nan)
+    return observed(Kind.HEADING, t, np.column_stack([angles, unsaid]), np.append(sigma, np.nan), FixType.RTK_FIXED)
 
 
 def drawn_start(

@@ -29,6 +29,7 @@ from georef.navigation.strapdown import (
     HEIGHT_BIAS,
     LEVER_ARM,
     SLOW,
+    SLOW_HEADING,
     SLOW_VELOCITY,
     STATE_SIZE,
     TIME_OFFSET,
@@ -48,6 +49,7 @@ SETUP = Setup(
     estimate_time_offset_s=0.1,
     gnss_correlated_share=0.4,
     gnss_velocity_share=0.3,
+    gnss_heading_share=0.2,
 )
 LAYOUT = layout_of(SETUP, heights=True)
 SENSORS = slice(MOVED, LAYOUT.core)
@@ -57,8 +59,8 @@ PLACES = {
     "antimeridian": (-0.6, np.pi),
     "near a pole": (1.57, 1.0),
 }
-STEPS = np.array([1.0, 0.1, 1e-4, 1e-4, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 0.1, 1e-2, 0.5, 0.5, 1.0])
-OF_STATES = [3, 3, 3, 3, 3, 3, 3, 3, 3, 3, 1, 3, 3, 1]
+STEPS = np.array([1.0, 0.1, 1e-4, 1e-4, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 0.1, 1e-2, 0.5, 0.5, 0.5, 1.0])
+OF_STATES = [3, 3, 3, 3, 3, 3, 3, 3, 3, 3, 1, 3, 3, 2, 1]
 STEP = np.repeat(STEPS, OF_STATES)  # of each error
 
 
@@ -73,7 +75,7 @@ def state_at(lat: float, lon: float, rng: np.random.Generator) -> FloatArray:
     x[GYRO_LEAN : GYRO_LEAN + LEANS] = 3e-4 * rng.standard_normal(LEANS)
     x[LEVER_ARM : LEVER_ARM + 3], x[TIME_OFFSET] = SETUP.lever_arms_b[0], 0.02
     x[SLOW : SLOW + 3], x[SLOW_VELOCITY : SLOW_VELOCITY + 3] = [0.3, -0.7, 1.1], [-0.4, 0.9, 0.2]
-    x[HEIGHT_BIAS] = 4.0
+    x[SLOW_HEADING : SLOW_HEADING + 2], x[HEIGHT_BIAS] = [0.8, -0.5], 4.0
     return x
 
 

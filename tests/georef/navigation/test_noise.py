@@ -43,6 +43,7 @@ def test_sigmas_are_scaled_up_and_down_by_kind_fix_type_and_axis() -> None:
             innovations(Kind.POSITION, FIXED, (3.0, 3.0, 1.5)),
             innovations(Kind.POSITION, FLOAT, (0.4, 0.4, 0.4)),
             innovations(Kind.VELOCITY, FIXED, (0.15, 0.15, 0.3)),
+            innovations(Kind.HEADING, FIXED, (1.5, 1.5, 1.5)),
         ]
     )
     found, won = rescaled(Setup(GRADES["tactical"], gnss_sigma_scale={FIXED: 2.0}), rows)
@@ -50,6 +51,7 @@ def test_sigmas_are_scaled_up_and_down_by_kind_fix_type_and_axis() -> None:
     assert found.gnss_vertical_scale == pytest.approx({FIXED: 0.5, FLOAT: 1.0}, rel=0.06)
     assert found.gnss_velocity_scale == pytest.approx({FIXED: 0.15}, rel=0.06)
     assert found.gnss_velocity_vertical_scale == pytest.approx({FIXED: 2.0}, rel=0.06)
+    assert found.gnss_heading_scale == pytest.approx(1.5, rel=0.06)
     assert min(won.values()) > EVIDENCE
 
 
@@ -65,15 +67,6 @@ def test_an_outlier_says_nothing_of_the_others() -> None:
     rows = innovations(Kind.POSITION, FIXED, (1.0, 1.0, 1.0))
     rows["normalised"][100], rows["chi2"][100] = 60.0, 3 * 3600.0
     assert second_moments(rows)[0][int(Kind.POSITION), FIXED, False] == pytest.approx(1.0, abs=0.1)
-
-
-def test_headings_are_compared_with_the_sigma_that_the_receiver_told() -> None:
-    """Theirs was made three times as large because neighbours repeat each other: innovations of a third are as told."""
-    setup = Setup(GRADES["tactical"], heading_repeats=3.0)
-    third, half = 1.0 / 3.0, 0.5
-    assert rescaled(setup, innovations(Kind.HEADING, FIXED, (third,) * 3))[0].gnss_heading_scale == 1.0
-    found, _ = rescaled(setup, innovations(Kind.HEADING, FIXED, (half,) * 3))
-    assert found.gnss_heading_scale == pytest.approx(1.5, rel=0.06)
 
 
 @cache
