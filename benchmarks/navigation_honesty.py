@@ -1,6 +1,6 @@
 """Whether sigmas are what errors are, over many flights: NEES of position, velocity, attitude; innovations.
 
-python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …] | --lasting]
+python -m benchmarks.navigation_honesty [--seeds 50] [--receivers [NAME …] | --lasting | --headings [GRADE …]]
 
 Made flights of ten minutes at 60 m/s, 50 Hz, fixes at 1 Hz with white errors and with errors that last a minute (70 %
 of the variance), the filter told of it. Truth and inertial samples are the simulator's. The interval is that of χ² at
@@ -16,6 +16,10 @@ is drawn once for the three sigmas, and takes some 2 s.
 ``--lasting``: instead of that, the UBX receiver with the tactical unit where another part of the positions' variance
 lasts than `solve` assumes, or for another time: NEES of position, errors over those of the smoother that knows, and
 sigmas over that smoother's, RMS, the worst of three components and all three together.
+
+``--headings``: instead of that, the UBX receiver with a second antenna that tells headings to 0.1° at 5 Hz, on lines of
+90 s, sigmas true, too small by 3, too large by 3: NEES of attitude, and errors and sigmas over those of the smoother
+that knows, RMS, the largest of roll, pitch and heading, and of heading alone. A flight takes some 10 s.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ from georef.navigation.inputs import GRADES, Fate, Solution
 from georef.navigation.smoother import forward, smooth
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
 from tests.georef.navigation.honesty import judge, squares
-from tests.georef.navigation.receivers import RECEIVERS, compared
+from tests.georef.navigation.receivers import DUAL_ANTENNAS, RECEIVERS, compared
 
 FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
@@ -102,15 +106,52 @@ def with_lasting(seeds: int) -> None:
         )
 
 
+@cache
+def long_lines() -> Truth:
+    """Ten minutes of lines of 90 s, and turns of a minute between them: headings show in turns only."""
+    return fly(survey(line_s=150.0), 600.0, 50.0)
+
+
+def with_headings(grades: list[str], seeds: int) -> None:
+    """Fly a receiver with two antennas whose headings err in several ways, and print a line each."""
+    head = f"{'NEES (99.8 %), ' + str(seeds) + ' flights':<50}{'attitude':>24}"
+    print(f"{head}   errors / best: worst, heading   sigma / best")
+    for grade in grades:
+        for name, receiver in DUAL_ANTENNAS.items():
+            found: dict[str, list[FloatArray]] = {words: [] for words in ("known", *OPTIMISMS)}
+            errors = {words: np.zeros((2, 9)) for words in OPTIMISMS}
+            variances = {words: np.zeros(2) for words in OPTIMISMS}
+            for seed in range(2000, 2000 + seeds):
+                flights = compared(long_lines(), receiver, grade, seed, OPTIMISMS.values())
+                for words, one in zip(OPTIMISMS, flights, strict=True):
+                    found[words].append(squares(long_lines(), one.solved.smoothed, 5.0, 0.5))
+                    errors[words] += one.squares(long_lines())
+                    both = one.solved.smoothed, one.best
+                    variances[words] += [np.square(run.attitude_sigma_rad[:, 2]).mean() for run in both]
+                found["known"].append(squares(long_lines(), one.best, 5.0, 0.5))
+            for words, squared in found.items():
+                of = judge(squared)["attitude"]
+                line = f"{f'{name}, {grade}, {words}':<50}{of.mean:>8.2f} ({of.low:.2f} … {of.high:.2f})"
+                if words in errors:
+                    ratio = np.sqrt(errors[words][0] / errors[words][1])
+                    wider = float(np.sqrt(variances[words][0] / variances[words][1]))
+                    line += f"{ratio[6:].max():>12.3f}{ratio[8]:>8.3f}{wider:>12.2f}"
+                print(line, flush=True)
+
+
 def main() -> None:
     """Fly and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=50, help="flights of each kind")
     parser.add_argument("--receivers", nargs="*", choices=RECEIVERS, help="these receivers (none named: all)")
     parser.add_argument("--lasting", action="store_true", help="errors that last otherwise than is assumed")
+    parser.add_argument("--headings", nargs="*", choices=("tactical", "mems"), help="two antennas (none named: both)")
     arguments = parser.parse_args()
     if arguments.receivers is not None:
         with_receivers(arguments.receivers or list(RECEIVERS), arguments.seeds)
+        return
+    if arguments.headings is not None:
+        with_headings(arguments.headings or ["tactical", "mems"], arguments.seeds)
         return
     if arguments.lasting:
         with_lasting(arguments.seeds)

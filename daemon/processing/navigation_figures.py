@@ -16,7 +16,7 @@ from daemon.processing.navigation_series import (
     outages_of,
     used_positions,
 )
-from georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Solution
+from georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Setup, Solution
 from georef.records import FixType, StructArray
 from georef.timescales.gps_time import SECOND_NS
 
@@ -75,8 +75,16 @@ def figures_of(flight: Flight, separation: Separation | None) -> Figures:
         "lasting_share": flight.setup.gnss_correlated_share,
         "lasting_velocity_share": flight.setup.gnss_velocity_share,
         "lasting_velocity_s": flight.setup.gnss_velocity_correlation_s if flight.setup.gnss_velocity_share else None,
+        "lasting_heading_share": flight.setup.gnss_heading_share if flight.setup.baseline_b is not None else None,
+        "lasting_heading_s": _heading_s(flight.setup),
         "counts": {name: int(count) for name, count in sorted(flight.forward.counts.items())},
     }
+
+
+def _heading_s(setup: Setup) -> float | None:
+    """Return how long errors of headings are taken to last; None where none do."""
+    lasts = setup.baseline_b is not None and setup.gnss_heading_share > 0.0
+    return setup.gnss_heading_correlation_s if lasts else None
 
 
 def _not_finite(solution: Solution) -> int:

@@ -327,6 +327,8 @@ def _run(figures: Figures) -> str:
         ["share of positions' variance that lasts", _number(figures["lasting_share"], ".2f")],
         ["share of velocities' variance that lasts", _number(figures["lasting_velocity_share"], ".2f")],
         ["how long velocities' errors last, s", _number(figures["lasting_velocity_s"], ".1f")],
+        ["share of headings' variance that lasts", _number(figures["lasting_heading_share"], ".2f")],
+        ["how long headings' errors last, s", _number(figures["lasting_heading_s"], ".1f")],
         *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items()),
     ]
     return "<h2>The run</h2>" + _table(("", ""), rows)

@@ -18,6 +18,7 @@ from georef.earth import geodetic_from_e, rot_e_from_l
 from georef.navigation.cross_covariance import ErrorChain, error_chain
 from georef.navigation.error_model import MOVED
 from georef.navigation.filter import FilterRun, run_filter, start_state
+from georef.navigation.heading_noise import find_heading_noise
 from georef.navigation.inputs import Inertial, Setup, Solution, Start
 from georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
 from georef.navigation.smoother import SmoothedNodes, difference, forward, smooth_nodes, solution_of
@@ -94,7 +95,7 @@ def solve(
         inertial, observations: of it, observations in any order.
         setup, start: of the first pass.
         noise_from_flight: look how good GNSS is, and go by what is found: factors on the sigmas of positions and
-            velocities by fix type and of headings, and which share of the positions' errors lasts; see `noise`.
+            velocities by fix type and of headings, and which share of their errors lasts; see `noise`, `heading_noise`.
         storage: where the runs and the solutions are kept.
     """
     run = run_filter(inertial, observations, setup, start, storage=storage)
@@ -125,7 +126,8 @@ def solve(
 
 def _noise(inertial: Inertial, observations: StructArray, setup: Setup, start: Start, run: FilterRun) -> NoiseFound:
     """Find the noise on the first `STRETCH_S` seconds."""
-    return find_noise(run.innovations, stretch_of(inertial, observations, start), setup)
+    stretch = stretch_of(inertial, observations, start)
+    return find_heading_noise(find_noise(run.innovations, stretch, setup), run.innovations, stretch)
 
 
 def stretch_of(inertial: Inertial, observations: StructArray, start: Start) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -13,12 +14,13 @@ from georef.navigation.inputs import GRADES, Kind, Setup, Solution
 from georef.navigation.smoother import smooth
 from georef.navigation.solve import Solved, solve
 from georef.records import StructArray
-from tests.georef.navigation.flights import Fixes, Truth, drawn_start, errors, noised
+from tests.georef.navigation.flights import BASELINE_B, Fixes, Truth, drawn_start, errors, noised
 from tests.georef.navigation.vehicles import ns
 
 FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 SHARE, TAU_S = 0.5, 60.0  # of the positions' variance that lasts
+HEADING_SHARE = 0.36  # of the headings', as `swath trajectory` assumes
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Receiver:
         place, speed = rows["kind"] == Kind.POSITION, rows["kind"] == Kind.VELOCITY
         rows["sigma"][place] = np.array(self.position_m or self.fixes.sigma_m) / optimism
         rows["sigma"][speed] = self.velocity_mps or np.full(3, self.fixes.velocity_mps / optimism)
+        rows["sigma"][rows["kind"] == Kind.HEADING] /= optimism
         return rows
 
 
@@ -50,6 +53,12 @@ RECEIVERS = {
     "NovAtel": Receiver(Fixes((0.01, 0.01, 0.02), SHARE, TAU_S, 5.0, 0.02), velocity_mps=(0.03, 0.03, 0.06)),
     "UBX": Receiver(Fixes((0.014, 0.014, 0.02), SHARE, TAU_S, 5.0, 0.03)),
     "NMEA": Receiver(Fixes((0.01, 0.01, 0.02), SHARE, TAU_S, 1.0), position_m=(0.02, 0.02, 0.04)),
+}
+_DIRECTIONS = replace(RECEIVERS["UBX"].fixes, heading_rad=math.radians(0.1))
+DUAL_ANTENNAS = {
+    "white": Receiver(_DIRECTIONS),
+    "half lasting 60 s": Receiver(replace(_DIRECTIONS, heading_share=0.5, heading_tau_s=60.0)),
+    "half lasting 10 s": Receiver(replace(_DIRECTIONS, heading_share=0.5, heading_tau_s=10.0)),
 }
 
 
@@ -74,11 +83,16 @@ class Compared:
 def compared(truth: Truth, receiver: Receiver, grade: str, seed: int, optimisms: Iterable[float]) -> Iterator[Compared]:
     """Fly one flight of a receiver, and navigate it for each factor by which its sigmas are too small.
 
-    Assumed is that `SHARE` of the positions' variance lasts for `TAU_S`, whatever is true of the receiver.
+    Assumed is that `SHARE` of the positions' variance lasts for `TAU_S`, of headings `HEADING_SHARE`, whatever is true
+    of the receiver.
     """
     inertial, rows = noised(truth, GRADES[grade], receiver.fixes, ARM, seed)
     start = drawn_start(truth, seed)
     setup = Setup(GRADES[grade], ARM[None], gnss_correlated_share=SHARE, gnss_correlation_s=TAU_S)
+    if receiver.fixes.heading_rad:
+        setup = replace(
+            setup, baseline_b=BASELINE_B, gnss_heading_share=HEADING_SHARE, gnss_heading_correlation_s=TAU_S
+        )
     knowing = replace(
         setup,
         position_floor_m=1e-3,
@@ -87,6 +101,9 @@ def compared(truth: Truth, receiver: Receiver, grade: str, seed: int, optimisms:
         gnss_correlation_s=receiver.fixes.tau_s,
         gnss_velocity_share=receiver.fixes.velocity_share,
         gnss_velocity_correlation_s=receiver.fixes.velocity_tau_s,
+        attitude_floor_rad=1e-6,
+        gnss_heading_share=receiver.fixes.heading_share,
+        gnss_heading_correlation_s=receiver.fixes.heading_tau_s,
     )
     best = smooth(run_filter(inertial, rows, knowing, start))
     for optimism in optimisms:

@@ -1,0 +1,146 @@
+"""What a flight says of a second antenna's headings: which part of their errors lasts, and for how long.
+
+Twenty flights of each kind are `python -m benchmarks.navigation_honesty --headings`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from georef.navigation.alignment_noise import HEADING_STEP_NS, spaced_headings
+from georef.navigation.filter import run_filter
+from georef.navigation.heading_noise import find_heading_noise
+from georef.navigation.inputs import GRADES, Kind, Setup
+from georef.navigation.noise import EVIDENCE, NoiseFound
+from georef.navigation.smoother import smooth
+from georef.navigation.solve import stretch_of
+from georef.quaternions import conjugate, product, rotation_vector
+from georef.records import FixType
+from tests.georef.navigation.flights import BASELINE_B, Truth, drawn_start, fly, noised, survey
+from tests.georef.navigation.honesty import judge, squares
+from tests.georef.navigation.receivers import ARM, DUAL_ANTENNAS, HEADING_SHARE, SHARE, TAU_S, Receiver, compared
+from tests.georef.navigation.vehicles import ns, observed
+
+pytestmark = pytest.mark.xdist_group("kernels")
+
+FloatArray = NDArray[np.float64]
+
+
+@cache
+def flight(seconds: float) -> Truth:
+    """Lines of 90 s: heading shows in the turns between them."""
+    return fly(survey(line_s=150.0), seconds, 50.0)
+
+
+def knowing(receiver: Receiver, grade: str) -> Setup:
+    """A setup that is told the truth."""
+    fixes = receiver.fixes
+    return Setup(
+        GRADES[grade],
+        ARM[None],
+        baseline_b=BASELINE_B,
+        gnss_correlated_share=fixes.share,
+        gnss_correlation_s=fixes.tau_s,
+        gnss_heading_share=fixes.heading_share,
+        gnss_heading_correlation_s=fixes.heading_tau_s,
+        position_floor_m=1e-3,
+        velocity_floor_mps=1e-3,
+        attitude_floor_rad=1e-6,
+    )
+
+
+def found_of(receiver: Receiver, seconds: float, seed: int, *, doubted: bool = False) -> tuple[Setup, NoiseFound]:
+    """What is found of its headings where positions and velocities are known, and the setup that was assumed."""
+    inertial, rows = noised(flight(seconds), GRADES["tactical"], receiver.fixes, ARM, seed)
+    start = drawn_start(flight(seconds), seed)
+    assumed = replace(knowing(receiver, "tactical"), gnss_heading_share=HEADING_SHARE, gnss_heading_correlation_s=TAU_S)
+    stretch = stretch_of(inertial, rows, start)
+    nothing = NoiseFound(assumed, (), {}, {}, doubted=doubted)
+    return assumed, find_heading_noise(nothing, stretch(assumed), stretch)
+
+
+def test_white_headings_are_found_to_be_white() -> None:
+    _, found = found_of(DUAL_ANTENNAS["white"], 180.0, 3)
+    assert found.setup.gnss_heading_share == 0.0
+    assert found.setup.gnss_heading_scale == pytest.approx(1.0, abs=0.06)
+    assert found.heading_evidence > EVIDENCE
+
+
+def test_headings_whose_errors_last_for_seconds_are_found() -> None:
+    """Half of the variance for 10 s: white and lasting sigma to a tenth and a fifth, the time to a factor."""
+    _, found = found_of(DUAL_ANTENNAS["half lasting 10 s"], 240.0, 3)
+    scale, share = found.setup.gnss_heading_scale, found.setup.gnss_heading_share
+    assert scale * np.sqrt(1.0 - share) == pytest.approx(np.sqrt(0.5), rel=0.1)
+    assert scale * np.sqrt(share) == pytest.approx(np.sqrt(0.5), rel=0.2)
+    assert 6.0 < found.setup.gnss_heading_correlation_s < 17.0
+    assert found.heading_evidence > EVIDENCE
+
+
+@pytest.mark.parametrize("doubted", [False, True], ids=["few", "doubted"])
+def test_headings_keep_what_is_assumed_where_nothing_may_be_found(doubted: bool) -> None:
+    """Fewer than sixty, whatever they are; and where positions are too far off to be noise."""
+    seconds = 180.0 if doubted else 11.0
+    assumed, found = found_of(DUAL_ANTENNAS["white"], seconds, 3, doubted=doubted)
+    assert found.setup is assumed
+    assert found.heading_evidence == 0.0
+
+
+def test_errors_with_headings_that_last_are_as_large_as_their_sigmas() -> None:
+    """12 flights, told the truth of headings: NEES of attitude within 99.8 % of what chance allows."""
+    receiver = DUAL_ANTENNAS["half lasting 10 s"]
+    flights = []
+    for seed in range(12):
+        inertial, rows = noised(flight(240.0), GRADES["mems"], receiver.fixes, ARM, seed)
+        run = run_filter(inertial, rows, knowing(receiver, "mems"), drawn_start(flight(240.0), seed))
+        headings = run.innovations[run.innovations["kind"] == Kind.HEADING]
+        white = headings["normalised"][:, 0]
+        assert abs(np.mean(white[1:] * white[:-1])) < 0.12
+        flights.append(squares(flight(240.0), smooth(run), 5.0, 0.5))
+    for part, honesty in judge(flights).items():
+        assert honesty.holds, (part, honesty)
+
+
+def test_alignment_takes_headings_so_far_apart_that_they_tell_something_new() -> None:
+    """The mean of many has the variance that lasting errors leave it; white headings are all taken."""
+    t = np.arange(0.0, 200.0, 0.2)
+    rows = observed(Kind.HEADING, t, np.zeros(3), np.full(3, 0.01), FixType.RTK_FIXED)
+    setup = Setup(GRADES["mems"], gnss_heading_share=0.5, gnss_heading_correlation_s=10.0)
+    spaced = spaced_headings(rows, setup)
+    assert (np.diff(spaced["time_ns"]) == HEADING_STEP_NS).all()
+    covariance = 1e-4 * 0.5 * np.exp(-np.abs(np.subtract.outer(t, t)) / 10.0)
+    variance = covariance[::25, ::25].mean() + 1e-4 * 0.5 / len(spaced)
+    assert spaced["sigma"][0, 0] ** 2 / len(spaced) == pytest.approx(variance, rel=0.1)
+    assert rows["time_ns"][0] == ns(0.0)
+    assert (rows["sigma"] == 0.01).all()
+    assert len(spaced_headings(rows, replace(setup, gnss_heading_share=0.0))) == len(t)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DUAL_ANTENNAS)
+@pytest.mark.parametrize("grade", ["tactical", "mems"])
+def test_a_flight_with_two_antennas_is_navigated_as_if_its_noise_were_known(grade: str, name: str) -> None:
+    """3 flights of ten minutes, sigmas true, too small by 3, too large by 3: attitudes lie within a quarter sigma of
+    those of the smoother that knows, which adds 3 % to their errors, and sigmas are that smoother's to a tenth.
+
+    Errors of attitude last for a whole flight: whether they are as large as their sigmas, many flights tell.
+    """
+    apart, variances = [], np.zeros((2, 3))
+    for seed, optimism in enumerate((1.0, 3.0, 1.0 / 3.0)):
+        (one,) = compared(flight(600.0), DUAL_ANTENNAS[name], grade, 100 + seed, (optimism,))
+        both = one.solved.smoothed, one.best
+        turned = rotation_vector(product(conjugate(one.best.q_e_from_b), one.solved.smoothed.q_e_from_b))
+        apart.append(np.mean((np.linalg.norm(turned, axis=1) / one.best.attitude_sigma_rad.max(axis=1)) ** 2))
+        variances += [np.square(run.attitude_sigma_rad).mean(axis=0) for run in both]
+    assert np.sqrt(np.mean(apart)) < 0.25
+    np.testing.assert_allclose(np.sqrt(variances[0] / variances[1]), 1.0, atol=0.1)
+
+
+@pytest.mark.slow
+def test_positions_share_is_found_beside_headings_as_without_them() -> None:
+    (one,) = compared(flight(600.0), DUAL_ANTENNAS["half lasting 10 s"], "tactical", 7, (1.0,))
+    assert abs(one.solved.report.setup.gnss_correlated_share - SHARE) < 0.2
