@@ -147,10 +147,10 @@ def input_doubts(
 def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Finding]:
     """Return a warning where a receiver's heights may be those above the geoid.
 
-    GGA tells the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11). A
-    separation that is 0 in every sentence is none: the altitude may then be either height.
+    GGA and GNS tell the height above the receiver's geoid and the geoid's height above the ellipsoid (NMEA 0183 v4.11).
+    A separation that is 0 in every sentence is none: the altitude may then be either height.
     """
-    told = [fix for fix in found.fixes if fix.message == "GGA" and fix.valid and fix.height_m is not None]
+    told = [fix for fix in found.fixes if fix.message in ("GGA", "GNS") and fix.valid and fix.height_m is not None]
     if len(told) < FEWEST_HEIGHTS or any(fix.undulation_m != 0.0 for fix in told):
         return []
     fix = told[len(told) // 2]
@@ -158,9 +158,9 @@ def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Fi
     known = geoid_undulation(e_from_geodetic(*place))
     size = "up to 107 m" if known is None else f"{known[0]:.1f} m ({known[1]})"
     text = (
-        f"all {len(told):,} GGA of {sources.gnss_source} say that geoid and ellipsoid are one (separation 0.0 m), as "
-        "they are nowhere on a whole flight: unless its altitudes are ellipsoidal already, heights are wrong by the "
-        f"geoid's, {size}; let the receiver send its geoid separation, or compare with control"
+        f"all {len(told):,} {fix.message} of {sources.gnss_source} say that geoid and ellipsoid are one (separation "
+        "0.0 m), as they are nowhere on a whole flight: unless its altitudes are ellipsoidal already, heights are "
+        f"wrong by the geoid's, {size}; let the receiver send its geoid separation, or compare with control"
     )
     return [Finding("geoid_unsaid", "warning", text)]
 

@@ -1,13 +1,15 @@
-"""NMEA 0183: GGA, RMC, ZDA, VTG, GST and HDT of any talker (NMEA 0183 v4.11; u-blox and NovAtel manuals agree).
+"""NMEA 0183: GGA, GNS, RMC, ZDA, VTG, GST and HDT of any talker (v4.11; u-blox and NovAtel manuals agree).
 
 Time: RMC and ZDA name the previous PPS edge, in UTC. RMC vouches for its time by status A; ZDA says nothing itself and
-is believed while the stream's latest GGA or RMC has a fix, or where it has neither of them. A tag off the whole
+is believed while the stream's latest GGA, GNS or RMC has a fix, or where it has none of them. A tag off the whole
 second does not vote.
 
-Fix: the sentences of one time of day make one `GnssFix` (`drivers.gnss.epochs`): position and quality of GGA, of RMC
-where there is no GGA; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and so
-belongs to the epoch it comes in; sigmas of GST. Height is GGA's altitude plus its geoid separation, None where the
-receiver leaves either empty. No vertical velocity. Empty fields are a receiver without a fix, not an error.
+Fix: the sentences of one time of day make one `GnssFix` (`drivers.gnss.epochs`): position and quality of GGA, else of
+GNS, else of RMC; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and so
+belongs to the epoch it comes in; sigmas of GST. Height is the altitude plus the geoid separation of GGA or GNS, None
+where the receiver leaves either empty. No vertical velocity. Empty fields are a receiver without a fix, not an error.
+GNS has a mode for each constellation; the best of them is the fix's, as one position is made of all. Where a receiver
+adds a GNS for each constellation, these have no mode and tell satellites only: they are not taken.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ FIX_TYPE_BY_QUALITY = {
     8: FixType.SIMULATED,
     9: FixType.DIFFERENTIAL,
 }
-# RMC field 12 and VTG field 9, mode indicator; sentences older than NMEA 2.3 have none
+# mode indicator, RMC field 12, VTG field 9 and, of each constellation, GNS field 6; before NMEA 2.3 there was none
 FIX_TYPE_BY_MODE = {
     "": FixType.SINGLE,
     "A": FixType.SINGLE,
@@ -64,6 +66,8 @@ FIX_TYPE_BY_MODE = {
     "S": FixType.SIMULATED,
     "N": FixType.NONE,
 }
+MODES_BEST_FIRST = "RFDPAEMS"
+POSITION_SENTENCES = ("GGA", "GNS", "RMC")  # the first that is there says position and quality
 VOUCHED = frozenset(
     {FixType.SINGLE, FixType.DIFFERENTIAL, FixType.RTK_FLOAT, FixType.RTK_FIXED}  # satellites, not a guess
 )
@@ -99,9 +103,10 @@ class NmeaParser(StreamParser):
         self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
         self._time_only = time_only
-        self._has_fix: bool | None = None  # by the latest GGA or RMC
+        self._has_fix: bool | None = None  # by the latest GGA, GNS or RMC
         self._decoders: dict[bytes, Callable[[int, Sentence], list[Record]]] = {
             b"GGA": self._gga,
+            b"GNS": self._gns,
             b"RMC": self._rmc,
             b"ZDA": self._zda,
         }
@@ -138,6 +143,16 @@ class NmeaParser(StreamParser):
     def _gga(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
         quality = sentence.number("gps_qual")
         fix_type = FIX_TYPE_BY_QUALITY.get(int(quality), FixType.NONE) if quality is not None else FixType.NONE
+        return self._solution(host_time_ns, sentence, fix_type, "GGA")
+
+    def _gns(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        modes = sentence.text("mode_indicator")
+        if not modes:
+            return []
+        mode = next((mode for mode in MODES_BEST_FIRST if mode in modes), "N")
+        return self._solution(host_time_ns, sentence, FIX_TYPE_BY_MODE[mode], "GNS")
+
+    def _solution(self, host_time_ns: int, sentence: Sentence, fix_type: FixType, name: str) -> list[Record]:
         time_ns, position = sentence.time_ns(), sentence.position_rad()
         altitude, separation = sentence.number("altitude"), sentence.number("geo_sep")
         satellites = sentence.number("num_sats")
@@ -151,7 +166,7 @@ class NmeaParser(StreamParser):
             int(satellites) if satellites is not None else None,
             undulation_m=separation,
         )
-        return self._add("GGA", part)
+        return self._add(name, part)
 
     def _rmc(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
         time_ns, date = sentence.time_ns(), self._meant(sentence.date_ddmmyy(), host_time_ns)
@@ -218,8 +233,9 @@ class NmeaParser(StreamParser):
 
 
 def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
-    """One fix of an epoch's sentences; None where neither GGA nor RMC is among them."""
-    solution = parts.get("GGA") or parts.get("RMC")
+    """One fix of an epoch's sentences; None where none that says a position is among them."""
+    message = next((name for name in POSITION_SENTENCES if name in parts), "")
+    solution = parts.get(message)
     if solution is None or solution.fix_type is None or solution.time_ns is None:
         return None
     others = [parts[name] for name in ("RMC", "VTG", "ZDA", "GST") if name in parts]
@@ -237,7 +253,7 @@ def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
         fix_type=solution.fix_type,
         satellites=solution.satellites,
         valid=solution.fix_type in VOUCHED and lat_rad is not None,
-        message="GGA" if "GGA" in parts else "RMC",
+        message=message,
         undulation_m=solution.undulation_m,
     )
 
@@ -248,7 +264,7 @@ DRIVERS = (
         kind="gnss",
         transports=("serial",),
         yields=(TimeMessage, GnssFix, GnssHeading),
-        summary="NMEA 0183 sentences of any receiver (GGA RMC ZDA VTG GST HDT)",
+        summary="NMEA 0183 sentences of any receiver (GGA GNS RMC ZDA VTG GST HDT)",
         make_parser=NmeaParser,
         make_time_parser=lambda settings: NmeaParser(settings, time_only=True),
         names_edge=NamesEdge.PREVIOUS,

@@ -292,6 +292,43 @@ def test_a_height_without_separation_is_not_said() -> None:
     assert fix.valid
 
 
+def test_gns_is_a_position_as_gga_is() -> None:
+    """A receiver's own (fixtures/nmea/pygpsdata-nmea4.log): 56.0 m above a geoid that is 48.5 m above the ellipsoid."""
+    records, parser = parse(b"$GNGNS,103607.00,5327.03942,N,00214.42462,W,AANN,06,5.88,56.0,48.5,,,V*34\r\n")
+    (fix,) = fixes(records)
+    assert math.degrees(fix.lat_rad or 0.0) == pytest.approx(53.450657, abs=1e-9)
+    assert math.degrees(fix.lon_rad or 0.0) == pytest.approx(-2.24041033333, abs=1e-9)
+    assert fix.height_m == pytest.approx(104.5)
+    assert (fix.fix_type, fix.valid, fix.satellites, fix.message) == (FixType.SINGLE, True, 6, "GNS")
+    assert parser.counters.errors == {}
+
+
+@pytest.mark.parametrize(
+    ("modes", "fix_type"),
+    [
+        ("RRNN", FixType.RTK_FIXED),
+        ("FA", FixType.RTK_FLOAT),
+        ("DAAN", FixType.DIFFERENTIAL),  # GGA of the same second: quality 2 (mikalhart/TinyGPSPlus #48)
+        ("NA", FixType.SINGLE),
+        ("EN", FixType.DEAD_RECKONING),
+        ("NNNN", FixType.NONE),
+    ],
+)
+def test_the_best_mode_of_gns_is_the_fixs(modes: str, fix_type: FixType) -> None:
+    (fix,) = fixes(parse(nmea.encode_gns(S, *POSITION, 400.0, 47.0, modes=modes))[0])
+    assert fix.fix_type is fix_type
+
+
+def test_gga_goes_before_gns_and_gns_of_one_constellation_says_no_position() -> None:
+    satellites_only = nmea.encode_sentence("GLGNS,000001.00,,,,,,7,,,,,")
+    gns, gga = nmea.encode_gns(S, *POSITION, 400.0, 47.0), nmea.encode_gga(S, *POSITION, 401.0, 47.0, quality=4)
+    records, parser = parse(gns, satellites_only, gga, nmea.encode_zda(S, DAY))
+    (fix,) = fixes(records)
+    assert (fix.message, fix.height_m, fix.fix_type) == ("GGA", 448.0, FixType.RTK_FIXED)
+    assert [message.valid for message in times(records)] == [True]
+    assert parser.counters.errors == {}
+
+
 def test_zda_is_believed_only_while_the_receiver_has_a_fix() -> None:
     no_fix = nmea.encode_sentence("GPGGA,120000.00,,,,,0,00,99.99,,,,,,")
     records, _ = parse(
