@@ -19,13 +19,22 @@ from numpy.typing import NDArray
 
 from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, open_points
 from georef.records import Int64Array
-from georef.timescales.gps_time import GPS_EPOCH, LAS_ADJUSTED_ZERO_S, SECOND_NS, WEEK_NS, WEEK_S
+from georef.timescales.gps_time import (
+    GPS_EPOCH,
+    GPS_EPOCH_UNIX_S,
+    LAS_ADJUSTED_ZERO_S,
+    SECOND_NS,
+    WEEK_NS,
+    WEEK_S,
+)
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
 SAMPLED_POINTS = 1000
 OF_WEEK_BELOW_S = 2 * WEEK_S  # a flight that goes on beyond the week's end may be counted on
 NAMED_FILES = 3
+DAY_S = 86_400
+GPS_EPOCH_UTC = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
 
 
@@ -78,12 +87,16 @@ def point_times_of(path: Path) -> PointTimes:
 def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
     """Return the times with what the numbers themselves say against the header."""
     low, high = float(seconds.min()), float(seconds.max())
+    future = _of_the_future(low)
+    remedy = future or "set bit 0 of the header's global encoding"
     if said is TimeKind.OF_WEEK and not 0.0 <= low <= high < OF_WEEK_BELOW_S:
         doubt = (
             f"{path}: its header says {said.value}, but its times, from {low:,.0f} s on, are none; "
-            f"taken for {TimeKind.ADJUSTED.value}: set bit 0 of the header's global encoding"
+            f"taken for {TimeKind.ADJUSTED.value}: {remedy}"
         )
         return PointTimes(path, TimeKind.ADJUSTED, seconds, doubt)
+    if said is TimeKind.ADJUSTED and future:
+        return PointTimes(path, said, seconds, f"{path}: its header says {said.value}: {future}")
     if said is TimeKind.ADJUSTED and 0.0 <= low <= high <= WEEK_S:
         day = GPS_EPOCH + dt.timedelta(seconds=LAS_ADJUSTED_ZERO_S + low)
         doubt = (
@@ -92,6 +105,23 @@ def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
         )
         return PointTimes(path, said, seconds, doubt)
     return PointTimes(path, said, seconds)
+
+
+def _of_the_future(adjusted_s: float) -> str:
+    """Return what is wrong with adjusted times that are later than now, and the remedy; empty: they are not.
+
+    Some software writes GPS seconds with nothing taken off them, or seconds since 1970, under the same bit.
+    """
+    now_s = (dt.datetime.now(dt.UTC) - GPS_EPOCH_UTC).total_seconds()
+    if adjusted_s + LAS_ADJUSTED_ZERO_S <= now_s + DAY_S:
+        return ""
+    day = GPS_EPOCH + dt.timedelta(seconds=LAS_ADJUSTED_ZERO_S + adjusted_s)
+    words = f"by that its times, from {adjusted_s:,.0f} s on, are of {day}, which is to come"
+    for what, zero_s in (("GPS seconds", 0), ("seconds since 1970", GPS_EPOCH_UNIX_S)):
+        if adjusted_s - zero_s <= now_s + DAY_S:
+            leap = ", and add the leap seconds" if zero_s else ""
+            return f"{words}; they look like {what}: take {LAS_ADJUSTED_ZERO_S + zero_s:,} s off them{leap}"
+    return words
 
 
 def time_notes(times: Sequence[PointTimes]) -> list[str]:

@@ -56,6 +56,25 @@ def test_times_that_contradict_their_header_are_told(tmp_path: Path) -> None:
     assert time_notes([unset, small]) == [unset.doubt, small.doubt]
 
 
+@pytest.mark.parametrize("adjusted", [True, False])
+@pytest.mark.parametrize(
+    ("first_s", "told"),
+    [
+        (1_174_893_536.0, "are of 2048-12-06, which is to come; they look like GPS seconds: take 1,000,000,000 s off"),
+        (1_490_858_318.0, "are of 2058-12-11, which is to come; they look like seconds since 1970: take 1,315,964,800"),
+        (3_900_000_000.0, "are of 2135-"),
+    ],
+)
+def test_times_of_the_future_are_told_with_what_they_look_like(
+    tmp_path: Path, first_s: float, told: str, adjusted: bool
+) -> None:
+    """2017-03-30 07:18:38 UTC as GPS seconds and as Unix seconds, under either bit (LAStools' list, 2017-08-27)."""
+    one = tile(tmp_path, "future.laz", first_s, adjusted=adjusted)
+    assert one.kind is TimeKind.ADJUSTED
+    assert told in one.doubt
+    assert one.doubt in look_at([tmp_path]).notes
+
+
 @pytest.mark.parametrize("after_s", [0.0, 604_800.0], ids=["begins anew", "counts on"])
 def test_a_flight_from_saturday_into_sunday_is_of_two_weeks(tmp_path: Path, after_s: float) -> None:
     before = tile(tmp_path, "saturday.laz", 604_700.0, adjusted=False)
