@@ -165,6 +165,8 @@ def _offset_finding(offset: TimeOffset, gps_ns: int) -> Finding:
     size = abs(offset.seconds)
     words = f"{1000.0 * size:.0f} ms" if size < 2.0 else f"{size:.2f} s"
     hint = "check how the IMU is stamped (pps, sample, stamp) or let the filter estimate the offset"
+    if size > 0.5:
+        hint = "positions written with other leap seconds (want GPS time), a second named wrongly, or " + hint
     if abs(size - leap) < 0.5:
         hint = f"GPS and UTC differ by these {leap} s: one of the two is taken for the other"
     return Finding(

@@ -116,13 +116,16 @@ def time_offset(inertial: Inertial, observations: StructArray) -> TimeOffset | N
 
 
 def velocities(observations: StructArray) -> tuple[Int64Array, FloatArray]:
-    """Times (n,) and velocities (n, 3) north, east, down, at least 0.2 s apart; from positions where there are none."""
+    """Return times (n,) and velocities (n, 3) north, east, down, at least 0.2 s apart.
+
+    Where there are none, those between positions at least 1 s apart: between nearer ones their noise hides the motion.
+    """
     rows = observations[observations["kind"] == Kind.VELOCITY]
-    rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)])
+    rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)], SECOND_NS // 5)
     if len(rows) >= FEWEST:
         return rows["time_ns"].astype(np.int64), rows["value"]
     rows = observations[observations["kind"] == Kind.POSITION]
-    rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)])
+    rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)], SECOND_NS)
     if len(rows) < 2:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     moved_e = np.diff(rows["value"], axis=0) / (np.diff(rows["time_ns"]) / SECOND_NS)[:, None]
@@ -131,9 +134,9 @@ def velocities(observations: StructArray) -> tuple[Int64Array, FloatArray]:
     return middle_ns, np.einsum("nji,nj->ni", rot_e_from_l(lat, lon), moved_e)
 
 
-def _apart(rows: StructArray) -> StructArray:
-    """Rows at least 0.2 s apart."""
-    cell = rows["time_ns"] // (SECOND_NS // 5)
+def _apart(rows: StructArray, step_ns: int) -> StructArray:
+    """Return the first row of each step of time."""
+    cell = rows["time_ns"] // step_ns
     return rows[np.concatenate([[True], np.diff(cell) > 0])] if len(rows) else rows
 
 
