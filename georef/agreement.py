@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from georef.earth import geodetic_from_e
+from georef.gusts import gusts
 from georef.navigation.gravity import gravity_e
 from georef.quaternions import about, conjugate, product, rotated
 from georef.records import FixType, Int64Array, StructArray
@@ -237,6 +238,8 @@ class Motion:
         convention: words for what the attitude would have to be for its turn rates to be those; empty: as it is.
         converted: correlation then.
         is_other: the two are surely no record of one motion.
+        gusts: correlation of what gusts do, above 0.5 Hz; nan where one of the two has little of it.
+        gusts_are_others: what they do in gusts is surely no record of one motion: of two flights over the same lines.
     """
 
     correlation: float
@@ -244,6 +247,8 @@ class Motion:
     convention: str
     converted: float
     is_other: bool
+    gusts: float
+    gusts_are_others: bool
 
 
 def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: FloatArray) -> Motion | None:
@@ -270,7 +275,10 @@ def compare_motion(trajectory: Trajectory, imu_time_ns: Int64Array, imu_rate_b: 
     correlation = _correlation(told, felt)
     other_motion = not words and all(_is_other(_coarser(told, n), _coarser(felt, n)) for n in (1, SLOW_STEPS))
     by_axis = np.array([_correlation(told[:, [k]], felt[:, [k]]) for k in range(3)])
-    return Motion(correlation, by_axis, words, _correlation(rates, felt), other_motion)
+    shaken = gusts(told, felt)
+    by_gusts = float("nan") if shaken is None else _correlation(*shaken)
+    other_gusts = shaken is not None and not words and _is_other(*shaken)
+    return Motion(correlation, by_axis, words, _correlation(rates, felt), other_motion, by_gusts, other_gusts)
 
 
 def _turned(

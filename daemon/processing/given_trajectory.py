@@ -300,6 +300,11 @@ def _judge_motion(given: Given, setup: Setup, clocks: LogClocks, log: Path, foun
             f"{given.file}: does not turn as the IMU in {log} does {told}; want the trajectory of this flight, or "
             "imu.….rotation_b_imu is another"
         )
+    elif motion.gusts_are_others:
+        found.refused.append(
+            f"{given.file}: turns as the IMU in {log} does, but gusts shake it otherwise (correlation "
+            f"{motion.gusts:+.2f} from 0.5 to 2.5 Hz): it is of another flight over the same lines; want this one's"
+        )
     elif motion.correlation < UNLIKE:
         found.warnings.append(
             f"{given.file}: does not turn as the IMU in {log} does {told}; it may be of another flight, or "

@@ -309,6 +309,44 @@ def test_a_trajectory_of_another_flight_is_refused_by_how_it_turns(log: Log) -> 
     assert "want the trajectory of this flight" in line
 
 
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory: pytest.TempPathFactory) -> list[Log]:
+    """One plan flown twice in light turbulence, by an inertial unit of the least grade."""
+    flights = []
+    for seed in (1, 2):
+        flight = f'origin_deg = [47.48, 11.4]\nlead_s = 3.0\nturbulence = "light"\nseed = {seed}'
+        text = two_lines("rough", flight=flight, gnss='grade = "rtk"', imu='grade = "consumer"', prf_hz=200)
+        flights.append(read(fly_short(tmp_path_factory.mktemp("rough"), text)))
+    return flights
+
+
+def test_another_flight_over_the_same_lines_is_refused_by_what_gusts_do(rough: list[Log]) -> None:
+    """It turns where this one does (correlation 0.9), and lies a decimetre from it, which the fixes cannot tell."""
+    for one, other in (rough, rough[::-1]):
+        assert one.judged(one.truth).refused == []
+        line = one.refused(other.truth)
+        assert "gusts shake it otherwise (correlation" in line
+        assert "another flight over the same lines" in line
+
+
+@pytest.mark.parametrize(("every", "digits"), [(10, 2), (4, 3), (1, 2)])
+def test_attitudes_in_few_digits_and_at_20_hz_are_still_this_flights(rough: list[Log], every: int, digits: int) -> None:
+    """Also late, which is told elsewhere."""
+    truth = rough[0].truth
+    angles = [np.radians(np.round(np.degrees(angle), digits)) for angle in truth.attitude()]
+    columns = [column[::every] for column in (*truth.geodetic(), truth.velocity_l(), *angles)]
+    for late_ns in (0, 100_000_000, 15_000_000_000):
+        given = Trajectory.from_geodetic(truth.time_ns[::every] + late_ns, *columns, name="x.out")
+        assert not any("gusts" in line for line in rough[0].judged(given).refused)
+
+
+def test_noise_is_no_gust(log: Log) -> None:
+    """Calm air: angles noisy by 0.02° say nothing of gusts, and the flight is this one."""
+    noise = np.radians(0.02) * np.random.default_rng(7).standard_normal((3, len(log.truth)))
+    given = turned(log.truth, lambda *angles: tuple(np.stack(angles) + noise))
+    assert not any("gusts" in line for line in log.judged(given).refused)
+
+
 def test_height_of_the_truth_is_the_ellipsoids(log: Log) -> None:
     """The fixes that all is held against are the receiver's, brought to the ellipsoid by its undulation."""
     fixes = [fix for fix in log.clocks.fixes["gnss/rover"] if fix.height_m is not None]
