@@ -286,6 +286,8 @@ def paths_of(wish: CalibrateWish, scanners: Iterable[str]) -> dict[str, Path]:
 def _refuse_one_strip(kept: KeptFlight) -> None:
     strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
     log = kept.logged[0].log
+    if not strips and (holes := [line for flight in kept.logged for line in flight.holes]):
+        raise UserError("\n".join(holes))
     if len(strips) < 2:
         raise UserError(
             f"{log}: {len(strips) or 'no'} strip with returns; a calibration compares strips: want at least two that "

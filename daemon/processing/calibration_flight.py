@@ -23,7 +23,7 @@ from daemon.config.tables import ScannerConfig
 from daemon.errors import UserError
 from daemon.processing.feed import LogFeed
 from daemon.processing.flights import Flight as LoggedFlight
-from daemon.processing.flights import Wish, read_flights
+from daemon.processing.flights import Wish, note_times, read_flights
 from daemon.processing.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
 from daemon.processing.models import motion_of
 from daemon.processing.workers import run_jobs
@@ -128,6 +128,7 @@ def read_flight(wish: Wish, folder: Path, tell: Steps) -> KeptFlight:
         progress=lambda done: tell("returns", done, total),
         do=keep_job,
     )
+    note_times(logged, results)
     heads = _heads(logged)
     swaths = [
         swath

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from daemon.config.config import Config
+    from daemon.processing.jobs import JobResult
     from daemon.processing.navigate import Navigated
     from georef.timescales import ClockStatus
 
@@ -297,6 +299,23 @@ def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
             f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
             "want --strips whole, or --strips FILE with their times"
         )
+
+
+def note_times(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
+    """Note in each flight's holes why returns of its strips have no time, a line a scanner."""
+    for number, flight in enumerate(flights):
+        own = [result for result in results if result.session == number and result.strip]
+        status, clocks = flight.status(flight.host_span[1]), flight.clocks.clocks
+        for name in flight.setup.scanners:
+            fates: Counter[str] = Counter()
+            refused: Counter[str] = Counter()
+            for result in own:
+                fates.update(result.fates.get(name, {}))
+                refused.update(result.time_refused.get(name, {}))
+            source = f"scanner/{name}"
+            stamps, trouble = clocks.stamps.get(source), clocks.trouble(source)
+            line = refusals.time_trouble(name, fates, refused, status, stamps, trouble)
+            flight.holes += [f"{flight.log}: {line}"] if line else []
 
 
 def _given_strips(name: str) -> list[Span]:

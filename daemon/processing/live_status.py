@@ -15,6 +15,7 @@ from daemon.log.chunks import LogBatch
 from daemon.processing.carried_verdict import first_lines
 from daemon.processing.live_follow import BEHIND_NS, LiveFollower
 from daemon.processing.live_products import LiveProducts, replace_file
+from daemon.processing.refusals import time_trouble
 from daemon.processing.setup import Setup
 from daemon.replay import source_of_topic
 from georef.points import FATE_NAMES
@@ -67,6 +68,8 @@ class LiveStatus:
         self._sources: dict[str, str | None] = {}  # by topic
         self._offsets: dict[str, tuple[int, int | None]] = {}  # by scanner: host time, GPS time less that
         self._points_before: Counter[str] = Counter()
+        self._fates_before: dict[str, Counter[str]] = {}
+        self._refused_before: dict[str, Counter[str]] = {}
         self._told_s = time.monotonic()
 
     def note_batch(self, batch: LogBatch, now_ns: int) -> None:
@@ -118,10 +121,8 @@ class LiveStatus:
             "points_per_s": rates,
             "waiting": {name: stream.waiting(name) for name in stream.scanners},
             "navigation": self.navigation,
-            "fates": {
-                name: {FATE_NAMES[fate]: count for fate, count in stream.fates(name).items()}
-                for name in stream.scanners
-            },
+            "fates": {name: self._fates(name) for name in stream.scanners},
+            "without_time": [line for name in stream.scanners if (line := self._without_time(name, now_ns))],
             "latency_s": {
                 source: {
                     "pulse": self._pulse[source].plain() if source in self._pulse else None,
@@ -144,6 +145,20 @@ class LiveStatus:
                 "damaged_chunks": follower.damaged + (follower.part.damaged if follower.part else 0),
             }
         return found
+
+    def _fates(self, name: str) -> dict[str, int]:
+        return {FATE_NAMES[fate]: count for fate, count in self._stream.fates(name).items()}
+
+    def _without_time(self, name: str, now_ns: int) -> str:
+        """Why returns of a scanner that came since the last time have no time; empty: few or none."""
+        source, clocks = f"scanner/{name}", self._stream.clocks
+        fates, refused = Counter(self._fates(name)), Counter(clocks.refused(source))
+        new_fates = fates - self._fates_before.get(name, Counter())
+        new_refused = refused - self._refused_before.get(name, Counter())
+        self._fates_before[name], self._refused_before[name] = fates, refused
+        device = clocks.host.plan.devices.get(source)
+        status = None if device is None else clocks.host.status(device.clock, now_ns)
+        return time_trouble(name, new_fates, new_refused, status, clocks.stamps(source))
 
     @property
     def _trajectory_source(self) -> str | None:
@@ -183,7 +198,7 @@ def sentence(found: dict[str, Any]) -> str:
         parts.append(f"{found['live_skipped_s']:.1f} s SKIPPED, more than {BEHIND_NS / 1e9:.0f} s behind")
     if found.get("damaged_chunks"):
         parts.append(f"{found['damaged_chunks']} chunks of the log DAMAGED")
-    parts += _not_locked(found)[:3]
+    parts += [*found.get("without_time", []), *_not_locked(found)[:3]]
     parts += [str(found[key]) for key in ("trouble", "points_file") if found.get(key)]
     return "; ".join(parts)
 
@@ -192,7 +207,7 @@ def is_well(found: dict[str, Any]) -> bool:
     """Whether points come of every scanner, on time, and nothing is wrong: what an operator may take for good."""
     if "points" not in found:
         return False
-    wrong = [found.get(key) for key in ("trouble", "points_file", "live_skipped_s", "damaged_chunks")]
+    wrong = [found.get(key) for key in ("trouble", "points_file", "live_skipped_s", "damaged_chunks", "without_time")]
     comes = all(rate > 0 for rate in found["points_per_s"].values()) and (_behind_s(found) or 0.0) <= LATE_S
     return comes and not any(wrong) and not _not_locked(found)
 

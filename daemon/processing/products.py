@@ -11,7 +11,6 @@ import glob
 import importlib.metadata
 import json
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,7 +24,7 @@ import numpy as np
 from daemon.errors import ExitCode, UserError
 from daemon.log.durable import sync_file, try_sync_directory
 from daemon.processing import refusals
-from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, read_flights, verdict_of
+from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
 from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from daemon.processing.quicklook_sidecar import read_sidecar, sessions_in
 from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
@@ -247,18 +246,7 @@ def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
 
 def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
     """Why returns have no time; UserError where no return at all could be placed."""
-    for number, flight in enumerate(flights):
-        own = [result for result in results if result.session == number and result.strip]
-        status = flight.status(flight.host_span[1])
-        for name in flight.setup.scanners:
-            fates: Counter[str] = Counter()
-            refused: Counter[str] = Counter()
-            for result in own:
-                fates.update(result.fates.get(name, {}))
-                refused.update(result.time_refused.get(name, {}))
-            stamps = flight.clocks.clocks.stamps.get(f"scanner/{name}")
-            trouble = flight.clocks.clocks.trouble(f"scanner/{name}")
-            flight.holes += refusals.time_troubles(flight.log, name, fates, refused, status, stamps, trouble)
+    note_times(flights, results)
     if not any(result.points or result.failed for result in results):
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
         lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]

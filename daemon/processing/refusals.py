@@ -161,7 +161,7 @@ def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) 
     """A trajectory and a log have some time in common.
 
     Raises:
-        UserError: they have none; the line says by how much they are apart where that names the mistake.
+        UserError: they have none; the line says from when to when each is.
     """
     first_ns, last_ns = trajectory.span
     if first_ns <= span[1] and last_ns >= span[0]:
@@ -230,19 +230,17 @@ def _refuse_by_remarks(log: Path, status: ClockStatus, remarks: Sequence[str]) -
         raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
 
 
-def time_troubles(
-    log: Path,
+def time_trouble(
     scanner: str,
     fates: Mapping[str, int],
     refused: Mapping[str, int],
     status: ClockStatus | None,
     stamps: Stamps | None = None,
     trouble: str = "",
-) -> list[str]:
-    """Lines for returns that have no time good enough, and why; empty: few or none.
+) -> str:
+    """Return how many returns have no time good enough, and why; empty: few or none.
 
     Args:
-        log: stands for the session.
         scanner: its name.
         fates: of its returns.
         refused: stamps that its clock did not believe, by reason.
@@ -253,28 +251,26 @@ def time_troubles(
     total = sum(fates.values())
     lost = fates.get(NO_TIME, 0)
     if not total or lost <= MUCH * total:
-        return []
-    told = f"{log}: scanner/{scanner}: {lost:,} of {total:,} returns have no time"
+        return ""
+    told = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
     if refused.get("past_hour"):
-        return [
+        return (
             f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to another "
             "second; want the NMEA sentences and the pulse of one receiver at the head"
-        ]
+        )
     if trouble:
-        return [f"{told}: the head {trouble}"]
+        return f"{told}: the head {trouble}"
     if status is not None and status.state not in GOOD_STATES:
-        return [f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"]
+        return f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"
     if refused.get("spacing"):
-        return [f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"]
+        return f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"
     if refused.get("stamp_jump"):
-        return [
-            f"{told}: {refused['stamp_jump']:,} stamps lie more than a second from their arrival: its clock was set"
-        ]
+        return f"{told}: {refused['stamp_jump']:,} stamps lie more than a second from their arrival: its clock was set"
     found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
-    return [
+    return (
         f"{told}: its stamps run free{found}; want a head that is locked to the PPS, or latches it, or "
         f"scanner.{scanner}.clock where its stamps are UTC or TAI all the same"
-    ]
+    )
 
 
 def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:

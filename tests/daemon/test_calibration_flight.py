@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.flight import Flight
+from daemon.processing import calibration_flight
 from daemon.processing.calibration_flight import read_flight
 from daemon.processing.flights import Wish
 from daemon.processing.flown import TrajectoryWish, offset_of
+from daemon.processing.jobs import JobResult
 from daemon.processing.setup import Options, Setup
+from daemon.processing.workers import run_jobs
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
@@ -53,6 +57,26 @@ def test_a_range_offset_by_pulse_rate_counts_once(made: Made, tmp_path: Path, ra
             prf_hz=PRF_HZ,
         )  # as swath georef places them
         np.testing.assert_allclose(flight.frame.t_from_e(rays.points_e), swath.points_t, atol=1e-8)
+
+
+def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if half of each strip's returns had come without: what calibrate, validate and strips say of their logs."""
+
+    def without_time(*args: Any, **keys: Any) -> list[JobResult]:
+        results = run_jobs(*args, **keys)
+        for result in results:
+            result.fates["left"]["no_time"] += result.fates["left"].total()
+        return results
+
+    monkeypatch.setattr(calibration_flight, "run_jobs", without_time)
+    trajectory = TrajectoryWish(made.flown.folder / "true_trajectory.csv")
+    wish = Wish([made.flown.log], tmp_path, trajectory, Options(datum="same", uncertainty=False))
+    kept = read_flight(wish, tmp_path, lambda *_: None)
+    total = 2 * sum(len(swath) for swath in kept.flight.swaths)
+    (line,) = (line for line in kept.notes if "have no time" in line)
+    assert line.startswith(f"{made.flown.log}: scanner/left: ")
+    lost, of = (int(words.replace(",", "")) for words in re.findall(r"[\d,]{3,}(?= of| returns)", line))
+    assert 2 * lost == of >= total
 
 
 def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from daemon.log.reader import open_logs
 from daemon.processing.feed import read_clocks
 from daemon.processing.head_clocks import find_stamps, stamp_lines
 from daemon.processing.log_index import index_log
-from daemon.processing.refusals import refuse_no_time, time_troubles
+from daemon.processing.refusals import refuse_no_time, time_trouble
 from daemon.processing.setup import Setup
 from drivers.scanner.hesai import encode_point_packet
 from drivers.scanner.velodyne import encode_data_packet
@@ -279,7 +279,7 @@ def test_a_head_without_pulse_beside_a_receiver_is_told_by_that(tmp_path: Path, 
     _, clocks = found(tmp_path, RECEIVER + WITH_AUX + 'pps = "main"\n', units)
     state = clocks.host.status("pps/main", START_UNIX_NS + 20 * NS)
     trouble = clocks.trouble("scanner/top")
-    (line,) = time_troubles(tmp_path, "top", {"no_time": 9, "georeferenced": 1}, {}, state, None, trouble)
+    line = time_trouble("top", {"no_time": 9, "georeferenced": 1}, {}, state, None, trouble)
     assert line.endswith("the head says that no pulse reaches it; want the receiver's PPS wired to it")
 
 

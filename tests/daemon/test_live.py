@@ -36,7 +36,9 @@ from daemon.processing.live_status import LiveStatus, sentence
 from daemon.processing.setup import Options, Setup
 from daemon.processing.warm_up import WarmUp
 from daemon.sim_log import fly_into_log
+from georef.points import Fate
 from georef.stream_clocks import DevicePlan
+from georef.timescales import ClockStatus, TimeState
 from sim.companions import companion_files, config_text, default_wires
 from sim.fly import VirtualFlight
 from sim.plan import parse_plan
@@ -245,16 +247,18 @@ class TestStatus:
         found["live_skipped_s"] = 7.25
         found["trouble"] = "free space is down"
         found["fates"] = {"left": {"georeferenced": 5, "no_time": 3}}
+        found["without_time"] = ["scanner/left: 3 of 8 returns have no time: its stamps run free"]
         told = sentence(found)
         assert "7.2 s SKIPPED, more than 5 s behind" in told
         assert told.endswith("; free space is down")
         assert "3 no time" in told
+        assert "its stamps run free" in told
         assert sentence(found | {"points_file": "p.npy ends"}).endswith("; free space is down; p.npy ends")
 
     def test_only_what_is_well_is_green(self, replayed: tuple[Path, Told]) -> None:
         """At a glance: points of every scanner, on time, every clock locked, nothing damaged or passed over."""
         found = copy.deepcopy(replayed[1])
-        found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following"}
+        found |= {"trouble": "", "live_skipped_s": 0.0, "damaged_chunks": 0, "state": "following", "without_time": []}
         found["points_per_s"] = dict.fromkeys(found["points"], 8000)
         for one in found["latency_s"].values():
             if one["pulse"]:
@@ -267,6 +271,7 @@ class TestStatus:
             {"points_file": "p.npy ends"},
             {"live_skipped_s": 7.25},
             {"damaged_chunks": 2},
+            {"without_time": ["scanner/left: 3 of 8 returns have no time"]},
             {"points_per_s": found["points_per_s"] | {"right": 0}},
             {"time": found["time"] | {"pps/main": {"state": "LOST", "sigma_ns": None}}},
             {"latency_s": late["latency_s"]},
@@ -297,6 +302,38 @@ class TestStatus:
             found.append(told["max"] if told else None)
         assert found == [None, 0.2, 0.2, 0.2, 0.3, 0.3]
         assert len(asked) == 3
+
+    def test_returns_without_time_are_told_with_the_reason_while_they_come(self) -> None:
+        """Those since the last time: at its beginning nothing has time, which passes."""
+        counts: dict[Fate, int] = {}
+        refused: dict[str, int] = {}
+        locked = ClockStatus(TimeState.LOCKED, 100.0)
+        host = SimpleNamespace(
+            by_source={},
+            plan=SimpleNamespace(devices={"scanner/left": DevicePlan("pps/main")}),
+            status=lambda clock, host_ns: locked,
+        )
+        clocks = SimpleNamespace(host=host, refused=lambda source: refused, stamps=lambda source: None)
+        stream: Any = SimpleNamespace(
+            scanners=["left"],
+            clocks=clocks,
+            path=SimpleNamespace(covered_until_ns=7),
+            fates=lambda name: counts,
+            waiting=lambda name: 0,
+        )
+        products: Any = SimpleNamespace(
+            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
+        )
+        status = LiveStatus(Mock(), stream, products)
+        said = []
+        for georeferenced, no_time, past_hour in ((0, 500, 0), (1000, 500, 0), (1900, 600, 0), (1900, 900, 300)):
+            counts.update({Fate.GEOREFERENCED: georeferenced, Fate.NO_TIME: no_time})
+            refused["past_hour"] = past_hour
+            said.append(status.plain(None, 0)["without_time"])
+        assert said[1] == []
+        assert said[0][0].startswith("scanner/left: 500 of 500 returns have no time: its stamps run free")
+        assert said[2][0].startswith("scanner/left: 100 of 1,000 returns have no time: its stamps run free")
+        assert said[3][0].startswith("scanner/left: 300 of 300 returns have no time: its stamps contradict the host's")
 
     def test_what_was_navigated_is_not_called_the_devices_own(self) -> None:
         """A receiver whose protocol could tell an INS solution, and that has none."""

@@ -143,10 +143,10 @@ def test_edges_that_no_receiver_names() -> None:
 )
 def test_why_returns_have_no_time(refused: dict[str, int], state: TimeState, words: str) -> None:
     fates = {"no_time": 500, "georeferenced": 500}
-    (told,) = refusals.time_troubles(A, "left", fates, refused, ClockStatus(state, 1.0))
+    told = refusals.time_trouble("left", fates, refused, ClockStatus(state, 1.0))
     assert words in told
     assert "500 of 1,000 returns" in told
-    assert refusals.time_troubles(A, "left", {"no_time": 10, "georeferenced": 990}, refused, None) == []
+    assert refusals.time_trouble("left", {"no_time": 10, "georeferenced": 990}, refused, None) == ""
     with pytest.raises(UserError, match="have no time"):
         refusals.refuse_nothing(A, [told], "")
     with pytest.raises(UserError, match=r"a\.mcap: no return could be georeferenced: 7 outside trajectory"):
