@@ -1,12 +1,14 @@
 """GPS times of points in LAS files: seconds of the week or adjusted standard time, as each file's header says.
 
-LAS 1.4 R15, 2.4: bit 0 of the global encoding is 0 for seconds of the GPS week, 1 for adjusted standard GPS time. Files
-of both kinds are merged and delivered side by side, and some headers say one and mean the other.
+LAS 1.4 R15, 2.4: bit 0 of the global encoding is 0 for seconds of the GPS week, 1 for adjusted standard GPS time, GPS
+seconds less 1e9. LAS 1.5 adds bit 6: less another multiple of 1e6, which stands in the header (Offset GPS Time). Files
+of all kinds are merged and delivered side by side, and some headers say one and mean the other.
 """
 
 from __future__ import annotations
 
 import datetime as dt
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -38,6 +40,10 @@ GPS_EPOCH_UTC = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
 
 
+OFFSET_FLAG = 1 << 6  # LAS 1.5, 2.4: of the global encoding
+_OFFSET, _OFFSET_AT = struct.Struct("<H"), 391  # in millions of seconds
+
+
 class TimeKind(Enum):
     """Say what the times of a file's points are."""
 
@@ -55,12 +61,14 @@ class PointTimes:
         kind: what its times are; decided by the header unless the times contradict it.
         sample_s: (k,) times of the first points, seconds as in the file.
         doubt: why the header is not believed, or not likely to be right, one line; empty: nothing speaks against it.
+        zero_s: GPS seconds from which adjusted times count.
     """
 
     path: Path
     kind: TimeKind
     sample_s: FloatArray
     doubt: str = ""
+    zero_s: int = LAS_ADJUSTED_ZERO_S
 
 
 def point_times_of(path: Path) -> PointTimes:
@@ -80,8 +88,18 @@ def point_times_of(path: Path) -> PointTimes:
     seconds = seconds[np.isfinite(seconds) & (np.abs(seconds) < LARGEST_S)]
     if not seconds.any():
         return PointTimes(path, TimeKind.NONE, np.zeros(0))
+    if header.global_encoding.value & OFFSET_FLAG and (header.version.major, header.version.minor) >= (1, 5):
+        return _offset(path, seconds)
     kind = TimeKind.ADJUSTED if header.global_encoding.gps_time_type == GpsTimeType.STANDARD else TimeKind.OF_WEEK
     return _weighed(path, kind, seconds)
+
+
+def _offset(path: Path, seconds: FloatArray) -> PointTimes:
+    """Return times that count from where the header of a LAS 1.5 file says; laspy opens none without the place."""
+    with path.open("rb") as file:
+        file.seek(_OFFSET_AT)
+        (millions,) = _OFFSET.unpack(file.read(_OFFSET.size))
+    return PointTimes(path, TimeKind.ADJUSTED, seconds, zero_s=millions * 1_000_000)
 
 
 def _weighed(path: Path, said: TimeKind, seconds: FloatArray) -> PointTimes:
@@ -154,8 +172,9 @@ class PointClock:
             near_ns: a GPS time of the flight, by a trajectory beside the points; None: there is none.
         """
         self._kinds = {one.path: one.kind for one in times}
+        self._zeros_s = {one.path: one.zero_s for one in times}
         of_week = [one.sample_s for one in times if one.kind is TimeKind.OF_WEEK]
-        adjusted = [one.sample_s for one in times if one.kind is TimeKind.ADJUSTED]
+        adjusted = [one for one in times if one.kind is TimeKind.ADJUSTED]
         self.notes: list[str] = []
         self._near_ns = 0
         if of_week:
@@ -166,7 +185,7 @@ class PointClock:
             elif near_ns is not None:
                 self._near_ns = near_ns
             elif adjusted:
-                self._near_ns = int(_adjusted_ns(np.array([np.median(np.concatenate(adjusted))]))[0])
+                self._near_ns = int(np.median(np.concatenate([_since(one.sample_s, one.zero_s) for one in adjusted])))
             else:
                 self.notes.append(_untold([one.path.name for one in times if one.kind is TimeKind.OF_WEEK]))
 
@@ -178,15 +197,16 @@ class PointClock:
         if kind is TimeKind.NONE:
             return np.zeros(len(seconds), np.int64)
         if kind is TimeKind.ADJUSTED:
-            return np.where(known, _adjusted_ns(seconds), 0)
+            return np.where(known, _since(seconds, self._zeros_s[path]), 0)
         of_week_ns = np.rint(seconds * SECOND_NS).astype(np.int64)
         away_ns = (of_week_ns - self._near_ns + WEEK_NS // 2) % WEEK_NS - WEEK_NS // 2
         return np.where(known, self._near_ns + away_ns, 0)
 
 
-def _adjusted_ns(seconds: FloatArray) -> Int64Array:
+def _since(seconds: FloatArray, zero_s: int) -> Int64Array:
+    """Return GPS times (n,) of seconds (n,) that count from GPS seconds."""
     whole = np.rint(seconds * SECOND_NS).astype(np.int64)
-    return np.asarray(whole + LAS_ADJUSTED_ZERO_S * SECOND_NS)
+    return np.asarray(whole + zero_s * SECOND_NS)
 
 
 def _span_of_week(seconds: FloatArray) -> tuple[int, int]:

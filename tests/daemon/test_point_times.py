@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,36 @@ def test_the_header_decides(tmp_path: Path) -> None:
     for one, first_s in ((of_week, 345_600.5), (adjusted, ADJUSTED_S + 0.5)):
         assert clock.time_ns(one.path, np.array([first_s])).tolist() == [FLIGHT_NS + 500_000_000]
     assert clock.notes == []
+
+
+def as_las_15(path: Path, offset: int) -> PointTimes:
+    """The header of a LAS 1.4 file made one of 1.5, with the flag of offset times.
+
+    LAS 1.5 R00, 2.4: greatest and least time (two doubles) and the offset in millions of seconds (u16) come after the
+    375 bytes of 1.4; 393 in all.
+    """
+    data = bytearray(path.read_bytes())
+    more = struct.pack("<ddH", 0.0, 0.0, offset)
+    (points_at,) = struct.unpack_from("<I", data, 96)
+    data[375:375] = more
+    data[25] = 5
+    data[6] |= 1 << 6
+    struct.pack_into("<HI", data, 94, 375 + len(more), points_at + len(more))
+    path.write_bytes(data)
+    return point_times_of(path)
+
+
+@pytest.mark.parametrize("offset", [1000, 1250, 1500])
+def test_times_of_las_15_count_from_where_the_header_says(tmp_path: Path, offset: int) -> None:
+    """1500 is the LAS working group's recommendation for 2023 to 2031: times of now are below 0."""
+    first_s = FLIGHT_NS / 1e9 - offset * 1e6
+    tile(tmp_path, "a.las", first_s, adjusted=True)
+    one = as_las_15(tmp_path / "a.las", offset)
+    assert (one.kind, one.doubt) == (TimeKind.ADJUSTED, "")
+    of_week = tile(tmp_path, "week.laz", 345_600.0, adjusted=False)
+    clock = PointClock([one, of_week])
+    assert clock.time_ns(one.path, np.array([first_s + 0.5])).tolist() == [FLIGHT_NS + 500_000_000]
+    assert clock.time_ns(of_week.path, np.array([345_600.5])).tolist() == [FLIGHT_NS + 500_000_000]
 
 
 def test_files_that_mix_times_are_named_by_the_quick_look_too(tmp_path: Path) -> None:
