@@ -31,6 +31,7 @@ MODELS: Mapping[str, tuple[str, ...]] = {
 }
 # What a column of the design is, besides the places of PARAMETERS
 SLOT, ZONE, KNOT, AZIMUTH, ELEVATION, RANGE = range(len(PARAMETERS), len(PARAMETERS) + 6)
+EXTRA = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")  # of tables, by scanner or of all
 BEAM_PARTS = {"azimuth_rad": AZIMUTH, "elevation_rad": ELEVATION, "range_m": RANGE}
 _BY_CONVENTION = "scan_angle_offset_rad"
 ANGLES = ("omega_rad", "phi_rad", "kappa_rad")
@@ -418,21 +419,25 @@ def _with_knots(calibration: Calibration, wish: Wish) -> Calibration:
     return replace(moved, ibrc=(knots, values - away))
 
 
+def check_scanners(scanners: Sequence[str], wish: Wish) -> None:
+    """Raise ParameterError where a wish names a scanner that is none of these, by name."""
+    for name in sorted({*wish.fix, *wish.free, *wish.priors}):
+        scanner, dot, _ = name.partition(".")
+        if dot and scanner not in scanners and not name.startswith(EXTRA):
+            raise ParameterError(f"parameters of {scanner}: no such scanner in this flight, but {', '.join(scanners)}")
+
+
 def check_wish(flight: Flight, wish: Wish) -> None:
     """Raise ParameterError where a wish names what there is not, or says what cannot be; before anything lasts long."""
     if wish.model not in MODELS:
         raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")
     heads = [head.name for head in flight.heads]
+    check_scanners(heads, wish)
     known = set(INDEX) | {f"{head}.{name}" for head in heads for name in INDEX}
-    extra = ("range_offset_slot.", "range_offset_zone.", "ibrc.", "beam.")
-    for name in sorted({*wish.fix, *wish.free, *wish.priors}):
-        scanner, dot, _ = name.partition(".")
-        if dot and scanner not in heads and not name.startswith(extra):
-            raise ParameterError(f"parameters of {scanner}: no such scanner in this flight, but {', '.join(heads)}")
     for name in sorted({*wish.fix, *wish.free} - known):
         raise ParameterError(f"{name}: is no parameter; want one of {', '.join(INDEX)}, or with {heads[0]}. before it")
     for name, sigma in wish.priors.items():
-        if name not in known and not name.split(".", 1)[-1].startswith(extra) and not name.startswith(extra):
+        if name not in known and not name.split(".", 1)[-1].startswith(EXTRA) and not name.startswith(EXTRA):
             raise ParameterError(f"prior {name}: is no parameter; want one of {', '.join(INDEX)}")
         if not sigma > 0.0:
             raise ParameterError(f"prior {name}: got {sigma:g}, want a sigma above 0")

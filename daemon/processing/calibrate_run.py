@@ -24,7 +24,7 @@ from calib.features import ControlPoint, Features
 from calib.flight import Flight, FlightError
 from calib.normals import NormalError
 from calib.outcome import Adjusted
-from calib.parameters import ANGLES, ParameterError, check_wish
+from calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
 from calib.parameters import Wish as Model
 from calib.picked_points import PickedError
 from calib.picked_points import carried as carried_points
@@ -160,7 +160,7 @@ def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
 
 def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
-    kept = read_flight(wish.logs, folder, tell)
+    kept = read_flight(wish.logs, folder, tell, lambda scanners: check_scanners(scanners, wish.model))
     _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
     check_wish(kept.flight, wish.model)
     with told_before(trajectory_verdicts_of(kept.logged), *REFUSED):

@@ -104,18 +104,21 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
     return from_smoother(kept.flight, chains, KNOT_S)
 
 
-def read_flight(wish: Wish, folder: Path, tell: Steps) -> KeptFlight:
+def read_flight(
+    wish: Wish, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
+) -> KeptFlight:
     """Read logs.
 
     Args:
         wish: as of `swath georef`; what it says of products does not count.
         folder: for the files, which are as large as 104 bytes a return.
         tell: is told how far it is.
+        check: as of `read_flights`.
 
     Raises:
         UserError: as of `read_flights`; StripError, MappingError, LogError, OSError.
     """
-    logged = read_flights(wish, tell)
+    logged = read_flights(wish, tell, check)
     frame = Tangent.at(_middle(logged[0]))
     plans = [KeepPlan(flight.index, flight.setup, flight.clocks.clocks, frame) for flight in logged]
     jobs = [job for number, flight in enumerate(logged) for job in _jobs(flight, number, folder)]

@@ -170,8 +170,13 @@ class Flight:
         return found
 
 
-def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
+def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None) -> list[Flight]:
     """The flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
+
+    Args:
+        wish: which logs, and how.
+        tell: is told how far it is.
+        check: is called with the names of all scanners before anything long is done; what it raises goes on.
 
     Raises:
         UserError: they cannot be georeferenced, or not together.
@@ -185,6 +190,7 @@ def read_flights(wish: Wish, tell: Tell) -> list[Flight]:
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
     for session in sessions:
         refusals.refuse_no_name(session.session_id, session.parts[0].path)
+    check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
     refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):

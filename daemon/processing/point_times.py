@@ -38,8 +38,6 @@ NAMED_FILES = 3
 DAY_S = 86_400
 GPS_EPOCH_UTC = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 LARGEST_S = 4e9  # GPS seconds of 2106; beyond, numbers mean something else
-
-
 OFFSET_FLAG = 1 << 6  # LAS 1.5, 2.4: of the global encoding
 _OFFSET, _OFFSET_AT = struct.Struct("<H"), 391  # in millions of seconds
 

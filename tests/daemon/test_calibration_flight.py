@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from calib.flight import Flight
-from daemon.processing import calibration_flight
+from daemon.cli.main import run_app
+from daemon.processing import calibration_flight, flights
 from daemon.processing.calibration_flight import read_flight
 from daemon.processing.flights import Wish
 from daemon.processing.flown import TrajectoryWish, offset_of
@@ -57,6 +58,21 @@ def test_a_range_offset_by_pulse_rate_counts_once(made: Made, tmp_path: Path, ra
             prf_hz=PRF_HZ,
         )  # as swath georef places them
         np.testing.assert_allclose(flight.frame.t_from_e(rays.points_e), swath.points_t, atol=1e-8)
+
+
+@pytest.mark.parametrize("option", [("--fix", "right.phi_deg"), ("--prior", "right.kappa_deg=0.1")])
+def test_parameters_of_no_scanner_of_the_log_are_refused_before_it_is_read(
+    made: Made,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    option: tuple[str, str],
+) -> None:
+    monkeypatch.setattr(flights, "read_clocks", None)  # the first that takes long
+    trajectory = str(made.flown.folder / "true_trajectory.csv")
+    log, output, same = str(made.flown.log), str(tmp_path / "left.toml"), ("--trajectory-datum", "same")
+    assert run_app(["calibrate", log, "-o", output, "--trajectory", trajectory, *same, *option]) != 0
+    assert "parameters of right: no such scanner in this flight, but left" in capsys.readouterr().err
 
 
 def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
