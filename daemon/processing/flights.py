@@ -25,6 +25,7 @@ from daemon.processing.flown import TrajectoryWish, choose_trajectory
 from daemon.processing.head_clocks import find_stamps, stamp_lines
 from daemon.processing.log_index import Listening, LogIndex, index_log
 from daemon.processing.setup import Options, Setup
+from daemon.processing.workers import refuse_in_import
 from daemon.text_files import text_of
 from georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
 from georef.trajectory import Trajectory
@@ -183,6 +184,7 @@ def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = la
         LogError, OSError: a log cannot be read.
         StripError, MappingError: in one line.
     """
+    refuse_in_import()
     passed_over: list[str] = []
     sessions = open_logs(wish.logs, passed_over)
     setups = [_setup(wish, session) for session in sessions]

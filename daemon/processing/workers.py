@@ -20,12 +20,23 @@ from drivers.core.extras import how_to_install
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
 DIED = "the process died, as it does when memory is short"
+UNGUARDED = 'want the call in a script under if __name__ == "__main__":, for processes import the script; or one worker'
 END_S = 5.0  # for a process to end when it was told to
 Progress = Callable[[int], None]  # bytes done so far
 Do = Callable[[Any, Job, Progress], JobResult]  # with the plan of its session; is told bytes
 
 _plans: list[Any] = []  # of a worker process
 _done: Any = None  # its share of the bytes done
+
+
+def refuse_in_import() -> None:
+    """Refuse to begin anew in a worker process that is only importing the script which began it.
+
+    Raises:
+        UserError: this is one.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # as `multiprocessing.spawn` finds it
+        raise UserError(f"called while a worker process imports the script: {UNGUARDED}")
 
 
 def run_jobs(
@@ -53,8 +64,9 @@ def run_jobs(
     Raises:
         JobError: the points of one cannot stand in a file.
         OSError: reading or writing failed.
-        UserError: there is no such scheduler.
+        UserError: there is no such scheduler, or a script that is only being imported calls this.
     """
+    refuse_in_import()
     order = sorted(range(len(jobs)), key=lambda number: (-jobs[number].size, number))
     if scheduler is not None:
         results = _on_cluster(plans, jobs, order, scheduler, progress, do)
@@ -85,9 +97,10 @@ def _failed(job: Job, why: str) -> JobResult:
 # ---------------------------------------------------------------------- processes of this computer
 
 
-def _begin(plans: bytes, done: Any) -> None:
+def _begin(plans: bytes, done: Any, begun: Any) -> None:
     """What a worker process does first; on an interrupt the process that began it ends it."""
     global _plans, _done
+    begun.value = True
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     _plans, _done = pickle.loads(plans), done
@@ -127,9 +140,9 @@ def _in_processes(
     plans: Sequence[Any], jobs: Sequence[Job], order: list[int], workers: int, progress: Progress, do: Do
 ) -> dict[int, JobResult]:
     context = multiprocessing.get_context("spawn")
-    done = context.Value("q", 0)
+    done, begun = context.Value("q", 0), context.Value("b", False)
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done))
+    pool = ProcessPoolExecutor(workers, context, _begin, (pickle.dumps(list(plans)), done, begun))
     results: dict[int, JobResult] = {}
     futures: dict[Future[JobResult], int] = {}
     try:
@@ -149,6 +162,8 @@ def _in_processes(
                 except BrokenProcessPool:
                     results[number] = _failed(jobs[number], DIED)
             progress(int(done.value))
+        if futures and not begun.value:
+            raise UserError(f"no worker process could be begun; {UNGUARDED}")
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         ours = set(multiprocessing.active_children()) - before

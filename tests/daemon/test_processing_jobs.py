@@ -7,6 +7,8 @@ import importlib
 import json
 import os
 import struct
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,9 @@ from daemon.processing import products, workers
 from daemon.processing.jobs import Job, JobResult, SessionPlan, Tell, run_job
 from daemon.processing.log_index import OP_CHUNK_INDEX, index_log, read_chunks
 from georef.strips import Segment
+from tests.daemon.commands import ROOT
 from tests.daemon.one_line import Flown, fly
+from tests.daemon.rig import HANGS_S
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
@@ -143,6 +147,36 @@ class TestWorkers:
         results = workers.run_jobs([None], self.jobs(2), workers=2, scheduler=None, progress=lambda done: None, do=dies)
         assert [bool(result.failed) for result in results] == [True, True]
         assert "memory" in results[0].failed
+
+    @pytest.mark.parametrize("guarded", [False, True])
+    def test_a_script_that_its_own_processes_would_run_again_is_told_so(self, tmp_path: Path, guarded: bool) -> None:
+        """Processes that are begun anew import the script: unguarded it would begin others."""
+        script = tmp_path / "script.py"
+        call = "run_jobs([None], jobs, workers=2, scheduler=None, progress=lambda done: None, do=counts)"
+        script.write_text(
+            "from daemon.processing.workers import run_jobs\n"
+            "from tests.daemon.test_processing_jobs import TestWorkers, counts\n"
+            "jobs = TestWorkers().jobs(2)\n"
+            + ('if __name__ == "__main__":\n' if guarded else "if True:\n")
+            + f"    print(len({call}), 'results')\n"
+        )
+        ended = subprocess.run(
+            [sys.executable, str(script)],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=HANGS_S,
+            check=False,
+        )
+        if guarded:
+            assert ended.stdout == "2 results\n"
+            return
+        assert ended.returncode == 1
+        last = ended.stderr.strip().splitlines()[-1]
+        assert 'no worker process could be begun; want the call in a script under if __name__ == "__main__":' in last
+        assert "called while a worker process imports the script" in ended.stderr
+        assert "memory" not in ended.stderr
 
 
 def dies(plan: SessionPlan, job: Job, tell: Tell) -> JobResult:
