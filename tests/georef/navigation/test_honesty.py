@@ -49,6 +49,24 @@ def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:
     assert 0.95 < np.mean(moments) < 1.05
 
 
+def test_errors_with_a_consumer_unit_are_as_large_as_their_sigmas() -> None:
+    """Biases of 0.4 °/s and of 80 mg, axes that lean by 10 mrad: 8 flights, filtered and smoothed."""
+    squared: dict[str, list[FloatArray]] = {"filtered": [], "smoothed": []}
+    for seed in range(8):
+        inertial, rows = noised(flight(), GRADES["consumer"], Fixes(), ARM, seed)
+        run = run_filter(
+            inertial,
+            rows,
+            replace(setup_for(GRADES["consumer"], ARM), position_floor_m=0.001),
+            drawn_start(flight(), seed),
+        )
+        for what, solution in (("filtered", forward(run)), ("smoothed", smooth(run))):
+            squared[what].append(squares(flight(), solution, 30.0, 0.5))
+    for what, flights in squared.items():
+        for name, honesty in judge(flights).items():
+            assert honesty.holds, (what, name, honesty)
+
+
 def test_errors_of_a_quick_receiver_that_last_for_seconds_are_as_large_as_their_sigmas() -> None:
     """Half of the positions' variance for 10 s, told of it: estimates of such errors have to die away as they do."""
     fixes = Fixes((0.014, 0.014, 0.02), 0.5, 10.0, 5.0, 0.03)

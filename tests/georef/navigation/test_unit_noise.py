@@ -30,7 +30,20 @@ def flown(unit: ImuNoise, told: ImuNoise) -> tuple[Run, Setup]:
     return stretch_of(inertial, rows, drawn_start(flight(), 7)), Setup(told, ARM[None])
 
 
-@pytest.mark.parametrize(("unit", "told"), [("mems", "tactical"), ("tactical", "mems")])
+def test_the_consumer_grade_is_its_data_sheets() -> None:
+    """InvenSense PS-MPU-6000A 3.4, 6.1 and 6.2: 0.005 °/s/√Hz, 400 µg/√Hz, ±80 mg, and within ±3 % and ±2 %."""
+    noise = GRADES["consumer"]
+    assert noise.velocity_random_walk == pytest.approx(400e-6 * 9.80665, rel=0.03)
+    assert 1.0 <= noise.angle_random_walk / np.radians(0.005) < 2.0  # of other units of the kind more
+    assert noise.accel_bias == pytest.approx(0.080 * 9.80665, rel=1e-3)
+    assert np.radians(0.1) < noise.gyro_bias < np.radians(1.0)
+    assert max(noise.gyro_scale, noise.accel_scale) == pytest.approx(0.03 / 3.0)
+    assert noise.misalignment == pytest.approx(0.02 / 2.0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "told"), [("mems", "tactical"), ("tactical", "mems"), ("consumer", "mems"), ("mems", "consumer")]
+)
 def test_a_flight_fits_its_own_grade(unit: str, told: str) -> None:
     run, setup = flown(GRADES[unit], GRADES[told])
     asked = better_grade(run, setup, {name: GRADES[name] for name in ("tactical", "mems", "consumer")})
