@@ -1,0 +1,88 @@
+"""Frames lost on a CAN bus, by commands alone: what is left is counted, navigated, and what is missing is said."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.cli.main import run_app
+from georef.formats.trajectory_file import read_trajectory
+from tests.daemon.short_flight import Flown, fly_short, two_lines
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
+
+LOST = 0.005  # of the frames, at random
+SILENT_S = (60.0, 63.0)  # of the log, without a frame
+SAMPLE = {"101", "102", "103", "100"}  # the frames of a sample; the last one closes it
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return fly_short(tmp_path_factory.mktemp("can"), two_lines("can", gnss='grade = "rtk"', prf_hz=100))
+
+
+@pytest.fixture(scope="module")
+def lossy(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """A log as if frames had been lost before the recorder, and how many samples are whole in it."""
+    folder = tmp_path_factory.mktemp("lossy")
+    assert run_app(["export", str(flown.log), str(folder / "files")]) == 0
+    (files,) = (folder / "files").iterdir()
+    (files / "imu-main.log.swath.csv.gz").unlink()  # which says what the file held
+    draws = random.Random(1)
+    lines = (files / "imu-main.log").read_text().splitlines(keepends=True)
+    begin_s = float(lines[0][1:18])
+    kept = [
+        line
+        for line in lines
+        if draws.random() >= LOST and not SILENT_S[0] <= float(line[1:18]) - begin_s < SILENT_S[1]
+    ]
+    (files / "imu-main.log").write_text("".join(kept))
+    shutil.move(files / "config", folder / "config")
+    config = str(folder / "config" / "config.toml")
+    assert run_app(["import", config, str(files), "-o", str(folder / "logs")]) == 0
+    return folder / "logs", sum(whole(kept))
+
+
+def whole(lines: list[str]) -> Iterator[bool]:
+    """Whether each sample of a candump has its frames, each of them once."""
+    frames = [line.split()[2].partition("#")[0] for line in lines]
+    ends = [-1, *(at for at, frame in enumerate(frames) if frame == "100")]
+    for begin, end in pairwise(ends):
+        sample = [frame for frame in frames[begin + 1 : end + 1] if frame in SAMPLE]
+        yield len(sample) == len(SAMPLE) == len(set(sample))
+
+
+def test_samples_that_lack_a_frame_are_counted_and_left_out(
+    lossy: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs, samples = lossy
+    capsys.readouterr()
+    assert run_app(["info", "--json", str(logs)]) == 0
+    (session,) = json.loads(capsys.readouterr().out)["sessions"]
+    unit = session["sources"]["imu/main"]["decoded"]
+    assert unit["records"]["ImuSamples"] == samples
+    assert unit["errors"]["sample_incomplete"] > 100
+    assert unit["errors"]["packet_gap"] > 100
+
+
+def test_what_is_left_is_navigated_and_what_is_missing_is_said(
+    flown: Flown, lossy: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Single samples are bridged; three seconds are a hole, and the rest lies within its sigmas."""
+    output = tmp_path / "t.csv"
+    assert run_app(["trajectory", str(lossy[0]), "-o", str(output), "--no-page"]) == 1
+    told = capsys.readouterr()
+    assert "of the inertial samples are missing and were made up: look with swath info" in told.out
+    assert told.err.strip().endswith("3.0 s: no samples")
+    got, truth = read_trajectory(output.read_bytes(), "t.csv"), flown.truth()
+    off = got.position_e[50:-50] - truth.poses(got.time_ns[50:-50]).position_e
+    sigma = got.position_sigma_l[50:-50].max(axis=1)
+    assert np.median(np.linalg.norm(off, axis=1) / sigma) < 3.0
+    assert np.linalg.norm(off, axis=1).max() < 0.3
