@@ -1,0 +1,78 @@
+"""An Ouster head that PTP sets, from its packets to points: on either scale, and only if it is on one."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from pathlib import Path
+from unittest.mock import patch
+
+import laspy
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from daemon.cli.main import run_app
+from drivers.scanner.ouster_head import read_head
+from sim.scanners import ouster_wire
+from sim.scanners.spinning_wire import HeadClock
+from tests.daemon import one_line
+from tests.daemon.one_line import PLAN, Flown, fly
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
+
+START = dt.datetime(2026, 6, 15, 9, 0, 0, tzinfo=dt.UTC)  # of a plan that says nothing else
+UNIX_NS = int(START.timestamp()) * 1_000_000_000
+SCALES_S = {"ptp-utc": 0, "ptp-tai": 37}  # of 1970 against UTC: TAI − UTC since 2017
+OFF_S = 3.0  # of a head that counts from somewhere else
+SHORT = (
+    PLAN.replace("-1000.0, -80.0", "-50.0, -80.0")
+    .replace("[1000.0, -80.0]", "[50.0, -80.0]")
+    .replace("height_m = 780.0", "height_m = 560.0")
+    .replace('kind = "oscillating"\nprf_hz = 1500.0', 'kind = "os1"')
+)
+
+
+def flown_by(folder: Path, beside_utc_s: float) -> Flown:
+    """A flight of 8 s whose head stamps nanoseconds since 1970 on a scale so many seconds beside UTC."""
+
+    def ticks(clock: HeadClock, time_s: NDArray[np.float64]) -> NDArray[np.int64]:
+        return UNIX_NS + np.floor((np.asarray(time_s) + beside_utc_s) * 1e9).astype(np.int64)
+
+    with (
+        patch.object(one_line, "PLAN", SHORT),
+        patch.object(HeadClock, "ticks", ticks),
+        patch.object(ouster_wire, "SYNC_PULSE", "TIME_FROM_PTP_1588"),
+    ):
+        flown = fly(folder)
+    assert read_head((flown.folder / "left.json").read_bytes()).timestamp_mode == "TIME_FROM_PTP_1588"
+    return flown
+
+
+@pytest.mark.parametrize("scale", list(SCALES_S))
+def test_points_have_the_time_and_place_of_their_pulses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scale: str
+) -> None:
+    flown = flown_by(tmp_path, SCALES_S[scale])
+    capsys.readouterr()
+    assert run_app(flown.arguments(tmp_path / "out", "--strips", "whole")) == 0
+    assert f"scanner/left: its stamps are taken as {scale}: " in capsys.readouterr().out
+    las = laspy.read(next((tmp_path / "out").glob("*_strip01.laz")))
+    truth = flown.truth
+    assert len(las) == len(truth["left.gps_ns"]) > 100_000
+    gps_s = (truth["left.gps_ns"] - 10**18) / 1e9
+    assert np.abs(np.asarray(las.gps_time) - gps_s).max() < 1e-6
+    expected = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True).transform(*truth["left.point_e"].T)
+    assert np.abs(las.xyz - np.stack(expected, axis=1)).max() < 0.01
+
+
+def test_a_head_on_no_scale_is_named_and_gives_no_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its clock was set by hand, or by a master that is wrong by 3 s."""
+    flown = flown_by(tmp_path, OFF_S)
+    capsys.readouterr()
+    assert run_app(flown.arguments(tmp_path / "out", "--strips", "whole", "--json")) == 1
+    told = capsys.readouterr()
+    assert "returns have no time: its stamps run free" in told.err
+    assert not list((tmp_path / "out").glob("*.laz"))
+    assert json.loads(told.out or "{}") == {}
