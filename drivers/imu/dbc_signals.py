@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from drivers.core.can_frames import frame_id
 from drivers.core.parser import DriverSettingsError
 from georef.records import ByteRows
+from georef.text_encoding import decoded
 
 UInt64Array = NDArray[np.uint64]
 Float64Array = NDArray[np.float64]
@@ -153,7 +154,7 @@ def signal_layout(message: Any, signal: Any) -> SignalLayout:
 
 
 def load_database(contents: bytes, key: str = "dbc") -> Any:
-    """The cantools database of a DBC file's bytes (UTF-8, else Windows-1252, the format's own).
+    """The cantools database of a DBC file's bytes (UTF-8, UTF-16 by its mark, else Windows-1252, the format's own).
 
     Raises:
         DriverSettingsError: it is no DBC file.
@@ -163,7 +164,7 @@ def load_database(contents: bytes, key: str = "dbc") -> Any:
 
     logging.getLogger("cantools").setLevel(logging.ERROR)  # of a message there twice `find_signal` tells, if it matters
     try:
-        text = contents.decode("utf-8")
+        text = decoded(contents)
     except UnicodeDecodeError:
         text = contents.decode("cp1252", errors="replace")
     try:

@@ -125,6 +125,15 @@ def test_a_missing_signal_is_named_with_what_there_is() -> None:
         find_signal(database, "acc_x", "imu.dbc")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_is_no_part_of_a_dbc(encoding: str) -> None:
+    """As Windows editors save it."""
+    marked = load_database(IMU_DBC.encode(encoding))
+    assert [message.name for message in marked.messages] == [
+        message.name for message in load_database(IMU_DBC.encode()).messages
+    ]
+
+
 def test_what_is_no_dbc_is_refused_in_one_line() -> None:
     with pytest.raises(DriverSettingsError, match="not a DBC file"):
         load_database(b"\x7fELF not a DBC")
