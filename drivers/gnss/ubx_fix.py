@@ -49,7 +49,7 @@ def merge_epoch(parts: dict[str, tuple[int, NavMessage]], floor_week: int) -> Gn
         position_cov_l=_position_cov(position, cov),
         velocity_cov_l=_velocity_cov(pvt, cov),
         fix_type=_fix_type(pvt),
-        satellites=pvt.satellites if pvt is not None else None,
+        satellites=pvt.satellites & 0x7F if pvt is not None else None,  # M8P firmware sets the highest bit
         valid=position is not None and (pvt is None or pvt.flags & ubx.PVT_FIX_OK != 0),
         message="NAV-PVT" if pvt is not None else "NAV-HPPOSLLH",
         undulation_m=_undulation_m(pvt, high) if position else None,

@@ -290,6 +290,12 @@ def test_one_fix_of_all_messages_of_an_epoch() -> None:
     assert parser.counters.errors == {}
 
 
+def test_the_highest_bit_of_satellites_counts_none() -> None:
+    """M8P firmware says 0x88 of eight satellites; no receiver uses more than 127."""
+    (fix,) = fixes(parse(pvt(NOON_MS, satellites=0x88), ubx.encode_nav_eoe(ubx.NavEoe(NOON_MS)))[0])
+    assert fix.satellites == 8
+
+
 def test_without_covariances_the_accuracies_stand_in() -> None:
     (fix,) = fixes(parse(pvt(NOON_MS))[0])
     assert fix.position_cov_l is not None
