@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,7 @@ from daemon.exporting import MANIFEST
 from daemon.log.format import LogError, safe_attachment_path
 from daemon.sidecar import SUFFIX
 from drivers.transports.base import TransportError
-from drivers.transports.capture_file import BareTime, is_candump, is_pcap, open_capture
+from drivers.transports.capture_file import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
 
 _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10
@@ -80,7 +79,7 @@ def _named(routes: Routes, text: str) -> list[Capture]:
         raise UserError(f"--source {text}: {_WANTED}")
     path = Path(file)
     port = _port(routes, source, f"--source {text}")
-    kind = _kind(path)
+    kind = _kind(read_beginning(path, _LOOKED_AT_BYTES)[0])
     wanted = _KIND_OF_PORT[port.kind]
     if (kind == "pcap") != (wanted == "pcap"):
         forms = {
@@ -105,8 +104,13 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
     """A file whose units say themselves whose they are, or the folder of an export."""
     if path.is_dir():
         return _of_export(routes, path)
-    kind = _kind(path)
+    head, damage = read_beginning(path, _LOOKED_AT_BYTES)
+    kind = _kind(head)
     if kind == "serial":
+        if damage:
+            raise TransportError(f"{path}: cannot be read: {damage}")
+        if any(map(is_shown_candump, _first_lines(head))):
+            raise UserError(f"{path}: is what candump shows for people to read; want what candump -L (or -l) writes")
         raise UserError(
             f"{path}: neither pcap nor candump -L; if it is a device's bytes, say --source kind/name={path}"
         )
@@ -115,19 +119,15 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
     return [Capture(path, kind)]
 
 
-def _kind(path: Path) -> str:
+def _kind(head: bytes) -> str:
     """By the beginning: pcap, candump, else the bytes of a serial line."""
-    try:
-        with open_capture(path) as stream:
-            head = stream.read(_LOOKED_AT_BYTES)
-    except TransportError:
-        raise
-    except (OSError, EOFError, zlib.error) as error:
-        raise TransportError(f"{path}: cannot be read: {error}") from error
     if is_pcap(head):
         return "pcap"
-    lines = head.decode("ascii", "replace").splitlines()[:_LOOKED_AT_LINES]
-    return "candump" if any(is_candump(line.strip()) for line in lines) else "serial"
+    return "candump" if any(map(is_candump, _first_lines(head))) else "serial"
+
+
+def _first_lines(head: bytes) -> list[str]:
+    return [line.strip() for line in head.decode("ascii", "replace").splitlines()[:_LOOKED_AT_LINES]]
 
 
 def _settle(capture: Capture, told: Told) -> None:

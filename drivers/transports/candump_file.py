@@ -24,6 +24,7 @@ from drivers.core.can_frames import (
 from drivers.transports.capture_base import LATEST_NS, CapturedUnit, CaptureTally, read_lines, report, until_damage
 
 _LINE = re.compile(r"\((\d{1,11})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(\S*)(?:\s+[RT])?")
+_SHOWN = re.compile(r"(?:\([^)]*\)\s+)?\S+\s+(?:[RT]X [-B] [-E]\s+)?[0-9A-Fa-f]{3,8}\s+\[\d{1,2}\](?:\s.*)?")
 _DROPPED = re.compile(r"DROPCOUNT: dropped (\d{1,10}) CAN frames? on .*")
 _CLASSIC_FRAME = struct.Struct("<IBBBB8s")
 _FD_FRAME = struct.Struct("<IBBxx64s")
@@ -32,6 +33,11 @@ _FD_FRAME = struct.Struct("<IBBxx64s")
 def is_candump(line: str) -> bool:
     """Whether a line is one of ``candump -L``."""
     return _LINE.fullmatch(line) is not None or _DROPPED.fullmatch(line) is not None
+
+
+def is_shown_candump(line: str) -> bool:
+    """Return whether a line is one that candump shows without ``-L``, for people to read."""
+    return _SHOWN.fullmatch(line) is not None
 
 
 def read_candump(

@@ -87,6 +87,24 @@ def open_capture(path: Path) -> BinaryIO:
     return gzip.open(path, "rb")  # type: ignore[return-value]
 
 
+def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
+    """Return up to ``count`` bytes of a file's content, and what kept more of them from being read ("" if nothing).
+
+    Raises:
+        TransportError: nothing can be read.
+    """
+    data, damage = b"", ""
+    with open_capture(path) as stream:
+        try:
+            while len(data) < count and (piece := stream.read1(count - len(data))):  # type: ignore[attr-defined]
+                data += piece
+        except (EOFError, OSError, zlib.error) as error:
+            if not data:
+                raise TransportError(f"{path}: cannot be read: {error}") from error
+            damage = str(error)
+    return data, damage
+
+
 def read_bytes(stream: BinaryIO, count: int, path: Path) -> bytes:
     """Up to ``count`` bytes, fewer at the end of the file only."""
     try:

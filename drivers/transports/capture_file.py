@@ -5,8 +5,8 @@ magic. For import, replaying, demonstrations and tests. A file that is not what 
 with one line, after the units before the bad place were given; a reader that is given a `CaptureTally` counts instead.
 """
 
-from drivers.transports.candump_file import candump_line, held_by_line, is_candump, read_candump
-from drivers.transports.capture_base import Address, CapturedUnit, CaptureTally, open_capture
+from drivers.transports.candump_file import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
+from drivers.transports.capture_base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning
 from drivers.transports.pcap_file import is_pcap, read_pcap
 from drivers.transports.serial_file import BareTime, chunk_table, read_bare, read_serial, read_tagged
 
@@ -20,8 +20,10 @@ __all__ = [
     "held_by_line",
     "is_candump",
     "is_pcap",
+    "is_shown_candump",
     "open_capture",
     "read_bare",
+    "read_beginning",
     "read_candump",
     "read_pcap",
     "read_serial",

@@ -9,10 +9,24 @@ from ipaddress import IPv6Address
 
 # https://www.tcpdump.org/linktypes.html
 _NULL, _ETHERNET, _RAW_IP, _LOOP, _LINUX_SLL, _IPV4_ONLY, _IPV6_ONLY, _LINUX_SLL2 = 0, 1, 101, 108, 113, 228, 229, 276
-_BARE = {_RAW_IP: 0, _IPV4_ONLY: 0, _IPV6_ONLY: 0, _NULL: 4, _LOOP: 4}  # bytes before the IP packet
+_RAW_IP_BSD, _RAW_IP_OPENBSD = 12, 14  # DLT_RAW of the systems themselves, which some software writes as it is
+_BARE = {
+    _RAW_IP: 0,
+    _RAW_IP_BSD: 0,
+    _RAW_IP_OPENBSD: 0,
+    _IPV4_ONLY: 0,
+    _IPV6_ONLY: 0,
+    _NULL: 4,
+    _LOOP: 4,
+}  # bytes before the IP packet
 _IPV4, _IPV6 = 0x0800, 0x86DD
 _VLAN_TAGS = (0x8100, 0x88A8, 0x9100)
 _UDP, _IPV6_FRAGMENT = 17, 44
+_IPV6_OPTIONS = (
+    0,
+    43,
+    60,
+)  # hop by hop, routing, destination: headers of 8 (length + 1) bytes (RFC 8200, 4.3, 4.4, 4.6)
 _MAX_PENDING = 64  # datagrams whose fragments are waited for; the oldest goes first
 _MAX_DATAGRAM_BYTES = 65_535
 _RECENT = 128  # packets among which a second copy is looked for: two times the fragments of the largest datagram
@@ -44,6 +58,13 @@ def ip_packet(link: int, frame: bytes) -> bytes:
     while int.from_bytes(kind, "big") in _VLAN_TAGS and at + 4 <= len(frame):  # IEEE 802.1Q: tag, then what follows
         kind, at = frame[at + 2 : at + 4], at + 4
     return frame[at:] if int.from_bytes(kind, "big") in (_IPV4, _IPV6) else b""
+
+
+def _past_options(packet: bytes, following: int, at: int) -> tuple[int, int]:
+    """Return what follows an IPv6 packet's options, and where; no more than the packet was captured to."""
+    while following in _IPV6_OPTIONS and at + 2 <= len(packet):
+        following, at = packet[at], at + 8 * (packet[at + 1] + 1)
+    return following, at
 
 
 @lru_cache(maxsize=4096)
@@ -127,20 +148,21 @@ class IpPackets:
     def _add_v6(self, packet: bytes) -> Datagram | None:
         following, length = packet[6], int.from_bytes(packet[4:6], "big")
         end = 40 + length if length else len(packet)  # 0: segmented by the network card
-        segment: bytes | None = packet[40:end]
+        following, at = _past_options(packet, following, 40)
         if following not in (_UDP, _IPV6_FRAGMENT):
             self.others += 1
             return None
         if len(packet) < end:
             self.cut += 1
             return None
+        segment: bytes | None = packet[at:end]
         if following == _IPV6_FRAGMENT:
-            head = packet[40:48]
+            head = packet[at : at + 8]
             if len(head) < 8 or head[0] != _UDP:
                 self.others += 1
                 return None
             place = int.from_bytes(head[2:4], "big")
-            segment = self._piece(head[4:8] + packet[8:40], place & 0xFFF8, packet[48:end], bool(place & 1))
+            segment = self._piece(head[4:8] + packet[8:40], place & 0xFFF8, packet[at + 8 : end], bool(place & 1))
         if segment is None:
             return None
         return str(IPv6Address(packet[8:24])), str(IPv6Address(packet[24:40])), segment

@@ -126,7 +126,7 @@ def _packets(stream: BinaryIO, path: Path, tally: CaptureTally | None) -> Iterat
     rest = read_bytes(stream, _FILE_HEADER_BYTES - 4, path)
     if len(rest) < _FILE_HEADER_BYTES - 4:
         raise CaptureDamageError(f"{path}: ends in its header")
-    link = struct.unpack(f"{order}I", rest[-4:])[0] & 0x0FFF_FFFF
+    link = struct.unpack(f"{order}I", rest[-4:])[0] & 0xFFFF  # above: of the frame check sequence, and reserved
     record = struct.Struct(f"{order}IIII")
     at = _FILE_HEADER_BYTES
     while head := read_bytes(stream, record.size, path):

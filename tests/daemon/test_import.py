@@ -357,6 +357,31 @@ class TestWrong:
         assert not (tmp_path / "logs").exists()
         assert self.run(tmp_path, nowhere, "--source", f"gnss/nobody={nowhere}")[0] == 2
 
+    def test_a_short_packed_capture_that_is_cut_gives_what_stands_before(self, tmp_path: Path) -> None:
+        """As larger ones do: less than is looked at to know what it is."""
+        frames = [
+            f"({1_700_000_000 + i}.{i * 7919 % 10**6:06}) can1 {i * 37 % 2048:03X}#{i * i:08X}" for i in range(200)
+        ]
+        whole = gzip.compress("\n".join(frames).encode())
+        (tmp_path / "short.log.gz").write_bytes(whole[: len(whole) // 2])
+        code, error, found = self.run(tmp_path, str(tmp_path / "short.log.gz"))
+        assert (code, error.count("\n")) == (4, 1)
+        assert "short.log.gz: cannot be read on: " in error
+        assert 50 < found["units"]["imu/main"] < 150
+
+    @pytest.mark.parametrize(
+        "line",
+        [
+            "  can0  120   [8]  00 11 22 33 44 55 66 77",
+            " (2026-11-21 10:15:00.000123)  can0  RX - -  18FF50E5  [02]  01 02",
+        ],
+    )
+    def test_what_candump_shows_people_is_named(self, tmp_path: Path, line: str) -> None:
+        (tmp_path / "shown.log").write_text(f"{line}\n{line}\n")
+        want = "shown.log: is what candump shows for people to read; want what candump -L (or -l) writes"
+        code, error, _ = self.run(tmp_path, str(tmp_path / "shown.log"))
+        assert (code, error) == (2, f"swath: {tmp_path}/{want}\n")
+
     def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))

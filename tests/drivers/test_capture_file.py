@@ -108,8 +108,8 @@ SLL_VLAN = bytes(14) + b"\x81\x00\x00\x05\x08\x00"
 SLL2 = b"\x08\x00" + bytes(18)
 SLL2_VLAN = b"\x81\x00" + bytes(18) + b"\x00\x05\x08\x00"
 LINKS = [
-    (0, bytes(4)), (1, ETHERNET), (1, VLAN), (1, TWO_TAGS), (101, b""), (108, bytes(4)), (113, SLL), (113, SLL_VLAN),
-    (228, b""), (276, SLL2), (276, SLL2_VLAN),
+    (0, bytes(4)), (1, ETHERNET), (1, VLAN), (1, TWO_TAGS), (12, b""), (14, b""), (101, b""), (108, bytes(4)),
+    (113, SLL), (113, SLL_VLAN), (228, b""), (276, SLL2), (276, SLL2_VLAN),
 ]  # fmt: skip
 
 
@@ -119,6 +119,12 @@ def test_link_layers_and_byte_orders(tmp_path: Path, link: int, head: bytes, ord
     frame = head + udp_packet(b"scan") + b"padding"
     [unit] = read_pcap(write_pcap(tmp_path / "one.pcap", [frame], link, order))
     assert unit == CapturedUnit(1_700_000_000_123_456_000, b"scan", "udp", ("10.0.0.1", 4000), ("10.0.0.2", 2368))
+
+
+def test_bits_of_the_frame_check_sequence_are_no_link_type(tmp_path: Path) -> None:
+    """As draft-ietf-opsawg-pcap has it: link type in the low 16 bits; FCS length 2 words and its flag above."""
+    [unit] = read_pcap(write_pcap(tmp_path / "fcs.pcap", [ETHERNET + udp_packet(b"scan") + bytes(4)], 0x2400_0001))
+    assert unit.data == b"scan"
 
 
 def test_nanosecond_times_are_exact(tmp_path: Path) -> None:
@@ -131,6 +137,29 @@ def test_ipv6_datagrams(tmp_path: Path) -> None:
     packet = struct.pack(">IHBB", 6 << 28, len(segment), 17, 64) + bytes(15) + b"\1" + bytes(15) + b"\2" + segment
     [unit] = read_pcap(write_pcap(tmp_path / "six.pcap", [bytes(12) + b"\x86\xdd" + packet]))
     assert (unit.source, unit.destination, unit.data) == (("::1", 1), ("::2", 2368), b"scan")
+
+
+def ipv6_with_options(following: int, rest: bytes, cut: int = 0) -> bytes:
+    """A packet with hop-by-hop, routing and destination options (RFC 8200, 4.3, 4.4, 4.6) before what follows."""
+    options = bytes([43, 0, 1, 4, 0, 0, 0, 0]) + bytes([60, 2]) + bytes(22) + bytes([following, 1]) + bytes(14)
+    head = struct.pack(">IHBB", 6 << 28, len(options + rest), 0, 64) + bytes(15) + b"\1" + bytes(15) + b"\2"
+    return (head + options + rest)[: cut or None]
+
+
+def test_ipv6_datagrams_behind_options() -> None:
+    segment = struct.pack(">HHHH", 1, 2368, 12, 0) + b"scan"
+    packet = ipv6_with_options(17, segment)
+    assert dpkt.ip6.IP6(packet).data.data == b"scan"
+    packets = IpPackets()
+    assert packets.add(packet) == ("::1", "::2", segment)
+    fragment = struct.pack(">BBHI", 17, 0, 0, 99)
+    assert packets.add(ipv6_with_options(44, fragment + segment)) == ("::1", "::2", segment)
+    assert packets.add(ipv6_with_options(58, segment)) is None
+    assert (packets.others, packets.cut) == (1, 0)
+    assert packets.add(ipv6_with_options(17, segment, cut=90)) is None
+    assert (packets.others, packets.cut) == (1, 1)
+    for cut in range(40, 88):
+        assert packets.add(ipv6_with_options(17, segment, cut=cut)) is None
 
 
 def test_fragments_are_put_together_in_any_order(tmp_path: Path) -> None:
