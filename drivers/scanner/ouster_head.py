@@ -159,7 +159,7 @@ def read_head(content: bytes) -> OusterHead:
         timestamp_mode=timestamp_mode,
         nmea_input=config.optional("multipurpose_io_mode", str, "") == "INPUT_NMEA_UART",
         return_order=_return_order(config),
-        altitude_rad=_angles(table, "beam_altitude_angles", beams, 90.0),
+        altitude_rad=_altitudes(table, beams),
         azimuth_rad=_angles(table, "beam_azimuth_angles", beams, 360.0),
         pixel_shift=layout.numbers("pixel_shift_by_row", beams, columns).astype(np.int64),
         beam_origin_m=_beam_origin(table),
@@ -281,6 +281,14 @@ def _return_order(config: _Keys) -> str:
 
 def _angles(table: _Keys, key: str, beams: int, bound_deg: float) -> FloatArray:
     return np.radians(table.numbers(key, beams, bound_deg))
+
+
+def _altitudes(table: _Keys, beams: int) -> FloatArray:
+    """Of each beam; a head whose factory calibration is lost says 0 of all, which puts its points into one plane."""
+    altitude_rad = _angles(table, "beam_altitude_angles", beams, 90.0)
+    if beams > 1 and not altitude_rad.any():
+        raise _wrong("beam_altitude_angles", altitude_rad.tolist(), "the head's own: 0 of all beams is no calibration")
+    return altitude_rad
 
 
 def _transform(table: _Keys, key: str) -> FloatArray:

@@ -105,6 +105,11 @@ def changed(path: str, value: Any) -> bytes:
             "beam_altitude_angles: got a list of 16, want 16 numbers within ±90",
         ),
         (
+            "beam_intrinsics/beam_altitude_angles",
+            [0, 0.0] * 8,
+            "beam_altitude_angles: got a list of 16, want the head's own: 0 of all beams is no calibration",
+        ),
+        (
             "beam_intrinsics/beam_to_lidar_transform",
             None,
             "lidar_origin_to_beam_origin_mm: got nothing, want a number within ±1000",
