@@ -22,6 +22,12 @@ _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10
 _MAX_MANIFEST_BYTES = 1 << 20
 _KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "pps": "pps"}
+_NO_CAPTURE = {  # what files begin with that hold devices' bytes in a way of their own
+    b"SQLite format 3\0": "a ROS 2 bag, or another SQLite file",
+    b"#ROSBAG V": "a ROS 1 bag",
+    b"\x89MCAP0\r\n": "a log, or a ROS 2 bag in MCAP",
+    b"LOGG": "a BLF file of Vector",
+}
 _WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE or kind/name:<UDP port>=FILE"
 
 
@@ -109,6 +115,8 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
     if kind == "serial":
         if damage:
             raise TransportError(f"{path}: cannot be read: {damage}")
+        if other := next((what for magic, what in _NO_CAPTURE.items() if head.startswith(magic)), ""):
+            raise UserError(f"{path}: is {other}; want pcap, candump -L or a device's bytes")
         if any(map(is_shown_candump, _first_lines(head))):
             raise UserError(f"{path}: is what candump shows for people to read; want what candump -L (or -l) writes")
         raise UserError(

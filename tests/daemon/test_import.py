@@ -382,6 +382,22 @@ class TestWrong:
         code, error, _ = self.run(tmp_path, str(tmp_path / "shown.log"))
         assert (code, error) == (2, f"swath: {tmp_path}/{want}\n")
 
+    @pytest.mark.parametrize(
+        ("begins", "what"),
+        [
+            (b"SQLite format 3\0\x10\0", "a ROS 2 bag, or another SQLite file"),
+            (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
+            (b"\x89MCAP0\r\n\x01", "a log, or a ROS 2 bag in MCAP"),
+            (b"LOGG\x90\0\0\0", "a BLF file of Vector"),
+        ],
+    )
+    def test_a_container_of_others_is_named(self, tmp_path: Path, begins: bytes, what: str) -> None:
+        """By the first bytes that SQLite, rosbag, MCAP and python-can's BLF reader give."""
+        (tmp_path / "flight.bag").write_bytes(begins + bytes(100))
+        code, error, _ = self.run(tmp_path, str(tmp_path / "flight.bag"))
+        want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L or a device's bytes\n"
+        assert (code, error) == (2, want)
+
     def test_a_capture_of_other_ports(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
