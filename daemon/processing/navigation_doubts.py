@@ -139,6 +139,7 @@ def input_doubts(
             f"{log}: {without:,} headings of {sources.gnss_source} are left out: want "
             f"gnss.{sources.gnss_name}.secondary_lever_arm_m, the second antenna's place"
         )
+    lines += _silent_antenna(found, sources, log)
     lines += [f"{log}: the recorder lost {count:,} units of {source}" for source, count in sorted(found.lost.items())]
     lines += _baseline_doubts(found, sources, log)
     return lines
@@ -163,6 +164,18 @@ def height_findings(found: NavigationLog, sources: NavigationSources) -> list[Fi
         f"wrong by the geoid's, {size}; let the receiver send its geoid separation, or compare with control"
     )
     return [Finding("geoid_unsaid", "warning", text)]
+
+
+def _silent_antenna(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:
+    """Nothing came of a second antenna that the configuration names: neither headings nor its own positions."""
+    if sources.gnss is None or sources.gnss.secondary_lever_arm_m is None or found.headings:
+        return []
+    if any(fix.antenna == "secondary" for fix in found.fixes):
+        return []
+    return [
+        f"{log}: {sources.gnss_source} sent no heading that is known here, though secondary_lever_arm_m names a second "
+        "antenna: want its messages of heading as the page of its protocol lists them"
+    ]
 
 
 def _baseline_doubts(found: NavigationLog, sources: NavigationSources, log: Path) -> list[str]:

@@ -258,6 +258,15 @@ class TestDoubts:
         assert inputs.refused["heading_no_secondary_lever_arm"] > 60
         assert "want gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
 
+    def test_a_second_antenna_that_tells_nothing(self, tmp_path: Path) -> None:
+        one = PLAN.replace("secondary_lever_arm_m = [0.9, 0.6, -1.2]", "")
+        flown = fly_short(tmp_path, one, 10.0)
+        assert not read_inputs(flown.session(), InputWish()).doubts
+        arm = "lever_arm_m = [0.1, -0.05, -1.2]"
+        config = flown.changed("two.toml", **{arm: f"{arm}\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]"})
+        (line,) = read_inputs(flown.session(), InputWish(config=config)).doubts
+        assert "gnss/rover sent no heading that is known here, though secondary_lever_arm_m" in line
+
     def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
         inputs = read_inputs(flown.session(), InputWish(config=config))
