@@ -66,6 +66,7 @@ def test_returns_lie_on_the_planes(looks: str) -> None:
     assert seen == sum(len(swath) for swath in flight.swaths)
 
 
+@pytest.mark.slow
 def test_sigmas_are_those_of_flights_with_such_errors() -> None:
     """60 flights: new trajectory errors, noise on range and angle, one step of the adjustment: χ² of four parameters.
 

@@ -371,6 +371,7 @@ class TestStatus:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_replays_with_a_configuration_of_its_own(self, flown: Flown, tmp_path: Path) -> None:
         config = flown.config.path.with_name("other.toml")
         config.write_text(flown.config.text + "\n[live]\npoints_per_s = 100\ncell_m = 5.0\n")

@@ -90,6 +90,7 @@ def run(command: Any, *arguments: str) -> None:
     app(args=list(arguments), standalone_mode=False)
 
 
+@pytest.mark.slow
 def test_tiles_in_any_order_give_the_same_cells_and_differences(tmp_path: Path) -> None:
     """Density of all returns and strips is 18 a square metre; of one strip's single ones on the meadow it is 5."""
     cloud, rng = flown(5.0), np.random.default_rng(1)

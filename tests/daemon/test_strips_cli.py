@@ -170,6 +170,7 @@ def test_a_wrong_roll_is_named_and_is_a_problem(made: Cast, tmp_path: Path, caps
     assert roll["sigma"] < 0.005
 
 
+@pytest.mark.slow
 def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     """Both ways to the same differences: arrays in t, and LAZ in a projection."""
     of_flight = strips_of_flight("flight", made.flight, StripRules())
@@ -182,6 +183,7 @@ def test_a_flight_gives_what_its_files_give(made: Cast, tmp_path: Path) -> None:
     assert float(np.median(heights[0])) == pytest.approx(float(np.median(heights[1])), abs=0.05)
 
 
+@pytest.mark.slow
 def test_one_cloud_has_one_figure_and_one_level_wherever_it_is_told(
     made: Cast, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -234,6 +236,7 @@ def test_the_datum_is_that_of_the_configuration(made: Cast, tmp_path: Path, said
     assert np.abs(of_files.seen.frame.e_from_t(gathered.points[own]) - there).max() < 0.01
 
 
+@pytest.mark.slow
 def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path: Path) -> None:
     """Also of two aircraft at one time: each strip has its run's trajectory."""
     first = products(tmp_path / "p", made.flight)
@@ -250,6 +253,7 @@ def test_equal_numbers_of_two_runs_are_strips_of_their_own(made: Cast, tmp_path:
     assert strips.seen.flown == [0, 0, 1, 1]
 
 
+@pytest.mark.slow
 def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, tmp_path: Path) -> None:
     folders = [products(tmp_path / name, made.flight) for name in ("left", "right")]
     strips = strips_of_files(folders, StripRules(), lambda what, done, of: None)

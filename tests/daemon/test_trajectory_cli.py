@@ -183,6 +183,7 @@ class TestOtherwise:
         assert len(reasons) == len(leg["verdict"]["reasons"]) - 1 > 0
         assert all(reason["what"] in line for reason, line in zip(leg["verdict"]["reasons"][1:], reasons, strict=True))
 
+    @pytest.mark.slow
     def test_an_attitude_given_by_hand_starts_it(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

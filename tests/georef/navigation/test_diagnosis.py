@@ -358,6 +358,7 @@ def component_late(rows: StructArray, component: str, late_s: float) -> StructAr
     ],
     ids=["course late", "course early", "down late"],
 )
+@pytest.mark.slow
 def test_motion_that_is_late_in_part_is_no_offset_but_unclear(
     recording: Callable[[], Recording], component: str, late_s: float, compared: str
 ) -> None:
