@@ -15,9 +15,9 @@ import gzip
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BufferedIOBase
 from pathlib import Path
 from types import TracebackType
-from typing import IO
 
 from drivers.transports.capture_base import LATEST_NS, CaptureDamageError, CapturedUnit, open_capture, read_bytes
 
@@ -95,7 +95,7 @@ def read_sidecar(path: Path) -> Iterator[SidecarRow]:
             yield row
 
 
-def _line(stream: IO[bytes], sidecar: Path) -> str:
+def _line(stream: BufferedIOBase, sidecar: Path) -> str:
     try:
         return stream.readline(_MAX_LINE_BYTES).decode("ascii", "replace")
     except (EOFError, OSError, zlib.error) as error:

@@ -7,8 +7,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 from drivers.transports.base import TransportError
 
@@ -74,8 +74,8 @@ def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> I
         report(tally, str(error))
 
 
-def open_capture(path: Path) -> BinaryIO:
-    """The file's content as a stream, decompressed where it begins as gzip does."""
+def open_capture(path: Path) -> BufferedIOBase:
+    """Open the file's content as a stream, decompressed where it begins as gzip does."""
     try:
         plain = path.open("rb")
         packed = plain.peek(2)[:2] == b"\x1f\x8b"
@@ -84,7 +84,7 @@ def open_capture(path: Path) -> BinaryIO:
     if not packed:
         return plain
     plain.close()
-    return gzip.open(path, "rb")  # type: ignore[return-value]
+    return gzip.open(path, "rb")
 
 
 def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
@@ -96,7 +96,7 @@ def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
     data, damage = b"", ""
     with open_capture(path) as stream:
         try:
-            while len(data) < count and (piece := stream.read1(count - len(data))):  # type: ignore[attr-defined]
+            while len(data) < count and (piece := stream.read1(count - len(data))):
                 data += piece
         except (EOFError, OSError, zlib.error) as error:
             if not data:
@@ -105,7 +105,7 @@ def read_beginning(path: Path, count: int) -> tuple[bytes, str]:
     return data, damage
 
 
-def read_bytes(stream: BinaryIO, count: int, path: Path) -> bytes:
+def read_bytes(stream: BufferedIOBase, count: int, path: Path) -> bytes:
     """Up to ``count`` bytes, fewer at the end of the file only."""
     try:
         return stream.read(count)
@@ -129,7 +129,7 @@ def read_lines(path: Path, tally: CaptureTally | None = None) -> Iterator[tuple[
                 yield number, text
 
 
-def _read_line(stream: BinaryIO, path: Path) -> bytes:
+def _read_line(stream: BufferedIOBase, path: Path) -> bytes:
     try:
         return stream.readline(MAX_LINE_BYTES + 1)
     except (EOFError, OSError, zlib.error) as error:

@@ -10,23 +10,13 @@ from ipaddress import IPv6Address
 # https://www.tcpdump.org/linktypes.html
 _NULL, _ETHERNET, _RAW_IP, _LOOP, _LINUX_SLL, _IPV4_ONLY, _IPV6_ONLY, _LINUX_SLL2 = 0, 1, 101, 108, 113, 228, 229, 276
 _RAW_IP_BSD, _RAW_IP_OPENBSD = 12, 14  # DLT_RAW of the systems themselves, which some software writes as it is
-_BARE = {
-    _RAW_IP: 0,
-    _RAW_IP_BSD: 0,
-    _RAW_IP_OPENBSD: 0,
-    _IPV4_ONLY: 0,
-    _IPV6_ONLY: 0,
-    _NULL: 4,
-    _LOOP: 4,
-}  # bytes before the IP packet
+_RAW = (_RAW_IP, _RAW_IP_BSD, _RAW_IP_OPENBSD, _IPV4_ONLY, _IPV6_ONLY)
+_BARE = {**dict.fromkeys(_RAW, 0), _NULL: 4, _LOOP: 4}  # bytes before the IP packet
 _IPV4, _IPV6 = 0x0800, 0x86DD
 _VLAN_TAGS = (0x8100, 0x88A8, 0x9100)
 _UDP, _IPV6_FRAGMENT = 17, 44
-_IPV6_OPTIONS = (
-    0,
-    43,
-    60,
-)  # hop by hop, routing, destination: headers of 8 (length + 1) bytes (RFC 8200, 4.3, 4.4, 4.6)
+# hop by hop, routing, destination: headers of 8 (length + 1) bytes (RFC 8200, 4.3, 4.4, 4.6)
+_IPV6_OPTIONS = (0, 43, 60)
 _MAX_PENDING = 64  # datagrams whose fragments are waited for; the oldest goes first
 _MAX_DATAGRAM_BYTES = 65_535
 _RECENT = 128  # packets among which a second copy is looked for: two times the fragments of the largest datagram

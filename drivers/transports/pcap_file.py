@@ -8,8 +8,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 from drivers.transports.base import TransportError
 from drivers.transports.capture_base import (
@@ -113,7 +113,7 @@ def _unit(
     return CapturedUnit(time_ns, segment[8:length], "udp", (source, from_port), (destination, to_port))
 
 
-def _packets(stream: BinaryIO, path: Path, tally: CaptureTally | None) -> Iterator[Packet]:
+def _packets(stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> Iterator[Packet]:
     """Time, link type and bytes of each packet."""
     head = read_bytes(stream, 4, path)
     magic = struct.unpack("<I", head)[0] if len(head) == 4 else 0
@@ -155,7 +155,7 @@ class _Interface:
 class _PcapngReader:
     """The packets of a pcapng file of which the first block's type has been read."""
 
-    def __init__(self, stream: BinaryIO, path: Path, tally: CaptureTally | None) -> None:
+    def __init__(self, stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> None:
         self._stream = stream
         self._path = path
         self._tally = tally

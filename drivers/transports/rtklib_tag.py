@@ -19,7 +19,7 @@ import datetime as dt
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from io import BufferedIOBase
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class TagLayout:
 _LAYOUTS = (TagLayout("I", "I"), TagLayout("I", "Q"), TagLayout("q", "Q"), TagLayout("q", "I"))
 
 
-def read_tags(stream: BinaryIO) -> Iterator[tuple[int, int]]:
+def read_tags(stream: BufferedIOBase) -> Iterator[tuple[int, int]]:
     """Time and size of the stream after each write; an unfinished last entry is left out.
 
     Yields:
@@ -131,7 +131,7 @@ def _gps_as_unix_ns(unix_ns: int) -> int:
 class TagWriter:
     """The tag file of a stream whose first bytes came at ``first_ns`` (nanoseconds since 1970, UTC)."""
 
-    def __init__(self, stream: BinaryIO, first_ns: int) -> None:
+    def __init__(self, stream: BufferedIOBase, first_ns: int) -> None:
         self._stream = stream
         self._open_ms = max(0, first_ns) // _MS_NS
         self._tick_ms = 0

@@ -6,8 +6,8 @@ import csv
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 from drivers.transports.base import TransportError
 from drivers.transports.capture_base import (
@@ -71,7 +71,7 @@ def _tabled(path: Path, given: Path | None) -> Iterator[CapturedUnit]:
             yield CapturedUnit(time_ns, data, "serial")
 
 
-def _seek(stream: BinaryIO, offset: int, position: int, path: Path) -> None:
+def _seek(stream: BufferedIOBase, offset: int, position: int, path: Path) -> None:
     try:
         if offset != position:
             stream.seek(offset)
@@ -124,14 +124,14 @@ def _tagged(path: Path, tags: Path) -> Iterator[CapturedUnit]:
             yield CapturedUnit(time_ns, data, "serial")
 
 
-def _tag_entries(stream: BinaryIO, tags: Path) -> Iterator[tuple[int, int]]:
+def _tag_entries(stream: BufferedIOBase, tags: Path) -> Iterator[tuple[int, int]]:
     try:
         yield from read_tags(stream)
     except (ValueError, EOFError, OSError) as error:
         raise CaptureDamageError(f"{tags}: {error}; want the time tags of RTKLIB's str2str") from error
 
 
-def _take(stream: BinaryIO, count: int, path: Path, tags: Path) -> Iterator[bytes]:
+def _take(stream: BufferedIOBase, count: int, path: Path, tags: Path) -> Iterator[bytes]:
     while count:
         data = read_bytes(stream, min(count, MAX_READ_BYTES), path)
         if not data:
