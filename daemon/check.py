@@ -329,9 +329,8 @@ def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
         void = heard.time_messages and heard.valid_time is None
         return ["the sentences at its input are void: want their receiver to have a fix"] if void else []
     if heard.sees_pps is not None:
-        return (
-            [] if entry.pps is not None else ["it says that no pulse reaches it; want the receiver's PPS wired to it"]
-        )
+        unlocked = "it says that it is not locked to a pulse; want the receiver's PPS wired to it"
+        return [] if entry.pps is not None else [unlocked]
     clock = entry.settings.config.get("clock", "auto")
     if clock != "auto":
         return [f'nothing tells whether it is locked; its stamps are taken as configured (clock = "{clock}")']

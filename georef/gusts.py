@@ -1,4 +1,4 @@
-"""What gusts did to an aircraft: turn rates above 0.5 Hz, which no two flights over the same lines share.
+"""Find what gusts did to an aircraft: turn rates above 0.5 Hz, which no two flights over the same lines share.
 
 Slower ones are those of the lines flown and the turns between them: another flight of the same plan has them too.
 """

@@ -304,10 +304,11 @@ class StreamClocks:
 
 @dataclass(frozen=True, slots=True)
 class HeadTime:
-    """What a scanner itself says of time in a log.
+    """Hold what a scanner itself says of time in a log.
 
-    messages: sentences or packets that it vouches for. trouble: why its time cannot be used, and the remedy; empty: it
-    can, or it says nothing.
+    Attributes:
+        messages: sentences or packets that it vouches for.
+        trouble: why its time cannot be used, and the remedy; empty: it can, or it says nothing.
     """
 
     messages: int = 0

@@ -143,10 +143,11 @@ def _trouble(read: _Reader, source: str, *, own: bool) -> str:
     facts = []
     if not (locked == 1).any():
         states = {str(status.values["pps_status"]) for status in read.statuses[source] if "pps_status" in status.values}
-        if states <= {"absent"}:
+        if states == {"absent"}:
             facts.append("says that no pulse reaches it; want the receiver's PPS wired to it")
         else:
-            facts.append(f"says that it is not locked to its pulse ({', '.join(sorted(states))}); want a steady PPS")
+            told = f" ({', '.join(sorted(states))})" if states else ""
+            facts.append(f"says that it is not locked to its pulse{told}; want a steady PPS, wired to it")
     messages = read.messages[source]
     valid = [message.host_time_ns for message in messages if message.valid]
     if own and not messages:
@@ -163,7 +164,7 @@ def _trouble(read: _Reader, source: str, *, own: bool) -> str:
 
 
 def is_void(status: DeviceStatus) -> bool:
-    """Whether a head says that the sentences of its receiver have no fix."""
+    """Tell whether a head says that the sentences of its receiver have no fix."""
     return status.values.get("nmea_valid") is False or status.values.get("gps_status") in ("invalid", "none")
 
 

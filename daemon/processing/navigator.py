@@ -207,7 +207,7 @@ class Navigator:
         return rows[fresh]
 
     def _directions(self, headings: list[GnssHeading], time_ns: list[int | None]) -> StructArray:
-        """Of a baseline, later than those handed on before."""
+        """Return headings of the baseline that are later than those handed on before."""
         if self._setup.baseline_b is None:
             return np.empty(0, OBSERVATION_DTYPE)
         found = heading_observations(headings, time_ns, float(np.linalg.norm(self._setup.baseline_b))).rows

@@ -178,24 +178,6 @@ def encode_gga(
     )
 
 
-def encode_gns(
-    time_ns: int,
-    lat_rad: float,
-    lon_rad: float,
-    altitude_m: float,
-    separation_m: float,
-    *,
-    modes: str = "AANN",
-    satellites: int = 12,
-    talker: str = "GN",
-) -> bytes:
-    """Fields as in GGA; ``modes`` has a letter for each constellation, GPS first."""
-    return encode_sentence(
-        f"{talker}GNS,{_time_text(time_ns)},{_position_text(lat_rad, lon_rad)},{modes},{satellites:02d},0.80,"
-        f"{altitude_m:.4f},{separation_m:.4f},,,V"
-    )
-
-
 def encode_rmc(
     time_ns: int,
     date: dt.date,

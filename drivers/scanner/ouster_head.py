@@ -284,7 +284,7 @@ def _angles(table: _Keys, key: str, beams: int, bound_deg: float) -> FloatArray:
 
 
 def _altitudes(table: _Keys, beams: int) -> FloatArray:
-    """Of each beam; a head whose factory calibration is lost says 0 of all, which puts its points into one plane."""
+    """Read each beam's altitude; a head that lost its factory calibration says 0 of all: all points in one plane."""
     altitude_rad = _angles(table, "beam_altitude_angles", beams, 90.0)
     if beams > 1 and not altitude_rad.any():
         raise _wrong("beam_altitude_angles", altitude_rad.tolist(), "the head's own: 0 of all beams is no calibration")

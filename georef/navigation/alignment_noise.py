@@ -96,7 +96,7 @@ def spaced_headings(rows: StructArray, setup: Setup) -> StructArray:
 
 
 def white_factor(step_ns: int, share: float, tau_s: float) -> float:
-    """Factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
+    """Return the factor on the sigma of values a step apart, a share of whose error is a Gauss–Markov process of tau.
 
     With it the mean of many has the variance that it really has, as if their errors were white.
     """

@@ -116,9 +116,9 @@ def time_offset(inertial: Inertial, observations: StructArray) -> TimeOffset | N
 
 
 def velocities(observations: StructArray) -> tuple[Int64Array, FloatArray]:
-    """Return times (n,) and velocities (n, 3) north, east, down, at least 0.2 s apart.
+    """Return times (n,) and velocities (n, 3) north, east, down, the first of each fifth of a second.
 
-    Where there are none, those between positions at least 1 s apart: between nearer ones their noise hides the motion.
+    Where there are none, those between the first positions of each second: between nearer ones noise hides the motion.
     """
     rows = observations[observations["kind"] == Kind.VELOCITY]
     rows = _apart(rows[np.isfinite(rows["value"]).all(axis=1)], SECOND_NS // 5)

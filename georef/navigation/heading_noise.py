@@ -1,4 +1,4 @@
-"""What a flight says of the errors of dual-antenna headings: how large they are, and which part lasts for how long.
+"""Find how large the errors of dual-antenna headings are on a flight, which part lasts, and for how long.
 
 Errors are a white part and a Gauss–Markov process, both in proportion to the sigma that the receiver tells. Gyroscopes
 know changes of heading over seconds far better than two antennas do, so that innovations tell the white part and how

@@ -1,4 +1,4 @@
-"""Whether a receiver's time is that of the computer that recorded it: a time zone off, or days by an old date.
+"""Compare a receiver's time with the clock of the computer that recorded it: a time zone off, or days.
 
 Nothing is decided by it, and a receiver's time is taken as it says it: the computer's clock may be the wrong one.
 """

@@ -76,7 +76,7 @@ def test_parameters_of_no_scanner_of_the_log_are_refused_before_it_is_read(
 
 
 def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if half of each strip's returns had come without: what calibrate, validate and strips say of their logs."""
+    """Take the time of half of each strip's returns: calibrate, validate and strips say so of their logs."""
 
     def without_time(*args: Any, **keys: Any) -> list[JobResult]:
         results = run_jobs(*args, **keys)

@@ -137,7 +137,7 @@ class TestAllWell:
         ("pps", "status", "said"),
         [
             (PPS_LOCKED, "V", "the sentences at its input are void: want their receiver to have a fix"),
-            (PPS_ABSENT, "A", "it says that no pulse reaches it; want the receiver's PPS wired to it"),
+            (PPS_ABSENT, "A", "it says that it is not locked to a pulse; want the receiver's PPS wired to it"),
         ],
     )
     def test_a_head_without_fix_or_pulse_is_said(self, tmp_path: Path, pps: int, status: str, said: str) -> None:

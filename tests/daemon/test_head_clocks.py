@@ -24,6 +24,7 @@ from daemon.processing.log_index import index_log
 from daemon.processing.refusals import refuse_no_time, time_trouble
 from daemon.processing.setup import Setup
 from drivers.scanner.hesai import encode_point_packet
+from drivers.scanner.hesai_gps import encode_gps_packet
 from drivers.scanner.velodyne import encode_data_packet
 from drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
 from georef.records import DEVICE_CLOCK_DTYPE
@@ -270,6 +271,15 @@ def test_a_head_without_fix_or_pulse_is_refused_by_that(
     with pytest.raises(UserError, match="no receiver is in the log, and the head " + words) as refused:
         refuse_no_time(tmp_path, plan.clock, state, setup.config, (), trouble)
     assert "configuration" not in refused.value.message
+
+
+def test_a_head_that_says_only_that_it_is_not_locked_is_not_said_to_have_no_pulse(tmp_path: Path) -> None:
+    """Hesai's packets have a flag, and no reason."""
+    text = RECEIVER + XT32 + 'auxiliary = "udp:0.0.0.0:10110"\npps = "main"\n'
+    seconds = [(START_UNIX_NS + k * NS + LATENCY_NS, START + dt.timedelta(seconds=k)) for k in range(SECONDS)]
+    aux = [("scanner/top/aux", at_ns, encode_gps_packet(time, locked=False)) for at_ns, time in seconds]
+    _, clocks = found(tmp_path, text, [*receiver(), *hesai(0), *aux])
+    assert clocks.trouble("scanner/top") == ("says that it is not locked to its pulse; want a steady PPS, wired to it")
 
 
 @pytest.mark.parametrize("status", ["A", "V"])

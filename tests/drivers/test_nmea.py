@@ -303,6 +303,11 @@ def test_gns_is_a_position_as_gga_is() -> None:
     assert parser.counters.errors == {}
 
 
+def gns(modes: str) -> bytes:
+    """Return a sentence of `POSITION` 400 m above the geoid, which is 47 m above the ellipsoid."""
+    return nmea.encode_sentence(f"GNGNS,000001.00,4707.4074,N,00830.0000,W,{modes},12,0.80,400.0,47.0,,,V")
+
+
 @pytest.mark.parametrize(
     ("modes", "fix_type"),
     [
@@ -315,14 +320,14 @@ def test_gns_is_a_position_as_gga_is() -> None:
     ],
 )
 def test_the_best_mode_of_gns_is_the_fixs(modes: str, fix_type: FixType) -> None:
-    (fix,) = fixes(parse(nmea.encode_gns(S, *POSITION, 400.0, 47.0, modes=modes))[0])
+    (fix,) = fixes(parse(gns(modes))[0])
     assert fix.fix_type is fix_type
 
 
 def test_gga_goes_before_gns_and_gns_of_one_constellation_says_no_position() -> None:
     satellites_only = nmea.encode_sentence("GLGNS,000001.00,,,,,,7,,,,,")
-    gns, gga = nmea.encode_gns(S, *POSITION, 400.0, 47.0), nmea.encode_gga(S, *POSITION, 401.0, 47.0, quality=4)
-    records, parser = parse(gns, satellites_only, gga, nmea.encode_zda(S, DAY))
+    gga = nmea.encode_gga(S, *POSITION, 401.0, 47.0, quality=4)
+    records, parser = parse(gns("AANN"), satellites_only, gga, nmea.encode_zda(S, DAY))
     (fix,) = fixes(records)
     assert (fix.message, fix.height_m, fix.fix_type) == ("GGA", 448.0, FixType.RTK_FIXED)
     assert [message.valid for message in times(records)] == [True]
