@@ -75,8 +75,8 @@ lint: $(VENV)/.tests ## style, import rules and types only
 
 # what each worker would do for itself: loops compiled by numba, tests by Python
 ready: $(VENV)/.tests
-	$(BIN)/python -m daemon.cli.main warm-up
-	@folder=$$(mktemp -d) && $(BIN)/python -m daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
+	$(BIN)/python -m swath.daemon.cli.main warm-up
+	@folder=$$(mktemp -d) && $(BIN)/python -m swath.daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
 	@$(PYTEST) -n 0 -q --collect-only >/dev/null || true
 
 bench: $(VENV)/.tests ## measure speed, each figure beside this machine's own limit

@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from daemon.log.reader import open_logs
+from swath.daemon.log.reader import open_logs
 
 TICKS = os.sysconf("SC_CLK_TCK")
 CAN_GROUP = "239.74.163.99"
@@ -74,7 +74,7 @@ def recorder(folder: Path, tables: str) -> Iterator[subprocess.Popen[bytes]]:
     logs = folder / "logs"
     config.write_text(f'[session]\nname = "bench"\ndirectory = "{logs}"\nreserve_mb = 1\n{tables}')
     with (folder / "stderr.txt").open("w") as stderr:
-        process = subprocess.Popen([sys.executable, "-m", "daemon.cli.main", "run", str(config)], stderr=stderr)
+        process = subprocess.Popen([sys.executable, "-m", "swath.daemon.cli.main", "run", str(config)], stderr=stderr)
     try:
         while not (logs / "recording.json").exists():
             if process.poll() is not None:
@@ -132,7 +132,7 @@ def record_udp(length: int, rate: float, seconds: float) -> Figure:
 
 BARE = """
 import os, socket, sys, time
-from drivers.transports.mmsg import MessageReader, ask_receive_buffer
+from swath.drivers.transports.mmsg import MessageReader, ask_receive_buffer
 port, path = int(sys.argv[1]), sys.argv[2]
 sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 ask_receive_buffer(sock, 32 << 20)

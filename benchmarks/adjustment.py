@@ -22,17 +22,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.adjust import adjust
-from calib.features import Features, Patch, Plane
-from calib.flight import Flight, Head, Swath
-from calib.outcome import Adjusted
-from calib.parameters import Wish, unknowns
-from calib.rows import Rows
-from calib.trajectory_errors import Taus, gauss_markov
-from daemon.memory import keep_freed_memory
-from georef.beams import LineGeometry
-from georef.calibration import Calibration, nominal
-from georef.records import RETURN_DTYPE
+from swath.calib.adjust import adjust
+from swath.calib.features import Features, Patch, Plane
+from swath.calib.flight import Flight, Head, Swath
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import Wish, unknowns
+from swath.calib.rows import Rows
+from swath.calib.trajectory_errors import Taus, gauss_markov
+from swath.daemon.memory import keep_freed_memory
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import Calibration, nominal
+from swath.georef.records import RETURN_DTYPE
 from tests.calib.roofs import GROUND_M, LINES, NOISE, aimed, frame, ranges, trajectory
 
 FloatArray = NDArray[np.float64]

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.calibration_runs import Outcome, Reference, read_reference, run
-from georef.calibration import PARAMETERS, read_calibration
+from swath.georef.calibration import PARAMETERS, read_calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def flight_seeds(count: int) -> list[int]:
 
 def swath(*arguments: str) -> str:
     """A command of the program: what it prints; SystemExit: it failed."""
-    command = [sys.executable, "-m", "daemon.cli.main", *arguments]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"swath {' '.join(arguments)}: {done.stderr.strip().splitlines()[-1:]}")

@@ -28,15 +28,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from calib.trajectory_errors import TrajectoryPrior
-from daemon.processing.calibrate_run import prior_of
-from daemon.processing.calibration_flight import read_flight
-from daemon.processing.flights import Wish as Logs
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
-from georef.uncertainty import Noise
-from sim.shots import GROUND, MARKING, ROAD, ROOF
-from sim.site import e_from_geodetic, rot_e_from_ned
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.daemon.processing.calibrate_run import prior_of
+from swath.daemon.processing.calibration_flight import read_flight
+from swath.daemon.processing.flights import Wish as Logs
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
+from swath.georef.uncertainty import Noise
+from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
+from swath.sim.site import e_from_geodetic, rot_e_from_ned
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

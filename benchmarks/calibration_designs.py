@@ -21,15 +21,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.adjust import adjust
-from calib.features import ControlPoint, Features
-from calib.normals import NormalError, TrajectoryWeight
-from calib.outcome import Adjusted
-from calib.parameters import INSTALLED, MODELS, Wish, unknowns
-from calib.rows import Rows
-from calib.solve import Settings
-from calib.trajectory_errors import Taus, gauss_markov
-from georef.calibration import INDEX, PARAMETERS, nominal
+from swath.calib.adjust import adjust
+from swath.calib.features import ControlPoint, Features
+from swath.calib.normals import NormalError, TrajectoryWeight
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import INSTALLED, MODELS, Wish, unknowns
+from swath.calib.rows import Rows
+from swath.calib.solve import Settings
+from swath.calib.trajectory_errors import Taus, gauss_markov
+from swath.georef.calibration import INDEX, PARAMETERS, nominal
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 from tests.calib.test_rows import shifted
 

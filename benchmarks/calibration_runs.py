@@ -16,23 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
-from calib.adjust import adjust
-from calib.control import control_planes, in_t, read_control
-from calib.features import Features, Patch, Plane
-from calib.flight import Flight, Swath
-from calib.parameters import MODELS, Wish
-from calib.plane_returns import thinned
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneSettings
-from calib.solve import Settings
-from calib.trajectory_errors import Knots, TrajectoryPrior, apply, from_smoother, knots_of
-from daemon.processing.calibration_flight import KNOT_S, read_flight, replaced
-from daemon.processing.flights import Wish as Logs
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
-from georef.calibration import Calibration, read_calibration
-from georef.navigation.cross_covariance import ErrorChain
-from georef.records import Int64Array
+from swath.calib.adjust import adjust
+from swath.calib.control import control_planes, in_t, read_control
+from swath.calib.features import Features, Patch, Plane
+from swath.calib.flight import Flight, Swath
+from swath.calib.parameters import MODELS, Wish
+from swath.calib.plane_returns import thinned
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneSettings
+from swath.calib.solve import Settings
+from swath.calib.trajectory_errors import Knots, TrajectoryPrior, apply, from_smoother, knots_of
+from swath.daemon.processing.calibration_flight import KNOT_S, read_flight, replaced
+from swath.daemon.processing.flights import Wish as Logs
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
+from swath.georef.calibration import Calibration, read_calibration
+from swath.georef.navigation.cross_covariance import ErrorChain
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

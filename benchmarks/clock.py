@@ -14,7 +14,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.timescales import PpsClock
+from swath.georef.timescales import PpsClock
 from tests.georef.clock_run import Outcome, rms, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, utc_tag, week_tag
 

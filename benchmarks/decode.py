@@ -23,22 +23,22 @@ from fastcrc.crc32 import iso_hdlc as crc32
 from fastcrc.crc64 import xz as crc64_xz
 
 from benchmarks.cpu_time import cpu_seconds
-from daemon.memory import keep_freed_memory
-from drivers.core.frame_kinds import GNSS_KINDS
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Parser, ParserCounters
-from drivers.imu.canmod_gps import CanmodGpsParser
-from drivers.imu.dbc import DbcParser
-from drivers.scanner.hesai import HesaiParser
-from drivers.scanner.hesai_heads import QT64, XT32
-from drivers.scanner.ouster import OusterParser
-from drivers.scanner.ouster_layout import LidarLayout
-from drivers.scanner.srep import SrepParser
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
-from drivers.scanner.velodyne_heads import VLP16, VLP32C, VLS128
-from drivers.transports.capture_file import read_candump, read_pcap
-from georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
+from swath.daemon.memory import keep_freed_memory
+from swath.drivers.core.frame_kinds import GNSS_KINDS
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Parser, ParserCounters
+from swath.drivers.imu.canmod_gps import CanmodGpsParser
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.scanner.hesai import HesaiParser
+from swath.drivers.scanner.hesai_heads import QT64, XT32
+from swath.drivers.scanner.ouster import OusterParser
+from swath.drivers.scanner.ouster_layout import LidarLayout
+from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
+from swath.drivers.scanner.velodyne_heads import VLP16, VLP32C, VLS128
+from swath.drivers.transports.capture_file import read_candump, read_pcap
+from swath.georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 BATCH_BYTES = 1 << 20  # a chunk of the log

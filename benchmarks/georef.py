@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
-from daemon.memory import keep_freed_memory
-from georef.atmosphere import Air
-from georef.beams import LineGeometry
-from georef.calibration import PARAMETERS, Calibration, nominal
-from georef.georeference import BLOCK_ROWS, Georeferencer
-from georef.mapping import Mapping
-from georef.records import RETURN_DTYPE, StructArray
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise, Uncertainty
+from swath.daemon.memory import keep_freed_memory
+from swath.georef.atmosphere import Air
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.georeference import BLOCK_ROWS, Georeferencer
+from swath.georef.mapping import Mapping
+from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise, Uncertainty
 
 FloatArray = NDArray[np.float64]
 

@@ -31,23 +31,23 @@ import lazrs
 import numpy as np
 
 from benchmarks.cpu_time import cpu_seconds
-from daemon.config.tables import LiveConfig
-from daemon.log.chunks import LogBatch
-from daemon.log.reader import Session, open_logs
-from daemon.memory import keep_freed_memory
-from daemon.processing.feed import LogFeed, read_clocks
-from daemon.processing.jobs import Job, SessionPlan, run_job
-from daemon.processing.live import replay
-from daemon.processing.log_index import SCANNER as SCANNER_TOPICS
-from daemon.processing.log_index import index_log, read_chunks
-from daemon.processing.setup import Options, Setup
-from daemon.replay import source_of_topic
-from georef.formats.las import BLOCK, LasSettings, PointPacker
-from georef.formats.las_header import POINT_FORMAT
-from georef.points import Fate, Points
-from georef.records import ChunkBatch, ScannerReturns
-from georef.strips import Segment
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.memory import keep_freed_memory
+from swath.daemon.processing.feed import LogFeed, read_clocks
+from swath.daemon.processing.jobs import Job, SessionPlan, run_job
+from swath.daemon.processing.live import replay
+from swath.daemon.processing.log_index import SCANNER as SCANNER_TOPICS
+from swath.daemon.processing.log_index import index_log, read_chunks
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.replay import source_of_topic
+from swath.georef.formats.las import BLOCK, LasSettings, PointPacker
+from swath.georef.formats.las_header import POINT_FORMAT
+from swath.georef.points import Fate, Points
+from swath.georef.records import ChunkBatch, ScannerReturns
+from swath.georef.strips import Segment
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 CRS = "EPSG:32633"
 SOME_POINTS = 1_000_000  # for what is measured on points that are held: all would not fit into a small memory
@@ -289,7 +289,7 @@ def fly(folder: Path, seconds: float, heads: list[str]) -> Path:
     """Make a flight's log with these scanners, in a folder that is made."""
     folder.mkdir()
     (folder / "plan.toml").write_text(PLAN + "".join(heads))
-    swath = [sys.executable, "-c", "from daemon.cli.main import main; main()"]
+    swath = [sys.executable, "-c", "from swath.daemon.cli.main import main; main()"]
     arguments = ["sim", "fly", str(folder / "plan.toml"), "--seconds", f"{seconds:g}", "--no-truth"]
     subprocess.run([*swath, *arguments, "-o", str(folder / "log")], check=True, stdout=subprocess.DEVNULL)
     return folder / "log"

@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
-from calib.flight import Flight, Head, Swath, Tangent
-from calib.plane_matching import rematch
-from calib.plane_search import find_planes
-from daemon.memory import keep_freed_memory
-from georef.beams import LineGeometry
-from georef.calibration import nominal
-from georef.earth import e_from_geodetic
-from georef.records import RETURN_DTYPE
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.calib.plane_matching import rematch
+from swath.calib.plane_search import find_planes
+from swath.daemon.memory import keep_freed_memory
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import nominal
+from swath.georef.earth import e_from_geodetic
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 

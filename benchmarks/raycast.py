@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
-from daemon.memory import keep_freed_memory
-from sim.plan import parse_plan
-from sim.scene import Scene, build_scene
-from sim.site import Site
+from swath.daemon.memory import keep_freed_memory
+from swath.sim.plan import parse_plan
+from swath.sim.scene import Scene, build_scene
+from swath.sim.site import Site
 
 FloatArray = NDArray[np.float64]
 

@@ -132,7 +132,7 @@ class Soak:
     def run(self, tell: Callable[[str], None]) -> None:
         """Record, look every second, read every part that is finished; then end everything."""
         logs = self._folder / "logs"
-        command = [sys.executable, "-m", "daemon.cli.main", "run", str(self._folder / "swath.toml")]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(self._folder / "swath.toml")]
         with (self._folder / "journal.txt").open("w") as journal:
             recorder = subprocess.Popen(command, stderr=journal)
         reader, ages = Watcher(read_parts, logs, keep=self._keep), Watcher(note_ages, logs)

@@ -10,11 +10,11 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from daemon.replay import source_of_topic
-from drivers.core.parser import Parser
-from georef.records import ChunkBatch
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.replay import source_of_topic
+from swath.drivers.core.parser import Parser
+from swath.georef.records import ChunkBatch
 
 
 @dataclass

@@ -25,17 +25,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.effects import NAMES, SeenFrom
-from calib.flight import Flight
-from calib.signatures import signatures
-from calib.strip_cells import StripRules
-from calib.strips import differences
-from calib.trajectory_errors import TrajectoryPrior, apply, draw
-from daemon.processing.calibration_flight import read_flight, smoothed_prior
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
-from georef.calibration import Calibration
+from swath.calib.effects import NAMES, SeenFrom
+from swath.calib.flight import Flight
+from swath.calib.signatures import signatures
+from swath.calib.strip_cells import StripRules
+from swath.calib.strips import differences
+from swath.calib.trajectory_errors import TrajectoryPrior, apply, draw
+from swath.daemon.processing.calibration_flight import read_flight, smoothed_prior
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
+from swath.georef.calibration import Calibration
 from tests.calib.cast_flight import cast_flight
 from tests.calib.village import village
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.features import ControlPoint, Features, Patch, Plane
-from calib.flight import Flight, Swath, Tangent
-from calib.local_plane import LocalPlane, PlaneRules, is_inside, robust_plane
-from georef.earth import e_from_geodetic
+from swath.calib.features import ControlPoint, Features, Patch, Plane
+from swath.calib.flight import Flight, Swath, Tangent
+from swath.calib.local_plane import LocalPlane, PlaneRules, is_inside, robust_plane
+from swath.georef.earth import e_from_geodetic
 
 FloatArray = NDArray[np.float64]
 

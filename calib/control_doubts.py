@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.control import ControlRules, Ground, grounds_at
-from calib.features import ControlPoint
-from calib.flight import Flight
-from georef.earth import geodetic_from_e
-from georef.mapping import Mapping, MappingError
+from swath.calib.control import ControlRules, Ground, grounds_at
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.georef.earth import geodetic_from_e
+from swath.georef.mapping import Mapping, MappingError
 
 FloatArray = NDArray[np.float64]
 Undulation = Callable[[FloatArray], tuple[float, str] | None]  # of a position in e: metres, and by which geoid

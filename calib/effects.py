@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Head, Swath, Tangent
-from georef.beams import SpinningGeometry
-from georef.calibration import INDEX, PARAMETERS
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.records import Int64Array
-from georef.rotations import rot_from_quaternion
-from georef.trajectory import Poses, Trajectory
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.beams import SpinningGeometry
+from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.records import Int64Array
+from swath.georef.rotations import rot_from_quaternion
+from swath.georef.trajectory import Poses, Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Effect:
 
     Attributes:
         name: for people.
-        parameter: of the calibration that has it, SI (`georef.calibration.PARAMETERS`).
+        parameter: of the calibration that has it, SI (`swath.georef.calibration.PARAMETERS`).
         factor, unit: of the report.
         look: of it in the strips.
         remedy: the flight line that shows it.
@@ -145,7 +145,7 @@ def error_columns(points_t: FloatArray, strip: Int64Array, time_ns: Int64Array, 
 
     Returns:
         (n, 6, 3) in t, metres a unit of what is added to the trajectory: position north, east, down (m), then small
-        turns of the body about north, east, down (rad), as of `calib.trajectory_errors`.
+        turns of the body about north, east, down (rad), as of `swath.calib.trajectory_errors`.
     """
     moved = np.zeros((len(points_t), 6, 3))
     for number in np.unique(strip).tolist():

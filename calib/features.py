@@ -1,6 +1,6 @@
 """What several swaths saw of the same: planes, tie points and control; what the adjustment takes.
 
-All coordinates stand in t (`calib.flight`). Indexes of returns are those of their swath's arrays.
+All coordinates stand in t (`swath.calib.flight`). Indexes of returns are those of their swath's arrays.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

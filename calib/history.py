@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.comparable import difference_between
-from georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.calib.comparable import difference_between
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
+from swath.calib.flight import Flight, Swath
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.signal import fftconvolve
 
-from calib.features import Features, Sighting, TiePoint
-from calib.flight import Flight, Swath
-from calib.marking_squares import Grid, Square, grid_of, near, squares_of
+from swath.calib.features import Features, Sighting, TiePoint
+from swath.calib.flight import Flight, Swath
+from swath.calib.marking_squares import Grid, Square, grid_of, near, squares_of
 
 FloatArray = NDArray[np.float64]
 

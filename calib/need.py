@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.effects import SeenFrom, effect_columns
-from calib.flight import Flight, Swath
-from calib.outcome import TrajectoryFit
-from calib.parameters import ANGLES
-from georef.calibration import PARAMETERS, Calibration
-from georef.records import Int64Array
+from swath.calib.effects import SeenFrom, effect_columns
+from swath.calib.flight import Flight, Swath
+from swath.calib.outcome import TrajectoryFit
+from swath.calib.parameters import ANGLES
+from swath.georef.calibration import PARAMETERS, Calibration
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

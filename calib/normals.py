@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.inverse import inverted, scales
-from calib.row_tables import OF_PLANE
-from calib.rows import Rows, SingleArray, State, tangents
-from calib.tie_rows import Seen, Ties, covariance_t
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.records import Int64Array
+from swath.calib.inverse import inverted, scales
+from swath.calib.row_tables import OF_PLANE
+from swath.calib.rows import Rows, SingleArray, State, tangents
+from swath.calib.tie_rows import Seen, Ties, covariance_t
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

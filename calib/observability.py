@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.outcome import Held
-from calib.report_words import sized
-from georef.calibration import INDEX, PARAMETERS
+from swath.calib.outcome import Held
+from swath.calib.report_words import sized
+from swath.georef.calibration import INDEX, PARAMETERS
 
 FloatArray = NDArray[np.float64]
 

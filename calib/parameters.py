@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Head
-from calib.intensity_curve import at_knots, curve, nodes_of
-from calib.outcome import Held
-from georef.beams import OusterGeometry, SpinningGeometry
-from georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
-from georef.records import Int64Array
+from swath.calib.flight import Flight, Head
+from swath.calib.intensity_curve import at_knots, curve, nodes_of
+from swath.calib.outcome import Held
+from swath.georef.beams import OusterGeometry, SpinningGeometry
+from swath.georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

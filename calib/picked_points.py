@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features, Sighting, TiePoint
-from calib.flight import Flight, Swath
+from swath.calib.features import Features, Sighting, TiePoint
+from swath.calib.flight import Flight, Swath
 
 FloatArray = NDArray[np.float64]
 

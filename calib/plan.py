@@ -13,22 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import adjust as adjustment
-from calib.adjust import AS_USUAL
-from calib.features import ControlPoint, Features, Patch, Plane
-from calib.flight import Flight, FlightError, Head, Swath, Tangent
-from calib.outcome import Held
-from calib.parameters import Wish
-from calib.plane_cells import CELL_SHORT_M, CELL_SIZES_M
-from calib.plane_returns import RIM_M
-from calib.plane_settings import PlaneSettings
-from calib.solve import Settings
-from calib.trajectory_errors import TrajectoryPrior
-from georef.calibration import Calibration
-from georef.records import RETURN_DTYPE, Int64Array
-from georef.rotations import boresight, rot_from_quaternion
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory
+from swath.calib import adjust as adjustment
+from swath.calib.adjust import AS_USUAL
+from swath.calib.features import ControlPoint, Features, Patch, Plane
+from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
+from swath.calib.outcome import Held
+from swath.calib.parameters import Wish
+from swath.calib.plane_cells import CELL_SHORT_M, CELL_SIZES_M
+from swath.calib.plane_returns import RIM_M
+from swath.calib.plane_settings import PlaneSettings
+from swath.calib.solve import Settings
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.georef.calibration import Calibration
+from swath.georef.records import RETURN_DTYPE, Int64Array
+from swath.georef.rotations import boresight, rot_from_quaternion
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class Surface:
     """A flat piece of the terrain, as a roof's side.
 
     Attributes:
-        name, kind: as of `calib.features.Plane`.
+        name, kind: as of `swath.calib.features.Plane`.
         normal_t: (3,) unit, outwards.
         points_t: (m, 3) spread evenly over it.
         area_m2: seen from above.
@@ -188,7 +188,7 @@ def planned(
 
 
 def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
-    """Metres a cell of the plane search would have on such a line, as `calib.plane_cells.cell_size` chooses."""
+    """Metres a cell of the plane search would have on such a line, as `swath.calib.plane_cells.cell_size` chooses."""
     if not len(per_m2):
         return _PLANES.cell_m
     middling = float(np.median(per_m2))
@@ -209,7 +209,7 @@ def predict(
         settings: of the adjustment, with the rules of what counts as determined.
 
     Raises:
-        ParameterError, NormalError: as of `calib.adjust.predict`.
+        ParameterError, NormalError: as of `swath.calib.adjust.predict`.
     """
     left, covariance = adjustment.predict(flight, features, wish, prior, settings)
     sigmas = np.sqrt(np.diag(covariance))

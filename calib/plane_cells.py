@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath, sensor_t
-from calib.plane_fit import expected_sigma
-from calib.plane_kernels import (
+from swath.calib.flight import Flight, Swath, sensor_t
+from swath.calib.plane_fit import expected_sigma
+from swath.calib.plane_kernels import (
     EMPTY,
     FEW,
     GOOD,
@@ -29,10 +29,10 @@ from calib.plane_kernels import (
     fit_cells,
     grow,
 )
-from calib.plane_settings import PlaneError, PlaneSettings
-from calib.scale import spacing_m
-from georef.points import contiguous
-from georef.records import Int64Array
+from swath.calib.plane_settings import PlaneError, PlaneSettings
+from swath.calib.scale import spacing_m
+from swath.georef.points import contiguous
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Segments:
     Attributes:
         swath: (k,) index of it.
         first: (k,) index of one of its returns.
-        moments: (k, 10) of its returns, as in `calib.plane_kernels`.
+        moments: (k, 10) of its returns, as in `swath.calib.plane_kernels`.
         normal_t: (k, 3).
         spread_m: (k, 3) standard deviations along the normal, and along the two axes of the plane, rising.
         cells: (c,) keys, (c,) of which segment, (c,) returns in them.

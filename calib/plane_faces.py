@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from calib.plane_cells import Segments
-from calib.plane_settings import PlaneSettings
-from georef.records import Int64Array
+from swath.calib.plane_cells import Segments
+from swath.calib.plane_settings import PlaneSettings
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

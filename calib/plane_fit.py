@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath, sensor_t
-from calib.plane_settings import PlaneSettings
-from georef.records import Int64Array
-from georef.uncertainty import Noise
+from swath.calib.flight import Flight, Swath, sensor_t
+from swath.calib.plane_settings import PlaneSettings
+from swath.georef.records import Int64Array
+from swath.georef.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 

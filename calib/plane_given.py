@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features, Plane
-from calib.flight import Flight, Swath, sensor_t
-from calib.plane_cells import cell_size, keys_of
-from calib.plane_fit import GATE, expected_sigma
-from calib.plane_returns import plane_of, returns_near, sights_of
-from calib.plane_settings import PlaneError, PlaneSettings, scaled_to
-from georef.records import Int64Array
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight, Swath, sensor_t
+from swath.calib.plane_cells import cell_size, keys_of
+from swath.calib.plane_fit import GATE, expected_sigma
+from swath.calib.plane_returns import plane_of, returns_near, sights_of
+from swath.calib.plane_settings import PlaneError, PlaneSettings, scaled_to
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]

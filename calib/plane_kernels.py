@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel, whole
-from georef.records import Int64Array
+from swath.georef.compiled import kept, kernel, whole
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features, Plane
-from calib.flight import Flight
-from calib.plane_cells import cell_size, keys_of
-from calib.plane_fit import GATE, Sight, fit_sight, refusal
-from calib.plane_returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
-from calib.plane_settings import PlaneSettings, scaled_to
-from georef.records import Int64Array
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight
+from swath.calib.plane_cells import cell_size, keys_of
+from swath.calib.plane_fit import GATE, Sight, fit_sight, refusal
+from swath.calib.plane_returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
+from swath.calib.plane_settings import PlaneSettings, scaled_to
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

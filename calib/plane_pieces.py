@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, sensor_t
-from calib.plane_cells import CELLS_LEAST, Segments, cell_middles
-from calib.plane_settings import PlaneSettings
-from georef.records import Int64Array
+from swath.calib.flight import Flight, sensor_t
+from swath.calib.plane_cells import CELLS_LEAST, Segments, cell_middles
+from swath.calib.plane_settings import PlaneSettings
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

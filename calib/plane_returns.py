@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features, Patch, Plane
-from calib.flight import Flight, Swath
-from calib.plane_cells import BLOCK, blocks, keys_of
-from calib.plane_fit import Sight, fit_sight, refusal
-from calib.plane_kernels import fill_table, gather
-from calib.plane_settings import PlaneSettings
-from georef.records import Int64Array
+from swath.calib.features import Features, Patch, Plane
+from swath.calib.flight import Flight, Swath
+from swath.calib.plane_cells import BLOCK, blocks, keys_of
+from swath.calib.plane_fit import Sight, fit_sight, refusal
+from swath.calib.plane_kernels import fill_table, gather
+from swath.calib.plane_settings import PlaneSettings
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

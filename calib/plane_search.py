@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features, Plane
-from calib.flight import Flight, sensor_t
-from calib.plane_cells import Segments, cell_size, segments_of
-from calib.plane_faces import same_faces
-from calib.plane_fit import GATE, expected_sigma
-from calib.plane_given import given_planes
-from calib.plane_pieces import Pieces, choose, cut
-from calib.plane_returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
-from calib.plane_settings import PlaneError, PlaneSettings, scaled_to
-from georef.records import Int64Array
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight, sensor_t
+from swath.calib.plane_cells import Segments, cell_size, segments_of
+from swath.calib.plane_faces import same_faces
+from swath.calib.plane_fit import GATE, expected_sigma
+from swath.calib.plane_given import given_planes
+from swath.calib.plane_pieces import Pieces, choose, cut
+from swath.calib.plane_returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
+from swath.calib.plane_settings import PlaneError, PlaneSettings, scaled_to
+from swath.georef.records import Int64Array
 
 __all__ = ["PlaneError", "PlaneRow", "PlaneSettings", "find_planes", "given_planes", "plane_rows"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.flight import Flight
-from calib.scale import Scale, scale_of
+from swath.calib.flight import Flight
+from swath.calib.scale import Scale, scale_of
 
 _CELLS_ACROSS, _CELL_LEAST_M = 50.0, 0.5  # cells that a swath should have across, at least; the smallest there are
 _TILES_ACROSS, _TILE_LEAST_M = 4.0, 4.0

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.flight import Flight, Swath
-from calib.height_grids import Lattice, Surface, surface
-from calib.scale import Scale, area_spacing_m, scale_of
-from georef.calibration import INDEX, Calibration
-from georef.records import Int64Array
+from swath.calib.flight import Flight, Swath
+from swath.calib.height_grids import Lattice, Surface, surface
+from swath.calib.scale import Scale, area_spacing_m, scale_of
+from swath.georef.calibration import INDEX, Calibration
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -27,14 +27,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint
-from calib.flight import Flight
-from calib.outcome import Adjusted
-from calib.profile_influence import Influence, influence
-from calib.profile_measure import KINDS, PARAMETER, Settings
-from calib.profiles import MISSING, Profile, survey
-from calib.trajectory_errors import TrajectoryPrior
-from georef.calibration import INDEX, PARAMETERS
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.calib.outcome import Adjusted
+from swath.calib.profile_influence import Influence, influence
+from swath.calib.profile_measure import KINDS, PARAMETER, Settings
+from swath.calib.profiles import MISSING, Profile, survey
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.georef.calibration import INDEX, PARAMETERS
 
 FloatArray = NDArray[np.float64]
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight
-from calib.profile_places import Track
-from calib.profile_sections import Pieces
+from swath.calib.flight import Flight
+from swath.calib.profile_places import Track
+from swath.calib.profile_sections import Pieces
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

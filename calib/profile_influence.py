@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
-from calib.profile_measure import PARAMETER, Ground
-from calib.profile_sections import Corridor
-from calib.profiles import Profile
-from calib.trajectory_errors import ERRORS, TrajectoryPrior
-from georef.calibration import PARAMETERS, Calibration
-from georef.records import Int64Array
+from swath.calib.flight import Flight, Swath
+from swath.calib.profile_measure import PARAMETER, Ground
+from swath.calib.profile_sections import Corridor
+from swath.calib.profiles import Profile
+from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior
+from swath.georef.calibration import PARAMETERS, Calibration
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
-from calib.profile_fit import TURNS, Fit, comparable, levers, solve, trajectory_sigmas
-from calib.profile_places import SAMPLES, Place, Track
-from calib.profile_sections import Corridor, Pieces, best_shift, fit_pieces, heights_by_bin
-from georef.calibration import Calibration
+from swath.calib.flight import Flight, Swath
+from swath.calib.profile_fit import TURNS, Fit, comparable, levers, solve, trajectory_sigmas
+from swath.calib.profile_places import SAMPLES, Place, Track
+from swath.calib.profile_sections import Corridor, Pieces, best_shift, fit_pieces, heights_by_bin
+from swath.georef.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -77,7 +77,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A profile's numbers; see `calib.profiles.Profile`."""
+    """A profile's numbers; see `swath.calib.profiles.Profile`."""
 
     kind: str
     first: int

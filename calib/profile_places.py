@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
-from calib.profile_sections import Corridor
-from georef.calibration import Calibration
-from georef.points import Fate
+from swath.calib.flight import Flight, Swath
+from swath.calib.profile_sections import Corridor
+from swath.georef.calibration import Calibration
+from swath.georef.points import Fate
 
 FloatArray = NDArray[np.float64]
 

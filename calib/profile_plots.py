@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calib.profiles import Profile, Section
-from calib.report_canvas import INK, MUTED
+from swath.calib.profiles import Profile, Section
+from swath.calib.report_canvas import INK, MUTED
 
 PAGE_IN = (9.6, 4.6)
 COLOURS = ("#0072b2", "#d55e00")  # first, second; told apart without colour by their marks too

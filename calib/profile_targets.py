@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint
-from calib.flight import Flight
-from calib.profile_fit import levers, solve, trajectory_sigmas
-from calib.profile_measure import Ground, Measured, Settings, part_of
-from calib.profile_places import Track
-from calib.profile_sections import Corridor, fit_pieces
-from georef.calibration import Calibration
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.calib.profile_fit import levers, solve, trajectory_sigmas
+from swath.calib.profile_measure import Ground, Measured, Settings, part_of
+from swath.calib.profile_places import Track
+from swath.calib.profile_sections import Corridor, fit_pieces
+from swath.georef.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

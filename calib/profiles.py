@@ -5,8 +5,8 @@ gives the angle: roll at the edges of an opposite pair over flat ground; pitch a
 slopes; heading along two lines side by side, at nadir of one of them, over slopes; the range by heights of flat
 targets. A first approximation for the adjustment, and a check of it that shares nothing with it but the points.
 
-The sections are compared by planes of their pieces (`calib.profile_fit`), and the points placed anew with the angle
-found until nothing is left, so that the lecture's formulas hold for large angles too.
+The sections are compared by planes of their pieces (`swath.calib.profile_fit`), and the points placed anew with the
+angle found until nothing is left, so that the lecture's formulas hold for large angles too.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint
-from calib.flight import Flight
-from calib.profile_measure import KINDS, PARAMETER, Ground, Measured, Settings, measure_place, shifts_m
-from calib.profile_places import Place, Track, places, tracks_of
-from calib.profile_sections import Corridor
-from calib.profile_targets import measure_range
-from georef.calibration import Calibration
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.calib.profile_measure import KINDS, PARAMETER, Ground, Measured, Settings, measure_place, shifts_m
+from swath.calib.profile_places import Place, Track, places, tracks_of
+from swath.calib.profile_sections import Corridor
+from swath.calib.profile_targets import measure_range
+from swath.georef.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -203,7 +203,7 @@ def survey(
 
     Args:
         with_points_of: by scanner, the calibrations of the flight's points, where they are not those to measure with.
-        pitch_unknown: scanners that get no heading from opposite lines (`calib.profile_places.places`).
+        pitch_unknown: scanners that get no heading from opposite lines (`swath.calib.profile_places.places`).
     """
     now = flight.starts() if calibrations is None else dict(calibrations)
     tracks = tracks_of(flight, now)

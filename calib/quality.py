@@ -3,7 +3,7 @@
 Residuals are those of the misclosures, e = −(w + A δ) at the last linearisation; r = 1 − A Q Aᵀ / M with the cofactors
 of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups). M is all that a return
 errs by, also what it has in common with the others of its moment; what of A Q Aᵀ counts then is said in
-`calib.row_sums.look`.
+`swath.calib.row_sums.look`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.normals import Extra, Feature, Normals, TrajectoryWeight, extras
-from calib.outcome import ControlFit, GroupFit, Residuals, TrajectoryFit
-from calib.robust import least_detectable
-from calib.row_tables import OF_PLANE
-from calib.rows import Batch, Rows, Run, SingleArray, State
-from calib.tie_rows import Seen, Ties
+from swath.calib.normals import Extra, Feature, Normals, TrajectoryWeight, extras
+from swath.calib.outcome import ControlFit, GroupFit, Residuals, TrajectoryFit
+from swath.calib.robust import least_detectable
+from swath.calib.row_tables import OF_PLANE
+from swath.calib.rows import Batch, Rows, Run, SingleArray, State
+from swath.calib.tie_rows import Seen, Ties
 
 FloatArray = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class Quality:
     """Of an adjustment.
 
     Attributes:
-        residuals, groups, control: as of `calib.outcome.Adjusted`.
+        residuals, groups, control: as of `swath.calib.outcome.Adjusted`.
         square, redundancy: Σ p e², and its expectation.
         least_detectable: by name.
     """

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration_file import Header
-from calib.features import Features
-from calib.flight import Flight
-from calib.outcome import Adjusted
-from calib.record_content import content_of
-from calib.record_tables import BY_KEY, CALIBRATION_TYPES, CLASSES, ROWS, VALIDATION_METHODS, Class, Row
-from calib.record_values import Matrix, Plain, Value, is_document, is_plain
-from georef.toml_tables import key_text
+from swath.calib.calibration_file import Header
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.outcome import Adjusted
+from swath.calib.record_content import content_of
+from swath.calib.record_tables import BY_KEY, CALIBRATION_TYPES, CLASSES, ROWS, VALIDATION_METHODS, Class, Row
+from swath.calib.record_values import Matrix, Plain, Value, is_document, is_plain
+from swath.georef.toml_tables import key_text
 
 Document = dict[str, Any]  # what a record's JSON holds
 
@@ -50,7 +50,7 @@ class RecordInput:
         flight, features, adjusted: of the calibration.
         scanner: whose record it is.
         header: of its calibration file.
-        told: what only people know, by ``CLASS.attribute`` of `calib.record_tables.ROWS`, as
+        told: what only people know, by ``CLASS.attribute`` of `swath.calib.record_tables.ROWS`, as
             ``CA_GNSS.numberSatellites``; numbers in SI units.
         settings: of the run, in words.
         attachment: name of the NPZ file that holds the matrices whole; empty: there is none.

@@ -8,16 +8,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration_file import Header
-from calib.features import ControlPoint, Features
-from calib.flight import Flight
-from calib.outcome import Adjusted, TrajectoryFit
-from calib.record_matrices import matrices_of
-from calib.record_values import Matrix, Value, utc_text
-from calib.report_words import unknown
-from georef.calibration import INDEX, Calibration
-from georef.earth import geodetic_from_e
-from georef.rotations import boresight
+from swath.calib.calibration_file import Header
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight
+from swath.calib.outcome import Adjusted, TrajectoryFit
+from swath.calib.record_matrices import matrices_of
+from swath.calib.record_values import Matrix, Value, utc_text
+from swath.calib.report_words import unknown
+from swath.georef.calibration import INDEX, Calibration
+from swath.georef.earth import geodetic_from_e
+from swath.georef.rotations import boresight
 
 FloatArray = NDArray[np.float64]
 Found = dict[str, Value]

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
+from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
 
 FloatArray = NDArray[np.float64]
 

@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from calib.features import Plane
-from calib.flight import Flight
-from calib.report_canvas import INK, MUTED, Canvas, Format, Panels, Picture, colour_of
-from calib.report_input import ReportInput
-from georef.calibration import Calibration
-from georef.records import Int64Array
+from swath.calib.features import Plane
+from swath.calib.flight import Flight
+from swath.calib.report_canvas import INK, MUTED, Canvas, Format, Panels, Picture, colour_of
+from swath.calib.report_input import ReportInput
+from swath.georef.calibration import Calibration
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

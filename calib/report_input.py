@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration_file import Header
-from calib.features import Features
-from calib.flight import Flight
-from calib.need import Need
-from calib.outcome import Adjusted
-from calib.profile_check import Check
+from swath.calib.calibration_file import Header
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.need import Need
+from swath.calib.outcome import Adjusted
+from swath.calib.profile_check import Check
 
 FloatArray = NDArray[np.float64]
 Pair = tuple[str, str]

@@ -15,9 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from calib.features import ControlPoint
-from calib.flight import Flight, Swath
-from calib.report_canvas import (
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight, Swath
+from swath.calib.report_canvas import (
     INK,
     MUTED,
     Canvas,
@@ -27,7 +27,7 @@ from calib.report_canvas import (
     class_words,
     colour_of,
 )
-from calib.report_input import DifferenceMap, ReportInput
+from swath.calib.report_input import DifferenceMap, ReportInput
 
 FloatArray = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from calib.outcome import TrajectoryFit
-from calib.report_canvas import AFTER, BAD, BEFORE, INK, MUTED, SERIES, Canvas, Format, Panels, Picture, colour_of
-from calib.report_input import Pair, ReportInput
-from calib.report_words import number, unknown
-from georef.timescales.gps_time import SECOND_NS
+from swath.calib.outcome import TrajectoryFit
+from swath.calib.report_canvas import AFTER, BAD, BEFORE, INK, MUTED, SERIES, Canvas, Format, Panels, Picture, colour_of
+from swath.calib.report_input import Pair, ReportInput
+from swath.calib.report_words import number, unknown
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

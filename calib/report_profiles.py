@@ -9,16 +9,16 @@ from functools import partial
 
 import numpy as np
 
-from calib.features import ControlPoint
-from calib.flight import Flight
-from calib.profile_check import Check, Comparison
-from calib.profile_measure import Ground
-from calib.profile_plots import draw, svg
-from calib.profile_sections import Corridor, fit_pieces
-from calib.profiles import Profile, Section
-from calib.report_input import Profile as Picture
-from calib.report_tables import Table
-from calib.report_words import decimals_of, number, unknown
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.calib.profile_check import Check, Comparison
+from swath.calib.profile_measure import Ground
+from swath.calib.profile_plots import draw, svg
+from swath.calib.profile_sections import Corridor, fit_pieces
+from swath.calib.profiles import Profile, Section
+from swath.calib.report_input import Profile as Picture
+from swath.calib.report_tables import Table
+from swath.calib.report_words import decimals_of, number, unknown
 
 MOST_DRAWN = 6
 MOST_RETURNS = 8000

@@ -12,10 +12,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from calib.outcome import Residuals
-from calib.report_canvas import BAD, INK, MUTED, SERIES, Canvas, Format, Panels, Picture
-from calib.report_input import ReportInput
-from georef.records import Int64Array
+from swath.calib.outcome import Residuals
+from swath.calib.report_canvas import BAD, INK, MUTED, SERIES, Canvas, Format, Panels, Picture
+from swath.calib.report_input import ReportInput
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from calib.report_canvas import Picture
-from calib.report_cut_plots import cut_picture
-from calib.report_input import Profile, ReportInput
-from calib.report_map_plots import difference_picture, map_picture
-from calib.report_plots import (
+from swath.calib.report_canvas import Picture
+from swath.calib.report_cut_plots import cut_picture
+from swath.calib.report_input import Profile, ReportInput
+from swath.calib.report_map_plots import difference_picture, map_picture
+from swath.calib.report_plots import (
     control_picture,
     correlation_picture,
     intensity_picture,
     strips_picture,
     trajectory_pictures,
 )
-from calib.report_profiles import comparison_table, profiles_table
-from calib.report_residual_plots import normal_picture, residual_picture
-from calib.report_tables import (
+from swath.calib.report_profiles import comparison_table, profiles_table
+from swath.calib.report_residual_plots import normal_picture, residual_picture
+from swath.calib.report_tables import (
     Table,
     control_table,
     detectable_table,
@@ -31,8 +31,8 @@ from calib.report_tables import (
     refused_table,
     strips_table,
 )
-from calib.report_verdict import BORESIGHT, DEG, Verdict, overall_rms_m, sigma_of
-from calib.report_words import degrees, is_undetermined, length, number, plain, thousands, words_of
+from swath.calib.report_verdict import BORESIGHT, DEG, Verdict, overall_rms_m, sigma_of
+from swath.calib.report_words import degrees, is_undetermined, length, number, plain, thousands, words_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.outcome import Held, Residuals
-from calib.report_input import ReportInput
-from calib.report_plots import SUSPECT
-from calib.report_verdict import held_words
-from calib.report_words import (
+from swath.calib.outcome import Held, Residuals
+from swath.calib.report_input import ReportInput
+from swath.calib.report_plots import SUSPECT
+from swath.calib.report_verdict import held_words
+from swath.calib.report_words import (
     Unknown,
     decimals_of,
     is_undetermined,
@@ -25,7 +25,7 @@ from calib.report_words import (
     unknown,
     words_of,
 )
-from georef.calibration import INDEX, PARAMETERS
+from swath.georef.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0

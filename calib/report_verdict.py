@@ -9,9 +9,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from calib.outcome import Adjusted, Considered
-from calib.report_input import Difference, Pair, ReportInput
-from calib.report_words import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
+from swath.calib.outcome import Adjusted, Considered
+from swath.calib.report_input import Difference, Pair, ReportInput
+from swath.calib.report_words import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
 
 DEG = 180.0 / math.pi
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")

@@ -1,7 +1,7 @@
 """Against blunders: weights that large misclosures lose, and tests that find what does not belong (FORMULAS 6.5).
 
-Huber's weights (in `calib.row_sums.weigh`) bring the adjustment near; then Baarda's w-test takes single observations
-out, by the variances that were assumed. A rejected observation comes back if a later solution fits it.
+Huber's weights (in `swath.calib.row_sums.weigh`) bring the adjustment near; then Baarda's w-test takes single
+observations out, by the variances that were assumed. A rejected observation comes back if a later solution fits it.
 """
 
 from __future__ import annotations

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath
-from calib.intensity_curve import at_knots, curve_by_knots
-from calib.parameters import Unknowns
-from calib.row_tables import Beam, Head, Looks, Sigmas
-from georef.beams import OusterGeometry
-from georef.calibration import Calibration
-from georef.kernels.types import Track
-from georef.points import Rays, contiguous
-from georef.records import Int64Array
-from georef.rotations import rot_x, rot_y, rot_z
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.calib.flight import Flight, Swath
+from swath.calib.intensity_curve import at_knots, curve_by_knots
+from swath.calib.parameters import Unknowns
+from swath.calib.row_tables import Beam, Head, Looks, Sigmas
+from swath.georef.beams import OusterGeometry
+from swath.georef.calibration import Calibration
+from swath.georef.kernels.types import Track
+from swath.georef.points import Rays, contiguous
+from swath.georef.records import Int64Array
+from swath.georef.rotations import rot_x, rot_y, rot_z
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from georef.kernels.types import ByteArray, FloatArray, Track
-from georef.records import Int64Array, StructArray
+from swath.georef.kernels.types import ByteArray, FloatArray, Track
+from swath.georef.records import Int64Array, StructArray
 
 STATES, OF_PLANE = 8, 3  # columns of a row
 
 
 class Beam(NamedTuple):
-    """The second half of `georef.points.Rays` of a batch of one swath, vectors as columns, and its rows."""
+    """The second half of `swath.georef.points.Rays` of a batch of one swath, vectors as columns, and its rows."""
 
     rows: StructArray
     fate: ByteArray
@@ -34,7 +34,7 @@ class Head(NamedTuple):
     """A scanner with its calibration.
 
     Attributes:
-        at, kind, argument: (m,) of its unknowns (`calib.parameters.Unknowns.of_head`).
+        at, kind, argument: (m,) of its unknowns (`swath.calib.parameters.Unknowns.of_head`).
         value: (16,) of its calibration.
         outer: (1, 3, 3) Rx(ω) Ry(φ).
         spin_b: (1, 3) a spinning head's axis.

@@ -2,7 +2,7 @@
 
 Returns are taken swath by swath and plane by plane, in runs of one plane between two knots of the trajectory's states:
 all rows of a run have the same unknowns. A pass places the returns of some runs at once, with the calibrations of the
-moment, and sums them up or looks at them (`calib.row_kernels`); nothing of a row is kept but what a report needs.
+moment, and sums them up or looks at them (`swath.calib.row_kernels`); nothing of a row is kept but what a report needs.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Plane
-from calib.flight import Flight, Swath
-from calib.parameters import BEAM_PARTS, Unknowns
-from calib.row_inputs import beam_table, head_table, new_looks, rays_of, sigmas_of, track_of, writeable
-from calib.row_sums import MODE_GIVE, MODE_LOOK, MODE_SUM, go_over
-from calib.row_tables import OF_PLANE, STATES, Looks, Sigmas, Sums, Task
-from calib.row_tables import Beam as BeamTable
-from calib.row_tables import Groups as GroupTable
-from calib.row_tables import Knots as KnotTable
-from calib.row_tables import Planes as PlaneTable
-from calib.trajectory_errors import TrajectoryPrior
-from georef.calibration import Calibration
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.points import contiguous
-from georef.records import Int64Array
-from georef.sensor_model import SensorModel
+from swath.calib.features import Plane
+from swath.calib.flight import Flight, Swath
+from swath.calib.parameters import BEAM_PARTS, Unknowns
+from swath.calib.row_inputs import beam_table, head_table, new_looks, rays_of, sigmas_of, track_of, writeable
+from swath.calib.row_sums import MODE_GIVE, MODE_LOOK, MODE_SUM, go_over
+from swath.calib.row_tables import OF_PLANE, STATES, Looks, Sigmas, Sums, Task
+from swath.calib.row_tables import Beam as BeamTable
+from swath.calib.row_tables import Groups as GroupTable
+from swath.calib.row_tables import Knots as KnotTable
+from swath.calib.row_tables import Planes as PlaneTable
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.georef.calibration import Calibration
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.points import contiguous
+from swath.georef.records import Int64Array
+from swath.georef.sensor_model import SensorModel
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
@@ -190,7 +190,7 @@ class Rows:
     def looks(
         self, state: State, cofactors: Any = None, weight: SingleArray | None = None
     ) -> Iterator[tuple[Batch, Looks]]:
-        """Batch by batch f and M of each row, and A Q Aᵀ (as `calib.row_sums.look` has them).
+        """Batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.row_sums.look` has them).
 
         Args:
             state: at which.

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath, sensor_t
-from georef.records import Int64Array
+from swath.calib.flight import Flight, Swath, sensor_t
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
-from calib.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
-from calib.flight import FlightError
-from calib.strips import Checks
-from calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.records import Int64Array
-from georef.rotations import rot_from_quaternion
-from georef.trajectory import Trajectory
+from swath.calib.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
+from swath.calib.flight import FlightError
+from swath.calib.strips import Checks
+from swath.calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.records import Int64Array
+from swath.georef.rotations import rot_from_quaternion
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -100,10 +100,10 @@ def signatures(
     """Estimate every effect that the differences can tell.
 
     Args:
-        checks: of `calib.strips`, points in t.
+        checks: of `swath.calib.strips`, points in t.
         seen: where from.
         prior: joint covariance of the trajectory's errors, knots of the trajectories in the order of
-            ``seen.trajectories`` (`calib.trajectory_errors.from_smoother`); None: `assumed_prior`.
+            ``seen.trajectories`` (`swath.calib.trajectory_errors.from_smoother`); None: `assumed_prior`.
         most_rows: checks that are used, drawn evenly.
     """
     checks = checks.take(_known(checks, seen))

@@ -8,18 +8,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features
-from calib.flight import Flight
-from calib.normals import Normals, TrajectoryWeight, moved, normals
-from calib.observability import Rules, decide
-from calib.outcome import Residuals
-from calib.parameters import Unknowns
-from calib.quality import Quality, Solution, examine
-from calib.robust import HUBER, w_critical
-from calib.rows import Rows, SingleArray, State
-from calib.tie_rows import Ties
-from calib.trajectory_errors import TrajectoryPrior
-from georef.calibration import Calibration
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.normals import Normals, TrajectoryWeight, moved, normals
+from swath.calib.observability import Rules, decide
+from swath.calib.outcome import Residuals
+from swath.calib.parameters import Unknowns
+from swath.calib.quality import Quality, Solution, examine
+from swath.calib.robust import HUBER, w_critical
+from swath.calib.rows import Rows, SingleArray, State
+from swath.calib.tie_rows import Ties
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.georef.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Swath
-from georef.records import Int64Array
+from swath.calib.flight import Swath
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ of position (north, east, down) and of small turns about these axes. All have pr
 seen by nobody without control. Which strip gets which is chosen by an information criterion (Schwarz 1978; AIC of
 Akaike 1974 as corrected by Hurvich and Tsai 1989), with the number of parameters that the returns determine, the trace
 of N (N + P)⁻¹ over those combinations of them that the returns know much better than the prior does; along all others
-nothing is corrected. The equations are those of the adjustment (`calib.normals`) with states of the trajectory alone.
+nothing is corrected. The equations are those of the adjustment (`swath.calib.normals`) with states of the trajectory
+alone.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features
-from calib.flight import Flight
-from calib.normals import Normals, TrajectoryWeight, normals
-from calib.outcome import TrajectoryFit
-from calib.parameters import Wish, unknowns
-from calib.rows import Rows, SingleArray, State
-from calib.tie_rows import Ties
-from calib.trajectory_errors import ERRORS, TrajectoryPrior, apply, knots_of
-from georef.calibration import Calibration
-from georef.records import Int64Array
-from georef.trajectory import Trajectory
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.normals import Normals, TrajectoryWeight, normals
+from swath.calib.outcome import TrajectoryFit
+from swath.calib.parameters import Wish, unknowns
+from swath.calib.rows import Rows, SingleArray, State
+from swath.calib.tie_rows import Ties
+from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior, apply, knots_of
+from swath.georef.calibration import Calibration
+from swath.georef.records import Int64Array
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -129,7 +130,8 @@ def adjust_strips(
         features: seen by several strips; control makes the corrections absolute.
         calibrations: by scanner; they are held.
         settings: of it.
-        row_weight: (n,) of the rows on planes, in the order of `calib.rows`, as the calibration left them; None: 1.
+        row_weight: (n,) of the rows on planes, in the order of `swath.calib.rows`, as the calibration left them; None:
+        1.
 
     Raises:
         StripError: an unknown model or criterion, or no features; `FlightError`: there is no strip.

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight
-from calib.strip_cells import FlightStrip, Gathered, StripRules, blocks_of, gather, overlap_cells
-from georef.records import Int64Array
+from swath.calib.flight import Flight
+from swath.calib.strip_cells import FlightStrip, Gathered, StripRules, blocks_of, gather, overlap_cells
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.features import Features, Plane, Sighting, TiePoint
-from calib.flight import Flight
-from georef.records import Int64Array
+from swath.calib.features import Features, Plane, Sighting, TiePoint
+from swath.calib.flight import Flight
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def find_ties(flight: Flight, planes: Features, settings: TieSettings = _DEFAULT
 
     Args:
         flight: with points.
-        planes: `Features` of `calib.plane_search`, of this flight with these points.
+        planes: `Features` of `swath.calib.plane_search`, of this flight with these points.
         settings: what counts.
 
     Returns:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint, Sighting, TiePoint
-from calib.row_inputs import new_looks
-from calib.row_sums import MODE_GIVE, go_over
-from calib.row_tables import Planes as PlaneTable
-from calib.rows import Batch, Rows, Run, State
-from georef.calibration import Calibration
-from georef.records import Int64Array
+from swath.calib.features import ControlPoint, Sighting, TiePoint
+from swath.calib.row_inputs import new_looks
+from swath.calib.row_sums import MODE_GIVE, go_over
+from swath.calib.row_tables import Planes as PlaneTable
+from swath.calib.rows import Batch, Rows, Run, State
+from swath.georef.calibration import Calibration
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

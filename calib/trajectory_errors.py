@@ -17,15 +17,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, FlightError
-from calib.inverse import inverted
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.cross_covariance import ErrorChain
-from georef.quaternions import product
-from georef.records import Int64Array
-from georef.rotations import attitude_of, rot_from_quaternion
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory, gps_text
+from swath.calib.flight import Flight, FlightError
+from swath.calib.inverse import inverted
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.cross_covariance import ErrorChain
+from swath.georef.quaternions import product
+from swath.georef.records import Int64Array
+from swath.georef.rotations import attitude_of, rot_from_quaternion
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory, gps_text
 
 FloatArray = NDArray[np.float64]
 
@@ -273,7 +273,8 @@ def from_smoother(flight: Flight, chains: Sequence[ErrorChain], knot_s: float = 
 
     Args:
         flight: on the smoothed trajectories.
-        chains: of each trajectory, `georef.navigation.cross_covariance.error_chain` of its run; the finer, the nearer
+        chains: of each trajectory, `swath.georef.navigation.cross_covariance.error_chain` of its run; the finer, the
+        nearer
             the knots can be put.
         knot_s: distance of knots; widened where there would be more than `MOST_KNOTS`. What gyroscopes walk between
             two knots is nobody's, so that it should be small: with a tactical unit (0.1°/√h) half of 0.1° √(1 s / 1 h).

@@ -20,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from calib.control import ControlRules
-from calib.effects import EFFECTS
-from calib.features import ControlPoint, Features
-from calib.flight import Flight
-from calib.history import Compared, compare
-from calib.observability import RULES_OF_ALL
-from calib.strips import Numbers
-from calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov
-from calib.validation_rows import Rows, control_rows, estimated_floor_m, plane_rows
-from georef.calibration import INDEX, PARAMETERS, Calibration
-from georef.earth import geodetic_from_e
+from swath.calib.control import ControlRules
+from swath.calib.effects import EFFECTS
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight
+from swath.calib.history import Compared, compare
+from swath.calib.observability import RULES_OF_ALL
+from swath.calib.strips import Numbers
+from swath.calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov
+from swath.calib.validation_rows import Rows, control_rows, estimated_floor_m, plane_rows
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.georef.earth import geodetic_from_e
 
 FloatArray = NDArray[np.float64]
 

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, sparse
 
-from calib.control import ControlRules, Ground, grounds_at
-from calib.effects import EFFECTS, SeenFrom, effect_columns
-from calib.features import ControlPoint, Features, Plane
-from calib.flight import Flight
-from calib.local_plane import LocalPlane, plane_through
-from calib.trajectory_errors import ERRORS, TrajectoryPrior
-from georef.calibration import INDEX, Calibration
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.records import Int64Array
+from swath.calib.control import ControlRules, Ground, grounds_at
+from swath.calib.effects import EFFECTS, SeenFrom, effect_columns
+from swath.calib.features import ControlPoint, Features, Plane
+from swath.calib.flight import Flight
+from swath.calib.local_plane import LocalPlane, plane_through
+from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior
+from swath.georef.calibration import INDEX, Calibration
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Rows:
         local: sparse (n, m) what one sigma of each error moves that only one plane's or point's share; None: none.
         sights: (n, 2) which sight of a plane is the first, and the second; (0, 2): all are different.
         by_knot: sparse (n, 6k) what a unit of the trajectory's errors at each knot moves; None: they count as none.
-        knots: (6k, 6k) covariance of these, as of `calib.trajectory_errors.TrajectoryPrior`.
+        knots: (6k, 6k) covariance of these, as of `swath.calib.trajectory_errors.TrajectoryPrior`.
         floor: sparse (n, sights) what a metre of each sight's own deviation from its plane moves; None: none.
         floor_m: sigma of these deviations times √2, so that it is a distance's.
         heads: names of the scanners behind the effects.

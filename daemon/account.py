@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from daemon.block_queue import SourceCount
-from daemon.channels import ChannelTable, JsonChannel
-from daemon.events import Events, Severity
-from daemon.host_clock import HostClock
-from daemon.log.encode import EncodedBlock
-from daemon.parts import Parts
+from swath.daemon.block_queue import SourceCount
+from swath.daemon.channels import ChannelTable, JsonChannel
+from swath.daemon.events import Events, Severity
+from swath.daemon.host_clock import HostClock
+from swath.daemon.log.encode import EncodedBlock
+from swath.daemon.parts import Parts
 
 STUCK_AFTER_S = 5.0  # without an account; a receiver that lives gives four a second while its device is open
 

@@ -13,17 +13,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from daemon.block_queue import BlockQueue, QueueItem, SourceCount
-from daemon.channels import ChannelTable
-from daemon.events import Events, Severity
-from daemon.host_clock import HostClock, StampConverter, read_clock_pair
-from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
-from daemon.log.format import ChannelSpec, ChunkClass
-from daemon.threads import name_thread
-from daemon.wire_trouble import WireTrouble
-from drivers.session import Session, SessionState
-from drivers.transports.base import UnitBlock
-from georef.records import Int64Array
+from swath.daemon.block_queue import BlockQueue, QueueItem, SourceCount
+from swath.daemon.channels import ChannelTable
+from swath.daemon.events import Events, Severity
+from swath.daemon.host_clock import HostClock, StampConverter, read_clock_pair
+from swath.daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
+from swath.daemon.log.format import ChannelSpec, ChunkClass
+from swath.daemon.threads import name_thread
+from swath.daemon.wire_trouble import WireTrouble
+from swath.drivers.session import Session, SessionState
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import Int64Array
 
 WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
 ACCOUNT_S = 0.25  # and says how much it has lost at least this often

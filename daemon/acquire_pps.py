@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from daemon.acquire import WAIT_S, Receiver, Shared
-from daemon.channels import JsonChannel
-from daemon.events import Severity
-from daemon.host_clock import read_clock_pair
-from daemon.log.encode import MESSAGE_HEADER_BYTES
-from daemon.wire_trouble import WireTrouble
-from drivers.session import Session, SessionState
-from drivers.transports.base import RawEdge
+from swath.daemon.acquire import WAIT_S, Receiver, Shared
+from swath.daemon.channels import JsonChannel
+from swath.daemon.events import Severity
+from swath.daemon.host_clock import read_clock_pair
+from swath.daemon.log.encode import MESSAGE_HEADER_BYTES
+from swath.daemon.wire_trouble import WireTrouble
+from swath.drivers.session import Session, SessionState
+from swath.drivers.transports.base import RawEdge
 
 
 class PpsReceiver(Receiver):

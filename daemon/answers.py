@@ -8,11 +8,11 @@ from __future__ import annotations
 import threading
 import time
 
-from daemon.config import DeviceEntry
-from daemon.identify import Heard, not_understood
-from drivers.core.registry import find_driver
-from drivers.transports.base import UnitBlock
-from georef.records import ChunkBatch, Int64Array
+from swath.daemon.config import DeviceEntry
+from swath.daemon.identify import Heard, not_understood
+from swath.drivers.core.registry import find_driver
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import ChunkBatch, Int64Array
 
 JUDGED_BYTES = 64 * 1024  # several messages of every protocol
 JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then, and the start of the recording is over

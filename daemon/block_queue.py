@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from daemon.log.encode import EncodedBlock
+from swath.daemon.log.encode import EncodedBlock
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daemon.capture_routes import Port, Routes
-from daemon.captures import Capture, has_times
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.exporting import MANIFEST
-from daemon.log.format import LogError, safe_attachment_path
-from daemon.sidecar import SUFFIX
-from drivers.transports.base import TransportError
-from drivers.transports.capture_file import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
+from swath.daemon.capture_routes import Port, Routes
+from swath.daemon.captures import Capture, has_times
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.exporting import MANIFEST
+from swath.daemon.log.format import LogError, safe_attachment_path
+from swath.daemon.sidecar import SUFFIX
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_file import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
 
 _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from daemon.acquire import Wire
-from daemon.config import Config
-from daemon.log.format import ChannelSpec
-from daemon.run import make_wire
-from drivers.transports.capture_base import CapturedUnit
-from drivers.transports.uri import TransportSpec
+from swath.daemon.acquire import Wire
+from swath.daemon.config import Config
+from swath.daemon.log.format import ChannelSpec
+from swath.daemon.run import make_wire
+from swath.drivers.transports.capture_base import CapturedUnit
+from swath.drivers.transports.uri import TransportSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daemon.capture_routes import Port, Routes
-from daemon.sidecar import complete, cut_by_sidecar, sidecar_of
-from drivers.transports.capture_base import (
+from swath.daemon.capture_routes import Port, Routes
+from swath.daemon.sidecar import complete, cut_by_sidecar, sidecar_of
+from swath.drivers.transports.capture_base import (
     LATEST_NS,
     Address,
     CapturedUnit,
@@ -19,7 +19,7 @@ from drivers.transports.capture_base import (
     read_lines,
     until_damage,
 )
-from drivers.transports.capture_file import (
+from swath.drivers.transports.capture_file import (
     BareTime,
     chunk_table,
     read_bare,
@@ -28,7 +28,7 @@ from drivers.transports.capture_file import (
     read_serial,
     read_tagged,
 )
-from drivers.transports.pcap_frames import NOBODY
+from swath.drivers.transports.pcap_frames import NOBODY
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field
 
-from daemon.log.encode import EncodedBlock, encode_json
-from daemon.log.format import ChannelSpec
+from swath.daemon.log.encode import EncodedBlock, encode_json
+from swath.daemon.log.format import ChannelSpec
 
 
 @dataclass(slots=True)

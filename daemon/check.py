@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from daemon.config import Config, DeviceEntry
-from daemon.host_clock import ClockDiscipline, read_clock_discipline
-from daemon.identify import Heard, describe_time, not_understood
-from daemon.places import nearest_there
-from drivers.core.registry import find_driver
-from drivers.session import Session
-from drivers.transports.base import RawEdge, TransportCounters, UnitBlock
-from drivers.transports.can_link import interface_bitrate
-from drivers.transports.uri import TransportSpec, open_transport, parse_pps
-from georef.records import ChunkBatch, TimeMessage
-from georef.timescales import ahead_s, distance_text
+from swath.daemon.config import Config, DeviceEntry
+from swath.daemon.host_clock import ClockDiscipline, read_clock_discipline
+from swath.daemon.identify import Heard, describe_time, not_understood
+from swath.daemon.places import nearest_there
+from swath.drivers.core.registry import find_driver
+from swath.drivers.session import Session
+from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
+from swath.drivers.transports.can_link import interface_bitrate
+from swath.drivers.transports.uri import TransportSpec, open_transport, parse_pps
+from swath.georef.records import ChunkBatch, TimeMessage
+from swath.georef.timescales import ahead_s, distance_text
 
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured

@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from daemon.log.durable import sync_directory
+from swath.daemon.log.durable import sync_directory
 
 NAME = "SHA256SUMS"
 _LINE = re.compile(r"(\\?)([0-9a-f]{64}) [ *](.+)")

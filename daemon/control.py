@@ -24,14 +24,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.errors import one_line
-from daemon.events import Severity
-from daemon.places import CONTROL_LINK
-from daemon.recorder import Writing
-from daemon.threads import name_thread
+from swath.daemon.errors import one_line
+from swath.daemon.events import Severity
+from swath.daemon.places import CONTROL_LINK
+from swath.daemon.recorder import Writing
+from swath.daemon.threads import name_thread
 
 if TYPE_CHECKING:
-    from daemon.run import Assembly
+    from swath.daemon.run import Assembly
 
 log = logging.getLogger("swath")
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.control import socket_address
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.parts import read_sign
-from daemon.places import CONTROL_LINK
+from swath.daemon.control import socket_address
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.parts import read_sign
+from swath.daemon.places import CONTROL_LINK
 
 ANSWER_S = 5.0
 ANSWER_BYTES = 1 << 16

@@ -11,11 +11,11 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from daemon.events import Events, Severity
-from daemon.threads import name_thread
-from drivers.core.parser import Parser
-from drivers.transports.base import UnitBlock
-from georef.records import Chunk, Int64Array
+from swath.daemon.events import Events, Severity
+from swath.daemon.threads import name_thread
+from swath.drivers.core.parser import Parser
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import Chunk, Int64Array
 
 MOST_WAITING = 64  # reads that a receiver's port has not taken yet; corrections older than that help nobody
 WAIT_S = 0.2

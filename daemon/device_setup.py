@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
-from daemon.config import Config, DeviceEntry
-from daemon.errors import ExitCode, UserError, one_line
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.core.startup import Answer, StartupMessage, StartupWish
-from drivers.transports.base import TransportError
-from drivers.transports.uri import TransportSpec, open_transport
+from swath.daemon.config import Config, DeviceEntry
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.core.startup import Answer, StartupMessage, StartupWish
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.uri import TransportSpec, open_transport
 
 SLICE_S = 0.1
 SETTLE_S = 0.3  # for a device to change the rate of its line

@@ -6,10 +6,10 @@ import logging
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from daemon.block_queue import BlockQueue, QueueItem
-from daemon.channels import ChannelTable, JsonChannel
-from daemon.host_clock import HostClock
-from daemon.log.encode import EncodedBlock
+from swath.daemon.block_queue import BlockQueue, QueueItem
+from swath.daemon.channels import ChannelTable, JsonChannel
+from swath.daemon.host_clock import HostClock
+from swath.daemon.log.encode import EncodedBlock
 
 log = logging.getLogger("swath")
 

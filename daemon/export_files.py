@@ -10,13 +10,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from daemon.log.chunks import LogBatch
-from daemon.log.format import ChannelSpec
-from daemon.log.reader import LOOK_AHEAD_BYTES, LOOK_AHEAD_NS
-from daemon.sidecar import SidecarWriter
-from drivers.transports.candump_file import candump_line, held_by_line
-from drivers.transports.capture_base import LATEST_NS, Address
-from drivers.transports.pcap_frames import (
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.format import ChannelSpec
+from swath.daemon.log.reader import LOOK_AHEAD_BYTES, LOOK_AHEAD_NS
+from swath.daemon.sidecar import SidecarWriter
+from swath.drivers.transports.candump_file import candump_line, held_by_line
+from swath.drivers.transports.capture_base import LATEST_NS, Address
+from swath.drivers.transports.pcap_frames import (
     FILE_HEADER,
     LATEST_PCAP_NS,
     NOBODY,
@@ -24,9 +24,9 @@ from drivers.transports.pcap_frames import (
     largest_payload,
     pcap_frames,
 )
-from drivers.transports.rtklib_tag import TagWriter
-from drivers.transports.uri import TransportSpec, parse_transport
-from georef.records import Int64Array
+from swath.drivers.transports.rtklib_tag import TagWriter
+from swath.drivers.transports.uri import TransportSpec, parse_transport
+from swath.georef.records import Int64Array
 
 # .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)
 _SERIAL_SUFFIX = {"ubx": ".ubx", "novatel": ".gps", "sbf": ".sbf", "nmea": ".nmea"}

@@ -1,7 +1,7 @@
 """A log as the files that its devices' own tools read: serial streams, candump, pcap, PPS text.
 
-Every source is written in the log's own order. What a format cannot hold goes into a sidecar (`daemon.sidecar`), so
-that `swath import` makes the same units of it again.
+Every source is written in the log's own order. What a format cannot hold goes into a sidecar (`swath.daemon.sidecar`),
+so that `swath import` makes the same units of it again.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daemon.errors import ExitCode, UserError
-from daemon.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
-from daemon.log.chunks import LogBatch
-from daemon.log.durable import sync_tree, try_sync_directory
-from daemon.log.format import LogError, safe_attachment_path
-from daemon.log.reader import Session
-from daemon.log_parsers import stored_config
-from daemon.replay import source_of_topic
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.durable import sync_tree, try_sync_directory
+from swath.daemon.log.format import LogError, safe_attachment_path
+from swath.daemon.log.reader import Session
+from swath.daemon.log_parsers import stored_config
+from swath.daemon.replay import source_of_topic
 
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"

@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterable, Mapping
 
-from daemon.acquire import Receiver
-from daemon.recorder import WriterHealth, Writing
+from swath.daemon.acquire import Receiver
+from swath.daemon.recorder import WriterHealth, Writing
 
 PROGRESS_S = 2.0
 OPENING_S = 20.0  # a driver may take its time to open: python-can sleeps 2 s for a serial CAN adapter

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
 LATER_NS = 1_000_000_000  # a stamp so much later than its reading is of a clock that was stepped on, and back meanwhile

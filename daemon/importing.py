@@ -6,19 +6,19 @@ Files are merged by time, each read in its own order and never whole.
 from __future__ import annotations
 
 import heapq
-import importlib.metadata
 import platform
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.capture_routes import Routes
-from daemon.captures import Capture, ImportUnit
-from daemon.config import Config
-from daemon.events import Severity
-from daemon.log.format import SessionInfo
-from daemon.made_log import MadeLog, session_name
-from daemon.run import read_boot_id
+from swath import __version__
+from swath.daemon.capture_routes import Routes
+from swath.daemon.captures import Capture, ImportUnit
+from swath.daemon.config import Config
+from swath.daemon.events import Severity
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.made_log import MadeLog, session_name
+from swath.daemon.run import read_boot_id
 
 
 def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
@@ -45,7 +45,7 @@ def import_session_info(name: str, first_ns: int) -> SessionInfo:
     boot_id = read_boot_id()
     return SessionInfo(
         session_id=session_name(name, first_ns, boot_id),
-        software=f"swath {importlib.metadata.version('swath')}",
+        software=f"swath {__version__}",
         host=platform.node(),
         boot_id=boot_id,
         realtime_ns=first_ns,

@@ -9,7 +9,7 @@ import os
 import queue
 import threading
 
-from daemon.threads import name_thread
+from swath.daemon.threads import name_thread
 
 MAX_LINES = 10_000  # that wait; further ones are counted: what they tell is in the log too
 END_S = 1.0  # that the last lines may take

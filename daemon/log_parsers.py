@@ -8,12 +8,12 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from daemon.config.config import Config, attachment_name, plain_table
-from daemon.config.tables import Tables
-from daemon.log.format import LogError
-from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
-from drivers.core.registry import UnknownProtocolError, find_driver
-from georef.toml_tables import TomlError, toml_tables
+from swath.daemon.config.config import Config, attachment_name, plain_table
+from swath.daemon.config.tables import Tables
+from swath.daemon.log.format import LogError
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.core.registry import UnknownProtocolError, find_driver
+from swath.georef.toml_tables import TomlError, toml_tables
 
 
 def stored_config(attachments: Mapping[str, bytes]) -> Config | None:

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.account import Account
-from daemon.acquire import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S
-from daemon.block_queue import BlockQueue, SourceCount
-from daemon.capture_routes import Port
-from daemon.channels import ChannelTable
-from daemon.config import Config
-from daemon.errors import ExitCode, UserError
-from daemon.events import Events, Severity
-from daemon.host_clock import ClockPair, HostClock
-from daemon.log.encode import MESSAGE_HEADER_BYTES, encode_block
-from daemon.log.format import CHUNK_OPEN_NS, SessionInfo
-from daemon.log.writer import PartWriter
-from daemon.parts import Attachment, Parts
-from drivers.transports.capture_base import Address
+from swath.daemon.account import Account
+from swath.daemon.acquire import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S
+from swath.daemon.block_queue import BlockQueue, SourceCount
+from swath.daemon.capture_routes import Port
+from swath.daemon.channels import ChannelTable
+from swath.daemon.config import Config
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.events import Events, Severity
+from swath.daemon.host_clock import ClockPair, HostClock
+from swath.daemon.log.encode import MESSAGE_HEADER_BYTES, encode_block
+from swath.daemon.log.format import CHUNK_OPEN_NS, SessionInfo
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.parts import Attachment, Parts
+from swath.drivers.transports.capture_base import Address
 
 STATUS_NS = 1_000_000_000
 _BEHIND = 1000  # units in a row so far behind the newest: its stamp was the wrong one

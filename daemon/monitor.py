@@ -8,15 +8,15 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from daemon.health import duration_text, source_trouble
-from daemon.log.chunks import LogBatch, json_objects
-from daemon.log.claim import is_being_written
-from daemon.log.follow import LogFollower, PartFollower
-from daemon.log.format import LogError, SessionInfo
-from daemon.log_parsers import stored_config, stored_drivers
-from daemon.monitor_source import Decoding, SourceWatch, decoded_trouble
-from daemon.replay import source_of_topic
-from daemon.run import read_boot_id
+from swath.daemon.health import duration_text, source_trouble
+from swath.daemon.log.chunks import LogBatch, json_objects
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.format import LogError, SessionInfo
+from swath.daemon.log_parsers import stored_config, stored_drivers
+from swath.daemon.monitor_source import Decoding, SourceWatch, decoded_trouble
+from swath.daemon.replay import source_of_topic
+from swath.daemon.run import read_boot_id
 
 TAIL_S = 5.0
 EVENTS_KEPT = 50

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from daemon.log.chunks import LogBatch
-from drivers.core.parser import DriverSettingsError, Parser
-from georef.records import ChunkBatch
+from swath.daemon.log.chunks import LogBatch
+from swath.drivers.core.parser import DriverSettingsError, Parser
+from swath.georef.records import ChunkBatch
 
 RATE_STATUSES = 6  # rates are of the last five seconds
 DECODED_SECONDS = 10  # kept of what the parser said

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from daemon.checksum_list import NAME, ChecksumList
-from daemon.errors import ExitCode, UserError
-from daemon.log.claim import is_being_written
-from daemon.log.durable import try_sync_directory
-from daemon.log.format import MAGIC
-from daemon.log.reader import RECOVERED
-from daemon.parts import read_sign
+from swath.daemon.checksum_list import NAME, ChecksumList
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.durable import try_sync_directory
+from swath.daemon.log.format import MAGIC
+from swath.daemon.log.reader import RECOVERED
+from swath.daemon.parts import read_sign
 
 PARTIAL = ".partial"
 BLOCK_BYTES = 4 << 20

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
-from daemon.channels import ChannelTable
-from daemon.log.durable import sync_directory
-from daemon.log.encode import EncodedBlock
-from daemon.log.format import MAX_PART, SessionInfo
-from daemon.log.writer import PartWriter
-from daemon.places import keep_directory
+from swath.daemon.channels import ChannelTable
+from swath.daemon.log.durable import sync_directory
+from swath.daemon.log.encode import EncodedBlock
+from swath.daemon.log.format import MAX_PART, SessionInfo
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.places import keep_directory
 
 RECORDING_SIGN = "recording.json"
 _MOST_SIGN_BYTES = 4096

@@ -8,7 +8,7 @@ import os
 import stat
 from pathlib import Path
 
-from daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.errors import ConfigError, ExitCode, UserError
 
 DEFAULT_CONFIG = Path("/etc/swath/swath.toml")
 LOCK = ".swath.lock"  # in the log directory: held while a recorder is at work there
@@ -25,7 +25,7 @@ def log_directory(where: Path) -> Path:
         ConfigError: the configuration is wrong.
         UserError: it cannot be read, there is no such log directory, or this user may not look into it.
     """
-    from daemon.config import load_config
+    from swath.daemon.config import load_config
 
     try:
         if not where.exists():

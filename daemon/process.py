@@ -12,20 +12,20 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.answers import judge
-from daemon.block_queue import QueueItem
-from daemon.control import Control
-from daemon.errors import ExitCode, UserError
-from daemon.events import Severity
-from daemon.health import a_restart_helps_nobody, sentence, stuck_threads
-from daemon.host_clock import read_clock_discipline, read_clock_sample
-from daemon.journal import threads_text
-from daemon.recorder import Writing
-from daemon.repair import repair_left_open
-from daemon.sd_notify import ServiceManager
+from swath.daemon.answers import judge
+from swath.daemon.block_queue import QueueItem
+from swath.daemon.control import Control
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.events import Severity
+from swath.daemon.health import a_restart_helps_nobody, sentence, stuck_threads
+from swath.daemon.host_clock import read_clock_discipline, read_clock_sample
+from swath.daemon.journal import threads_text
+from swath.daemon.recorder import Writing
+from swath.daemon.repair import repair_left_open
+from swath.daemon.sd_notify import ServiceManager
 
 if TYPE_CHECKING:
-    from daemon.run import Assembly
+    from swath.daemon.run import Assembly
 
 log = logging.getLogger("swath")
 

@@ -16,15 +16,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from daemon.account import Account, TimeStatus
-from daemon.block_queue import BlockQueue, QueueItem
-from daemon.channels import ChannelTable
-from daemon.events import Events, Severity
-from daemon.host_clock import HostClock
-from daemon.log.encode import EncodedBlock
-from daemon.log.writer import PartWriter
-from daemon.parts import Parts
-from daemon.threads import name_thread
+from swath.daemon.account import Account, TimeStatus
+from swath.daemon.block_queue import BlockQueue, QueueItem
+from swath.daemon.channels import ChannelTable
+from swath.daemon.events import Events, Severity
+from swath.daemon.host_clock import HostClock
+from swath.daemon.log.encode import EncodedBlock
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.parts import Parts
+from swath.daemon.threads import name_thread
 
 log = logging.getLogger("swath")
 

@@ -14,10 +14,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from daemon.events import Events, Severity
-from daemon.log.claim import is_being_written
-from daemon.log.format import LogError
-from daemon.log.reader import read_part_head
+from swath.daemon.events import Events, Severity
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.format import LogError
+from swath.daemon.log.reader import read_part_head
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _LOOK_AGAIN_S = 60.0
@@ -104,7 +104,7 @@ async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:
     """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
     # a child inherits the recorder's real-time priority: it must be idle before its interpreter even starts
     command = ["chrt", "--idle", "0"] if shutil.which("chrt") else []
-    command += [sys.executable, "-m", "daemon.cli.main", "recover", "--background"]
+    command += [sys.executable, "-m", "swath.daemon.cli.main", "recover", "--background"]
     command += ["--keep-free-mb", str(reserve_bytes // 1_000_000), str(path)]
     process = await asyncio.create_subprocess_exec(
         *command,

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
-from daemon.config import Config
-from daemon.log.chunks import json_objects
-from daemon.log.reader import Session
-from daemon.wire_player import Output, PpsOutput, TimedUnit, open_output
+from swath.daemon.config import Config
+from swath.daemon.log.chunks import json_objects
+from swath.daemon.log.reader import Session
+from swath.daemon.wire_player import Output, PpsOutput, TimedUnit, open_output
 
 _FIXED = "fixed:"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.metadata
 import os
 import platform
 import time
@@ -11,29 +10,30 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.acquire import Receiver, Shared, UnitReceiver, UnitsSeen, Wire
-from daemon.acquire_pps import PpsReceiver
-from daemon.answers import FirstUnits
-from daemon.block_queue import BlockQueue
-from daemon.channels import ChannelTable, JsonChannel
-from daemon.config import Config, DeviceEntry, GnssConfig
-from daemon.corrections import CorrectionsWatch, Relay
-from daemon.errors import ExitCode
-from daemon.events import Events
-from daemon.host_clock import HostClock
-from daemon.log.format import SessionInfo
-from daemon.memory import lock_memory
-from daemon.parts import Attachment, Parts
-from daemon.places import take_directory
-from daemon.process import RecorderProcess
-from daemon.recorder import Recorder, RecorderSettings
-from daemon.sd_notify import ServiceManager
-from daemon.timekeeper import TimeKeeper
-from drivers.core.registry import find_driver
-from drivers.session import Session
-from drivers.transports.base import UnitBlock
-from drivers.transports.uri import TransportSpec, open_transport, parse_pps
-from georef.records import NamesEdge
+from swath import __version__
+from swath.daemon.acquire import Receiver, Shared, UnitReceiver, UnitsSeen, Wire
+from swath.daemon.acquire_pps import PpsReceiver
+from swath.daemon.answers import FirstUnits
+from swath.daemon.block_queue import BlockQueue
+from swath.daemon.channels import ChannelTable, JsonChannel
+from swath.daemon.config import Config, DeviceEntry, GnssConfig
+from swath.daemon.corrections import CorrectionsWatch, Relay
+from swath.daemon.errors import ExitCode
+from swath.daemon.events import Events
+from swath.daemon.host_clock import HostClock
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.memory import lock_memory
+from swath.daemon.parts import Attachment, Parts
+from swath.daemon.places import take_directory
+from swath.daemon.process import RecorderProcess
+from swath.daemon.recorder import Recorder, RecorderSettings
+from swath.daemon.sd_notify import ServiceManager
+from swath.daemon.timekeeper import TimeKeeper
+from swath.drivers.core.registry import find_driver
+from swath.drivers.session import Session
+from swath.drivers.transports.base import UnitBlock
+from swath.drivers.transports.uri import TransportSpec, open_transport, parse_pps
+from swath.georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
 
@@ -52,7 +52,7 @@ def make_session_info(name: str, clock: HostClock) -> SessionInfo:
     start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(clock.realtime_ns // 1_000_000_000))
     return SessionInfo(
         session_id=f"{name}-{start}-{boot_id[:4]}",
-        software=f"swath {importlib.metadata.version('swath')}",
+        software=f"swath {__version__}",
         host=platform.node(),
         boot_id=boot_id,
         realtime_ns=clock.realtime_ns,

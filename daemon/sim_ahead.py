@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
-from daemon.errors import ExitCode, UserError
-from daemon.sim_flight import Flight
-from daemon.wire_player import TimedUnit
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.sim_flight import Flight
+from swath.daemon.wire_player import TimedUnit
 
 AHEAD_S = 5.0  # of flight that wait, at most
 BATCH_S = 0.1
@@ -28,7 +28,7 @@ MakeFlight = Callable[[], "tuple[Flight, dict[str, bytes]]"]
 
 @dataclass(frozen=True, slots=True)
 class FlightFacts:
-    """What is known of a flight before it begins; the first four as of `daemon.sim_flight.Flight`.
+    """What is known of a flight before it begins; the first four as of `swath.daemon.sim_flight.Flight`.
 
     Attributes:
         files: what stands beside it, by name.

@@ -1,6 +1,6 @@
 """What `daemon` knows of a flight of the virtual aircraft: its units, its host's clock, and what befalls its wires.
 
-`sim.fly.VirtualFlight` is one; only the command imports it, so that no recorder loads what flying takes.
+`swath.sim.fly.VirtualFlight` is one; only the command imports it, so that no recorder loads what flying takes.
 """
 
 from __future__ import annotations

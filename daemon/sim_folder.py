@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.durable import sync_directory
-from daemon.made_log import refuse_session
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.durable import sync_directory
+from swath.daemon.made_log import refuse_session
 
 _AGAIN = "is there already; remove it or give another place"
 

@@ -7,7 +7,6 @@ gives the same bytes.
 from __future__ import annotations
 
 import heapq
-import importlib.metadata
 import itertools
 import uuid
 from collections.abc import Callable, Iterator
@@ -17,20 +16,21 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.acquire import SILENT_AFTER_S
-from daemon.block_queue import SourceCount
-from daemon.capture_routes import Port, Routes
-from daemon.channels import JsonChannel
-from daemon.config import Config
-from daemon.events import Severity
-from daemon.host_clock import STA_UNSYNC, ClockDiscipline
-from daemon.log.format import SessionInfo
-from daemon.made_log import MadeLog, Source, session_name
-from daemon.process import CLOCK_PERIOD_S
-from daemon.run import make_timekeeper
-from daemon.sim_flight import Flight, VirtualClock, VirtualUnit
-from drivers.transports.base import UnitBlock
-from drivers.transports.capture_base import Address
+from swath import __version__
+from swath.daemon.acquire import SILENT_AFTER_S
+from swath.daemon.block_queue import SourceCount
+from swath.daemon.capture_routes import Port, Routes
+from swath.daemon.channels import JsonChannel
+from swath.daemon.config import Config
+from swath.daemon.events import Severity
+from swath.daemon.host_clock import STA_UNSYNC, ClockDiscipline
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.made_log import MadeLog, Source, session_name
+from swath.daemon.process import CLOCK_PERIOD_S
+from swath.daemon.run import make_timekeeper
+from swath.daemon.sim_flight import Flight, VirtualClock, VirtualUnit
+from swath.drivers.transports.base import UnitBlock
+from swath.drivers.transports.capture_base import Address
 
 HOST = "virtual"
 FIRST_HEAD = 201  # 192.168.1.201, where heads are as they come from the factory
@@ -50,7 +50,7 @@ def sim_session_info(name: str, clock: VirtualClock, seed: int) -> SessionInfo:
     boot_id, start_ns = virtual_boot_id(name, seed), clock.realtime_ns(0.0)
     return SessionInfo(
         session_id=session_name(name, start_ns, boot_id),
-        software=f"swath {importlib.metadata.version('swath')}",
+        software=f"swath {__version__}",
         host=HOST,
         boot_id=boot_id,
         realtime_ns=start_ns,

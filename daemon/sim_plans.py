@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.errors import ExitCode, UserError, one_line
-from drivers.core.extras import how_to_install
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.drivers.core.extras import how_to_install
 
 if TYPE_CHECKING:
-    from daemon.sim_flight import Flight
+    from swath.daemon.sim_flight import Flight
 
 NEEDS = ("scipy", "pyproj", "numba", "matplotlib")
 WARM_UP_S = 0.3  # a block of every source
@@ -41,7 +41,7 @@ class Wish:
             UserError: it is not there, or a key is wrong; or what `sim` needs is not installed.
         """
         _check_installed()
-        from sim.plan import load_plan
+        from swath.sim.plan import load_plan
 
         with self.told():
             plan = load_plan(self.plan)
@@ -54,7 +54,7 @@ class Wish:
         Args:
             names: of files beside the plan's that may be what is wrong.
         """
-        from sim.errors import PlanError
+        from swath.sim.errors import PlanError
 
         try:
             yield
@@ -82,8 +82,8 @@ def make_flight(wish: Wish, truth: Path | None = None) -> tuple[Flight, dict[str
         OSError: the truth cannot be written.
     """
     plan = wish.load()
-    from sim.companions import companion_files
-    from sim.fly import VirtualFlight, open_truth
+    from swath.sim.companions import companion_files
+    from swath.sim.fly import VirtualFlight, open_truth
 
     writer = None if truth is None else open_truth(plan, truth)
     try:
@@ -102,7 +102,7 @@ def make_flight_in_time(wish: Wish) -> tuple[Flight, dict[str, bytes]]:
     A moment of the same flight is flown with all scanners on.
     """
     plan = wish.load()
-    from sim.fly import VirtualFlight
+    from swath.sim.fly import VirtualFlight
 
     always_on = {name: {"on_lines_only": False} for name in plan.tables.scanner}
     with wish.told():
@@ -119,7 +119,7 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
         wires: transports and PPS sources by source; None: those of an aircraft's computer.
         directory: for logs.
     """
-    from sim.companions import config_text, default_wires
+    from swath.sim.companions import config_text, default_wires
 
     text: str = config_text(plan, default_wires(plan) if wires is None else wires, directory)
     return text.encode()
@@ -128,7 +128,7 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
 def draw(wish: Wish, picture: Path) -> list[dict[str, Any]]:
     """Draw a plan; what it covers, a row a line and one for all. Raises UserError, OSError."""
     plan = wish.load()
-    from sim.picture import draw_plan
+    from swath.sim.picture import draw_plan
 
     with wish.told(str(picture)):
         rows: list[dict[str, Any]] = draw_plan(plan, picture)

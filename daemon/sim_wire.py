@@ -12,11 +12,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from daemon.config import Config
-from daemon.errors import ExitCode, UserError
-from daemon.replay import close_outputs, output_makers
-from daemon.sim_ahead import FlightFacts
-from daemon.wire_player import Output, PlayReport, TimedUnit, play
+from swath.daemon.config import Config
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.replay import close_outputs, output_makers
+from swath.daemon.sim_ahead import FlightFacts
+from swath.daemon.wire_player import Output, PlayReport, TimedUnit, play
 
 CAN_GROUP = "239.74.163.2"
 _CLOCK, _PLUG = "wall clock", "plug of "
@@ -205,7 +205,7 @@ def fly_on_wires(
         units: of the flight, in order of time.
         facts: of the flight.
         outputs, others: of `open_wires`.
-        progress, stopped: as of `daemon.wire_player.play`.
+        progress, stopped: as of `swath.daemon.wire_player.play`.
     """
     merged = heapq.merge(units, _events(facts), key=lambda unit: unit.time_ns)
     return play(merged, {**outputs, **others}, progress=progress, stopped=stopped)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from daemon.log.chunks import LogBatch, json_objects
-from daemon.log.reader import Session
-from daemon.log_parsers import stored_parsers
-from daemon.replay import source_of_topic
-from drivers.core.parser import Parser
-from georef.records import ChunkBatch, Int64Array
+from swath.daemon.log.chunks import LogBatch, json_objects
+from swath.daemon.log.reader import Session
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.replay import source_of_topic
+from swath.drivers.core.parser import Parser
+from swath.georef.records import ChunkBatch, Int64Array
 
 USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
 GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still speaks ten times a second

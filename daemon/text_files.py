@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from daemon.errors import ExitCode, UserError
-from georef.text_encoding import encoding_of
+from swath.daemon.errors import ExitCode, UserError
+from swath.georef.text_encoding import encoding_of
 
 
 def text_of(path: Path, want: str = "a CSV file") -> str:

@@ -11,12 +11,12 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from daemon.events import Events, Severity
-from daemon.host_clock import ClockDiscipline
-from drivers.core.parser import Parser
-from drivers.transports.base import UnitBlock
-from georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
-from georef.timescales import HostTimeline, PpsClock, WallComparison
+from swath.daemon.events import Events, Severity
+from swath.daemon.host_clock import ClockDiscipline
+from swath.drivers.core.parser import Parser
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
+from swath.georef.timescales import HostTimeline, PpsClock, WallComparison
 
 STOPPED_NS = 5_000_000_000  # data, but no time message for so long, and for thrice as long as ever before …
 STOPPED_LONGEST_NS = 60_000_000_000  # … or for so long

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from daemon.events import Events, Severity
-from drivers.transports.base import TransportCounters
+from swath.daemon.events import Events, Severity
+from swath.drivers.transports.base import TransportCounters
 
 TOLD_AGAIN_S = 30.0  # trouble that goes on is told so often, with what came meanwhile
 

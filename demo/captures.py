@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path
 
-from daemon.wire_player import TimedUnit
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.transports.capture_file import CapturedUnit, read_candump, read_pcap, read_serial
-from georef.records import Chunk, TimeMessage, TimeScale
-from georef.timescales import SECOND_NS, WEEK_NS
+from swath.daemon.wire_player import TimedUnit
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.transports.capture_file import CapturedUnit, read_candump, read_pcap, read_serial
+from swath.georef.records import Chunk, TimeMessage, TimeScale
+from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 FIXTURES = Path(__file__).resolve().parent.parent / "fixtures"
 GNSS = FIXTURES / "novatel" / "propak6-basic-fix.gps.gz"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from daemon.sim_ahead import Ahead
-from daemon.sim_plans import Wish, configuration, make_flight_in_time
-from daemon.sim_wire import own_wires
 from demo.proof import Show
+from swath.daemon.sim_ahead import Ahead
+from swath.daemon.sim_plans import Wish, configuration, make_flight_in_time
+from swath.daemon.sim_wire import own_wires
 
 PLAN = "small"
 WHAT = {

@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from daemon.config import load_config
-from daemon.replay import close_outputs, open_outputs, source_of_topic
-from daemon.wire_player import Output, PlayReport, TimedUnit, play
+from swath.daemon.config import load_config
+from swath.daemon.replay import close_outputs, open_outputs, source_of_topic
+from swath.daemon.wire_player import Output, PlayReport, TimedUnit, play
 
 START_S, END_S = 30.0, 30.0
 
@@ -73,7 +73,7 @@ def start_recorder(folder: Path, sources: int) -> subprocess.Popen[bytes]:
     """``swath run`` on the folder's configuration, all its devices open."""
     journal = folder / "journal.txt"
     with journal.open("w") as stderr:
-        command = [sys.executable, "-m", "daemon.cli.main", "run", str(folder / "swath.toml")]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(folder / "swath.toml")]
         recorder = subprocess.Popen(command, stderr=stderr)
     deadline = time.monotonic() + START_S
     while journal.read_text().count("device_opened") < sources:
@@ -155,7 +155,7 @@ def perform(console: Console, folder: Path, show: Show) -> bool:
         os.sched_setaffinity(0, allowed)
         close_outputs(opened)
     console.print(f"[bold]$ swath info {folder}/logs[/]")
-    info = subprocess.run([sys.executable, "-m", "daemon.cli.main", "info", str(folder / "logs")], check=False)
+    info = subprocess.run([sys.executable, "-m", "swath.daemon.cli.main", "info", str(folder / "logs")], check=False)
     console.print(show.remark)
     good = prove(console, folder / "logs", outputs, report)
     return good and ended == 0 and info.returncode == 0

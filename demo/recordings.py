@@ -6,10 +6,10 @@ import heapq
 from collections.abc import Iterator
 from pathlib import Path
 
-from daemon.sim_wire import free_ports
-from daemon.wire_player import TimedUnit
 from demo.captures import can_units, gnss_units, pps_units, scanner_units, until
 from demo.proof import Show
+from swath.daemon.sim_wire import free_ports
+from swath.daemon.wire_player import TimedUnit
 
 WHAT = {
     "gnss/rover": "NovAtel ProPak6 SPAN, 2014, through a pty",

@@ -16,7 +16,7 @@ from dataclasses import fields
 from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
-from drivers.transports.base import PpsSource, Transport, TransportCounters, TransportError
+from swath.drivers.transports.base import PpsSource, Transport, TransportCounters, TransportError
 
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0

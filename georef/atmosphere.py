@@ -2,7 +2,8 @@
 beams that bend (FORMULAS 3.2, 4; ``[atmosphere]`` of the configuration).
 
 Group refractivity: the closed form of IAG 1999, in the International Standard Atmosphere (dry) or in one that goes
-through a measured temperature, pressure and humidity. Bending: `georef.refraction`, whose models bring their own air.
+through a measured temperature, pressure and humidity. Bending: `swath.georef.refraction`, whose models bring their own
+air.
 Heights are ellipsoidal where the models count from the sea: with a geoid 50 m away ranges change by 1.3 ppm.
 """
 
@@ -15,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.kernels.air import ARDC, CELLS, FLOOR_M, SPHERICAL, STEP_M, STRAIGHT, apply_air, means
-from georef.refraction import ardc_k, layer_constant_ppm, layer_refractivity, spherical_bending
+from swath.georef.kernels.air import ARDC, CELLS, FLOOR_M, SPHERICAL, STEP_M, STRAIGHT, apply_air, means
+from swath.georef.refraction import ardc_k, layer_constant_ppm, layer_refractivity, spherical_bending
 
 FloatArray = NDArray[np.float64]
 
@@ -217,7 +218,7 @@ def _refractivity(
 
 
 def _table(refractivity: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """(CELLS, 5) of `georef.kernels.air`: the cubic through four heights of each cell, and the integral below it.
+    """(CELLS, 5) of `swath.georef.kernels.air`: the cubic through four heights of each cell, and the integral below it.
 
     Air is so smooth over a cell that this is exact to 1e-13.
     """

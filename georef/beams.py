@@ -15,8 +15,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.calibration import Calibration, is_rotation
-from georef.kernels.beam import (
+from swath.georef.calibration import Calibration, is_rotation
+from swath.georef.kernels.beam import (
     BY_CHANNEL,
     COLUMNS,
     FIBRE_BY_CHANNEL,
@@ -47,7 +47,7 @@ class Deflection:
     """A geometry with a calibration, for the kernel.
 
     Attributes:
-        kind, table: of `georef.kernels.beam`; (channels, 8).
+        kind, table: of `swath.georef.kernels.beam`; (channels, 8).
         select: how a return chooses its channel.
         rot_s_from_head, head_s: (3, 3), (3,) the head's own axes in s.
     """

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.toml_tables import TomlError, key_text, toml_tables
+from swath.georef.toml_tables import TomlError, key_text, toml_tables
 
 FloatArray = NDArray[np.float64]
 

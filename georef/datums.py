@@ -24,7 +24,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from georef.earth import A_M, B_M, e_from_geodetic, geodetic_from_e
+from swath.georef.earth import A_M, B_M, e_from_geodetic, geodetic_from_e
 
 FloatArray = NDArray[np.float64]
 Area = tuple[float, float, float, float]
@@ -427,7 +427,7 @@ def _unbound(crs: CRS) -> CRS:
 
 
 def _has_our_ellipsoid(crs: CRS) -> bool:
-    """Whether geodetic coordinates on it mean what they mean on the ellipsoid of `georef.earth`."""
+    """Whether geodetic coordinates on it mean what they mean on the ellipsoid of `swath.georef.earth`."""
     ellipsoid = crs.ellipsoid
     if ellipsoid is None:
         return False

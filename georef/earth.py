@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.compiled import kept, kernel
+from swath.georef.compiled import kept, kernel
 
 FloatArray = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.kernels.motion import PLACE, REACH, TRAIN, cut, rates
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
-from georef.stream_rows import joined, words
+from swath.georef.kernels.motion import PLACE, REACH, TRAIN, cut, rates
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.stream_rows import joined, words
 
 FloatArray = NDArray[np.float64]
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]

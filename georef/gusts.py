@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.timescales.gps_time import SECOND_NS
-from georef.trajectory_time import REACH_STEPS, STEP_NS
+from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.trajectory_time import REACH_STEPS, STEP_NS
 
 FloatArray = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.calibration import INDEX, PARAMETERS
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.points import Rays
-from georef.rotations import attitude_of, rot_from_quaternion, rot_x, rot_y
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.points import Rays
+from swath.georef.rotations import attitude_of, rot_from_quaternion, rot_x, rot_y
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

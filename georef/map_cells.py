@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
+from swath.georef.compiled import kept, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -18,7 +18,7 @@ from pyproj.database import get_database_metadata
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
-from georef.datums import (
+from swath.georef.datums import (
     ACCURACY_M,
     SAME,
     Area,
@@ -29,9 +29,9 @@ from georef.datums import (
     read_target,
     transformer_of,
 )
-from georef.earth import geodetic_from_e
-from georef.map_cells import APPROXIMATION_M, ROOT_M, MapCells
-from georef.map_fit import degrees_text, misfit_of, outside_deg
+from swath.georef.earth import geodetic_from_e
+from swath.georef.map_cells import APPROXIMATION_M, ROOT_M, MapCells
+from swath.georef.map_fit import degrees_text, misfit_of, outside_deg
 
 __all__ = ["Mapping", "MappingError"]
 

@@ -17,8 +17,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array, StructArray
-from georef.rotations import rot_l_from_b
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import rot_l_from_b
 
 FloatArray = NDArray[np.float64]
 DEFAULT_MAX_GAP_NS = 1_000_000_000

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]

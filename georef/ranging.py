@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.kernels.zones import (
+from swath.georef.kernels.zones import (
     AMBIGUOUS,
     BRIDGED,
     COMPLETE,
@@ -32,7 +32,7 @@ from georef.kernels.zones import (
     TICKS,
     resolve_zones,
 )
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class PulseRates:
     """Pulse and tick rates that a scanner's headers tell, each from a pulse on; by ``pulse_id``, so that late rows
     still find theirs.
 
-    A parser calls `note`; `ZoneResolver` and `georef.georeference.Georeferencer` ask.
+    A parser calls `note`; `ZoneResolver` and `swath.georef.georeference.Georeferencer` ask.
     """
 
     def __init__(self) -> None:

@@ -135,7 +135,7 @@ class GnssFix:
 
     Attributes:
         host_time_ns: host time of arrival.
-        time: epoch of the solution; `georef.timescales` completes it to GPS nanoseconds.
+        time: epoch of the solution; `swath.georef.timescales` completes it to GPS nanoseconds.
         lat_rad, lon_rad: geodetic, radians; None where the message has a velocity only.
         height_m: ellipsoidal height (geoid separation already added).
         velocity_l: north, east, down, m/s; None components absent from the protocol are nan.

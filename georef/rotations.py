@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.earth import rot_e_from_l
+from swath.georef.earth import rot_e_from_l
 
 FloatArray = NDArray[np.float64]
 

@@ -3,7 +3,8 @@
     x_e = x_b^e + rot_e_from_b · ( lever_arm_b + R(ω, φ + slope · θ, κ) · G · T · x_s(ρ, θ) )
 
 with the position at the pulse's time, GPS stamp + time_offset, the attitude at that + imu_latency, and the gimbal G,
-where there is one (NGA Eq. 3). The beam is straight and the air does nothing: that comes after (`georef.georeference`).
+where there is one (NGA Eq. 3). The beam is straight and the air does nothing: that comes after
+(`swath.georef.georeference`).
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.atmosphere import Air
-from georef.beams import Geometry
-from georef.calibration import INDEX, Calibration
-from georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
-from georef.kernels.rays import cast
-from georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
-from georef.mount import Mount
-from georef.points import Fate, Rays, contiguous
-from georef.records import Int64Array, StructArray
-from georef.rotations import rot_x, rot_y, rot_z
-from georef.trajectory import Trajectory
-from georef.uncertainty import Uncertainty
+from swath.georef.atmosphere import Air
+from swath.georef.beams import Geometry
+from swath.georef.calibration import INDEX, Calibration
+from swath.georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, SPINNING
+from swath.georef.kernels.rays import cast
+from swath.georef.kernels.types import Axes, Model, Mounted, Out, Ranging, Scanning, Track
+from swath.georef.mount import Mount
+from swath.georef.points import Fate, Rays, contiguous
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import rot_x, rot_y, rot_z
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Uncertainty
 
 FloatArray = NDArray[np.float64]
 

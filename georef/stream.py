@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.points import FATE_NAMES, ByteArray, Fate, Points
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
-from georef.stream_clocks import StreamClocks
-from georef.stream_path import CompletePath, GrowingPath, Path
-from georef.stream_rows import Held, any_has, beyond, compact, joined, split, taken
+from swath.georef.points import FATE_NAMES, ByteArray, Fate, Points
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.stream_clocks import StreamClocks
+from swath.georef.stream_path import CompletePath, GrowingPath, Path
+from swath.georef.stream_rows import Held, any_has, beyond, compact, joined, split, taken
 
 if TYPE_CHECKING:
-    from georef.trajectory import Trajectory
+    from swath.georef.trajectory import Trajectory
 
 __all__ = ["CompletePath", "GrowingPath", "Path", "ScannerChain", "Stream", "StreamSettings"]
 
@@ -54,14 +54,14 @@ class StreamSettings:
 
 
 class Georeferences(Protocol):
-    """What makes points of a scanner's returns: `georef.georeference.Georeferencer`."""
+    """What makes points of a scanner's returns: `swath.georef.georeference.Georeferencer`."""
 
     def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
         """Points, and the fate of every row."""
 
 
 class Resolver(Protocol):
-    """What finds the emissions of returns with pulses in air, and may hold some back: `georef.ranging.ZoneResolver`."""
+    """Finds emissions of returns with pulses in air, may hold some back: `swath.georef.ranging.ZoneResolver`."""
 
     counts: Counter[str]
 
@@ -80,7 +80,7 @@ Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]
 
 
 class Motion(Protocol):
-    """Finds the encoder's rate and acceleration from the readings around: `georef.encoder_motion.EncoderMotion`."""
+    """Finds the encoder's rate and acceleration from readings around: `swath.georef.encoder_motion.EncoderMotion`."""
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
         """Rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
@@ -90,7 +90,7 @@ class Motion(Protocol):
 
 
 class GivenMotion:
-    """Hands the encoder's motion of the rows at hand to a `georef.georeference.Georeferencer`."""
+    """Hands the encoder's motion of the rows at hand to a `swath.georef.georeference.Georeferencer`."""
 
     def __init__(self) -> None:
         self.rate = self.acceleration = np.empty(0)

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept
-from georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
-from georef.timescales import (
+from swath.georef.compiled import kept
+from swath.georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
+from swath.georef.timescales import (
     ClockEvent,
     ClockStatus,
     DeviceClock,

@@ -6,10 +6,10 @@ from typing import Protocol
 
 import numpy as np
 
-from georef.records import StructArray
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.records import StructArray
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 KEPT_BEHIND_S = 30.0  # of a growing trajectory, behind its newest epoch: longer than any return waits
 SHORTEST_TRAJECTORY = 2  # epochs

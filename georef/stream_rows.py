@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 
 WORDS = RETURN_DTYPE.itemsize // 8
 _OFFSETS = {name: int(place[1]) for name, place in (RETURN_DTYPE.fields or {}).items()}

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.points import FloatArray
-from georef.records import Int64Array
+from swath.georef.points import FloatArray
+from swath.georef.records import Int64Array
 
 SECOND_NS = 1_000_000_000
 LATEST_NS = 1 << 62  # of GPS time, in 2126: differences and sums of two stay within 64 bits

@@ -15,13 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.compiled import kept, kernel
-from georef.earth import e_from_geodetic, geodetic_from_e
-from georef.points import ByteArray, Fate
-from georef.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
-from georef.records import Int64Array
-from georef.rotations import quaternion_from_rot, rot_l_from_plumb
-from georef.timescales.gps_time import SECOND_NS, week_from_gps
+from swath.georef.compiled import kept, kernel
+from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.points import ByteArray, Fate
+from swath.georef.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
+from swath.georef.records import Int64Array
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_plumb
+from swath.georef.timescales.gps_time import SECOND_NS, week_from_gps
 
 FloatArray = NDArray[np.float64]
 

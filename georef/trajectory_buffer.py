@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.quaternions import rotations_between
-from georef.records import INS_DTYPE, Int64Array, StructArray
-from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
+from swath.georef.quaternions import rotations_between
+from swath.georef.records import INS_DTYPE, Int64Array, StructArray
+from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.gps_time import DAY_NS, SECOND_NS, table_leap_seconds, utc_from_gps
-from georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, table_leap_seconds, utc_from_gps
+from swath.georef.trajectory import Trajectory, TrajectoryError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

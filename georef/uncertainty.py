@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.calibration import INDEX, PARAMETERS, Calibration
-from georef.kernels.covariance import (
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.georef.kernels.covariance import (
     ALONG_ONLY,
     ANGLE,
     ANGLE_BY_ACCELERATION,
@@ -31,9 +31,9 @@ from georef.kernels.covariance import (
     Flown,
     Known,
 )
-from georef.points import contiguous
-from georef.rotations import rot_x, rot_y
-from georef.trajectory import Trajectory
+from swath.georef.points import contiguous
+from swath.georef.rotations import rot_x, rot_y
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 _NONE = np.zeros(0)
@@ -76,7 +76,7 @@ class Noise:
 
 
 class Uncertainty:
-    """Covariances of the points of one scanner, by `georef.sensor_model.SensorModel.rays`."""
+    """Covariances of the points of one scanner, by `swath.georef.sensor_model.SensorModel.rays`."""
 
     def __init__(self, calibration: Calibration, noise: Noise) -> None:
         """Take the parameters' covariance apart.
@@ -116,7 +116,7 @@ class Uncertainty:
 
 
 def _effects(calibration: Calibration) -> FloatArray:
-    """(16, 18) what each parameter does (FORMULAS 5.2), columns as in `georef.kernels.covariance`.
+    """(16, 18) what each parameter does (FORMULAS 5.2), columns as in `swath.georef.kernels.covariance`.
 
     ω, φ and κ turn the beam about their own axes in b; that the pitch slope moves κ's is left out (1e-4 of its part).
     """

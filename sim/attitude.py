@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.gravity import RATE_IE_E, gravity_e
-from sim.plan_tables import FlightTable
-from sim.site import geodetic_from_e, rot_e_from_ned
+from swath.sim.gravity import RATE_IE_E, gravity_e
+from swath.sim.plan_tables import FlightTable
+from swath.sim.site import geodetic_from_e, rot_e_from_ned
 
 FloatArray = NDArray[np.float64]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sim.errors import PlanError
-from sim.plan import Plan
-from sim.plan_tables import ScannerTable, Tables
-from sim.toml_text import toml_text
+from swath.sim.errors import PlanError
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import ScannerTable, Tables
+from swath.sim.toml_text import toml_text
 
 CONVENTIONS_VERSION = 1
 SPINNING = ("vlp16", "os1")

@@ -1,7 +1,7 @@
 """Rays through the scene, compiled: each pulse on its own, one after the other, on one core.
 
-A ray goes from cell to cell (`sim.cells`) until it meets something hard; in a cell it looks at what the cell lists and
-at the ground. Crowns and wires it meets on the way take their share of its energy and let the rest through.
+A ray goes from cell to cell (`swath.sim.cells`) until it meets something hard; in a cell it looks at what the cell
+lists and at the ground. Crowns and wires it meets on the way take their share of its energy and let the rest through.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.compiled import kernel, whole
-from sim.rays import (
+from swath.sim.compiled import kernel, whole
+from swath.sim.rays import (
     NEVER,
     Ray,
     boundary,
@@ -27,14 +27,14 @@ from sim.rays import (
     uniform,
     wire_passage,
 )
-from sim.shots import GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, WATER, WIRE
+from swath.sim.shots import GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, WATER, WIRE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Pulse = tuple[float, int, int]
 """Time of emission, number, seed of all pulses."""
 Hit = tuple[float, int, float, float]
-"""Distance, index into `sim.shots.SURFACES`, reflectance, cosine of incidence."""
+"""Distance, index into `swath.sim.shots.SURFACES`, reflectance, cosine of incidence."""
 
 THINGS, COVERS = 4, 2  # how many kinds of each there are
 SOLIDS, TREES, WIRES, CARS = range(THINGS)
@@ -79,11 +79,11 @@ class SceneArrays(NamedTuple):
 
     Attributes:
         frame: see there.
-        z: (rows, columns) the ground's nodes (`sim.terrain.Ground`).
+        z: (rows, columns) the ground's nodes (`swath.sim.terrain.Ground`).
         top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
         first: (2, cells + 1) a cell's things are ``item[first[0, c] : first[0, c + 1]]``, its covers those of row 1.
         item: code of an object: where its row begins in ``rows``, times `THINGS` or `COVERS`, plus its kind.
-        rows: the tables of `sim.objects.Things`, one behind the other.
+        rows: the tables of `swath.sim.objects.Things`, one behind the other.
         seed: of leaves and water.
     """
 

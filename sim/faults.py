@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim.clocks import generator
-from sim.errors import PlanError
-from sim.plan import Plan
-from sim.plan_tables import FaultTable, Tables
-from sim.shots import WireUnit
+from swath.sim.clocks import generator
+from swath.sim.errors import PlanError
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import FaultTable, Tables
+from swath.sim.shots import WireUnit
 
 Window = tuple[float, float]
 

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from sim.attitude import coordinated, quaternions_e_from_b
-from sim.envelope import Envelope, Ground, refuse_lines
-from sim.itinerary import route_of
-from sim.plan import Plan
-from sim.plan_tables import Tables
-from sim.route import Route
-from sim.site import Site, geodetic_from_e, rot_e_from_ned
-from sim.smoothing import STEP_S, smoothed, spline_through
-from sim.turbulence import angles_rad, displacement_m
+from swath.sim.attitude import coordinated, quaternions_e_from_b
+from swath.sim.envelope import Envelope, Ground, refuse_lines
+from swath.sim.itinerary import route_of
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import Tables
+from swath.sim.route import Route
+from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
+from swath.sim.smoothing import STEP_S, smoothed, spline_through
+from swath.sim.turbulence import angles_rad, displacement_m
 
 FloatArray = NDArray[np.float64]
 

@@ -9,27 +9,27 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.atmosphere import Air
-from sim.calibration_files import check_latencies
-from sim.clocks import PulsePerSecond, generator
-from sim.companions import control_points_e
-from sim.coverage import corners, refuse_ranges
-from sim.errors import PlanError
-from sim.faults import Window, check_faults, windows, with_faults
-from sim.flight import Trajectory, fly
-from sim.gnss_wire import GnssWire
-from sim.host import HostClock
-from sim.imu_wire import ImuWire
-from sim.inertial import InertialUnit
-from sim.plan import Plan
-from sim.satellites import Receiver
-from sim.scan import Scanner
-from sim.scanners.assembly import head_and_wire
-from sim.scanners.ranging import Ranging
-from sim.scene import build_scene
-from sim.shots import SURFACES, FloatArray, WireUnit
-from sim.site import Site
-from sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, StructArray, TruthWriter
+from swath.sim.atmosphere import Air
+from swath.sim.calibration_files import check_latencies
+from swath.sim.clocks import PulsePerSecond, generator
+from swath.sim.companions import control_points_e
+from swath.sim.coverage import corners, refuse_ranges
+from swath.sim.errors import PlanError
+from swath.sim.faults import Window, check_faults, windows, with_faults
+from swath.sim.flight import Trajectory, fly
+from swath.sim.gnss_wire import GnssWire
+from swath.sim.host import HostClock
+from swath.sim.imu_wire import ImuWire
+from swath.sim.inertial import InertialUnit
+from swath.sim.plan import Plan
+from swath.sim.satellites import Receiver
+from swath.sim.scan import Scanner
+from swath.sim.scanners.assembly import head_and_wire
+from swath.sim.scanners.ranging import Ranging
+from swath.sim.scene import build_scene
+from swath.sim.shots import SURFACES, FloatArray, WireUnit
+from swath.sim.site import Site
+from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, StructArray, TruthWriter
 
 BLOCK_S = 1.0
 

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.site import geodetic_from_e
+from swath.sim.site import geodetic_from_e
 
 FloatArray = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 One sample is four frames: X, Y and Z with specific force and angular rate of that axis, then SAMPLE with the counter at
 the interval's end. The counter at an edge of PPS comes in a message of its own, SYNC. Frames are written by
-`drivers.imu.dbc_encoder` through the very DBC and signal map that the recorder reads them with.
+`swath.drivers.imu.dbc_encoder` through the very DBC and signal map that the recorder reads them with.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import DeviceSettings
-from drivers.imu.dbc_encoder import encode_latch, encode_samples
-from drivers.imu.dbc_settings import map_signals
-from sim.clocks import PulsePerSecond, generator
-from sim.errors import PlanError
-from sim.imu_grades import noise_of
-from sim.inertial import InertialUnit
-from sim.plan_tables import ImuTable
-from sim.shots import WireUnit
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.imu.dbc_encoder import encode_latch, encode_samples
+from swath.drivers.imu.dbc_settings import map_signals
+from swath.sim.clocks import PulsePerSecond, generator
+from swath.sim.errors import PlanError
+from swath.sim.imu_grades import noise_of
+from swath.sim.inertial import InertialUnit
+from swath.sim.plan_tables import ImuTable
+from swath.sim.shots import WireUnit
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -226,7 +226,7 @@ class ImuWire:
 
 
 def _check_counter(table: ImuTable, name: str, jitter_s: float) -> None:
-    """Refuse a counter whose readings cannot be made continuous; see `drivers.imu.counters`.
+    """Refuse a counter whose readings cannot be made continuous; see `swath.drivers.imu.counters`.
 
     Between samples the host's stamps tell how often it has wrapped (to half a wrap: forty mean delays are never
     reached), a latched value is looked for up to seven eighths of a wrap before the sample behind it, one ahead of its

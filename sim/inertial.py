@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from sim.clocks import Oscillator, generator
-from sim.errors import PlanError
-from sim.gravity import EARTH_RATE_RADPS, RATE_IE_E, gravity_e
-from sim.imu_grades import sensor_grades
-from sim.plan_tables import ImuNoiseTable, ImuTable
+from swath.sim.clocks import Oscillator, generator
+from swath.sim.errors import PlanError
+from swath.sim.gravity import EARTH_RATE_RADPS, RATE_IE_E, gravity_e
+from swath.sim.imu_grades import sensor_grades
+from swath.sim.plan_tables import ImuNoiseTable, ImuTable
 
 if TYPE_CHECKING:
-    from sim.flight import Motion, Trajectory
+    from swath.sim.flight import Motion, Trajectory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sim.compiled import kept, kernel
-from sim.flight import Poses
-from sim.plan_tables import ScannerTable
-from sim.shots import FloatArray, Pulses
-from sim.site import Site
+from swath.sim.compiled import kept, kernel
+from swath.sim.flight import Poses
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.shots import FloatArray, Pulses
+from swath.sim.site import Site
 
 Three = tuple[float, float, float]
 

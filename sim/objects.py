@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.clocks import generator
-from sim.plan_terrain import CarTable, ForestTable, RoadTable, WireTable
-from sim.rays import PLANE
-from sim.shots import CAR, ROOF, WALL
-from sim.terrain import Ground, Lake, ups
-from sim.village import ROOFS, Houses
+from swath.sim.clocks import generator
+from swath.sim.plan_terrain import CarTable, ForestTable, RoadTable, WireTable
+from swath.sim.rays import PLANE
+from swath.sim.shots import CAR, ROOF, WALL
+from swath.sim.terrain import Ground, Lake, ups
+from swath.sim.village import ROOFS, Houses
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -10,19 +10,19 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from georef.text_encoding import decoded
-from georef.timescales import gps_ns_from_unix, table_leap_seconds
-from georef.toml_tables import TomlError, toml_tables
-from sim.errors import PlanError
-from sim.plan_tables import Tables
-from sim.toml_text import toml_text
+from swath.georef.text_encoding import decoded
+from swath.georef.timescales import gps_ns_from_unix, table_leap_seconds
+from swath.georef.toml_tables import TomlError, toml_tables
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import Tables
+from swath.sim.toml_text import toml_text
 
 PRESETS = ("small", "calibration", "corridor", "block", "bench")
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan whose keys are all right; whether it can be flown is for `sim.flight` and `sim.scene` to say.
+    """A plan whose keys are all right; whether it can be flown is for `swath.sim.flight` and `swath.sim.scene` to say.
 
     Attributes:
         tables: every key.
@@ -56,7 +56,7 @@ def load_plan(name: str | Path) -> Plan:
     """
     path = Path(name)
     if str(name) in PRESETS and not path.is_file():
-        text = (resources.files("sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+        text = (resources.files("swath.sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
         return parse_plan(text, Path.cwd())
     try:
         text = decoded(path.read_bytes())

@@ -1,7 +1,7 @@
 """Every key of a plan: its type, unit (in the name), bounds and default. Names are those of the configuration.
 
 Positions on the ground are metres east and north of the origin, in the plane that touches the ellipsoid there (the
-site frame of `sim.site`). Heights are ellipsoidal.
+site frame of `swath.sim.site`). Heights are ellipsoidal.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from sim.plan_base import Matrix, Name, NotNegative, Point, Positive, Section, Vector, Wired
-from sim.plan_terrain import TerrainTable
+from swath.sim.plan_base import Matrix, Name, NotNegative, Point, Positive, Section, Vector, Wired
+from swath.sim.plan_terrain import TerrainTable
 
 
 def _identity() -> list[list[float]]:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.compiled import kernel
+from swath.sim.compiled import kernel
 
 FloatArray = NDArray[np.float64]
 Ray = tuple[float, float, float, float, float, float, float, float]

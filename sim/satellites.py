@@ -1,7 +1,7 @@
 """A GNSS receiver: what its solutions say at its epochs, and how far that is from the truth.
 
 Epochs stand at whole multiples of the interval since the plan's start. Errors are local (north, east, down); grades
-and their sizes are in `sim.gnss.grades`. Without noise only what the plan scripts is left: outages and jumps.
+and their sizes are in `swath.sim.gnss.grades`. Without noise only what the plan scripts is left: outages and jumps.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.records import FixType
-from sim.errors import PlanError
-from sim.gnss import grades
-from sim.gnss.noise import Noise
-from sim.plan_tables import GnssTable
-from sim.site import FloatArray, e_from_geodetic, geodetic_from_e, rot_e_from_ned
+from swath.georef.records import FixType
+from swath.sim.errors import PlanError
+from swath.sim.gnss import grades
+from swath.sim.gnss.noise import Noise
+from swath.sim.plan_tables import GnssTable
+from swath.sim.site import FloatArray, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 IntArray = NDArray[np.int64]
 
@@ -26,7 +26,7 @@ VELOCITY_AGE_S = {"novatel": 0.05, "ubx": 0.0, "nmea": 0.0}  # velocity lags its
 
 
 class BodyMotion(Protocol):
-    """The part of `sim.flight.Motion` that an antenna needs."""
+    """The part of `swath.sim.flight.Motion` that an antenna needs."""
 
     @property
     def position_e(self) -> FloatArray: ...
@@ -39,7 +39,7 @@ class BodyMotion(Protocol):
 
 
 class Flown(Protocol):
-    """The part of `sim.flight.Trajectory` that a receiver needs."""
+    """The part of `swath.sim.flight.Trajectory` that a receiver needs."""
 
     @property
     def end_s(self) -> float: ...

@@ -11,16 +11,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sim.atmosphere import Air
-from sim.flight import Trajectory
-from sim.mounting import Beams, Mounting
-from sim.plan_tables import ScannerTable
-from sim.scanners.assembly import Head, Wire
-from sim.scanners.ranging import Ranging
-from sim.scene import Scene
-from sim.shots import Echoes, FloatArray, Pulses, WireUnit
-from sim.site import Site
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.atmosphere import Air
+from swath.sim.flight import Trajectory
+from swath.sim.mounting import Beams, Mounting
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.assembly import Head, Wire
+from swath.sim.scanners.ranging import Ranging
+from swath.sim.scene import Scene
+from swath.sim.shots import Echoes, FloatArray, Pulses, WireUnit
+from swath.sim.site import Site
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 BLOCK_S = 0.25
 EARTH_RADIUS_M = 6_371_000.0

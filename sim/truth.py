@@ -24,7 +24,7 @@ RETURN_TRUTH_DTYPE = np.dtype(
         ("strip", "<i2"),  # index of the flight line, −1 between lines
         ("channel", "<u2"),  # facet or beam
         ("return_number", "u1"),
-        ("surface", "u1"),  # index into sim.shots.SURFACES
+        ("surface", "u1"),  # index into swath.sim.shots.SURFACES
     ]
 )
 POSE_TRUTH_DTYPE = np.dtype(

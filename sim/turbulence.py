@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
-from sim.clocks import generator
-from sim.smoothing import STEP_S
+from swath.sim.clocks import generator
+from swath.sim.smoothing import STEP_S
 
 FloatArray = NDArray[np.float64]
 

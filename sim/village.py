@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.clocks import generator
-from sim.errors import PlanError
-from sim.plan_terrain import BuildingTable, RoadTable, VillageTable
+from swath.sim.clocks import generator
+from swath.sim.errors import PlanError
+from swath.sim.plan_terrain import BuildingTable, RoadTable, VillageTable
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

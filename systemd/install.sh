@@ -67,7 +67,7 @@ install_program() {
     trap 'exit 130' INT
     trap 'exit 143' TERM
     mkdir "$work/swath"
-    for item in pyproject.toml README.md LICENSE calib daemon drivers georef sim; do
+    for item in pyproject.toml README.md LICENSE swath calib daemon drivers georef sim; do
         cp -R "$source/$item" "$work/swath/"
     done
     build_program

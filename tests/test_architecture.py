@@ -11,18 +11,19 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import calib
-import daemon
-import drivers
-import georef
-import sim
+import swath
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = {"daemon": daemon, "drivers": drivers, "georef": georef, "calib": calib, "sim": sim}
+PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
 LARGEST_FILE_BYTES = 2_000_000
 LARGEST_CHECKOUT_BYTES = 60_000_000
-SHARED_OF_GEOREF = {"georef.records", "georef.text_encoding", "georef.timescales", "georef.toml_tables"}
-PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "calib"}
+SHARED_OF_GEOREF = {
+    "swath.georef.records",
+    "swath.georef.text_encoding",
+    "swath.georef.timescales",
+    "swath.georef.toml_tables",
+}
+PROCESSING_ONLY = {"numba", "scipy", "pyproj", "laspy", "matplotlib", "swath.calib"}
 
 
 def project() -> dict[str, Any]:
@@ -42,50 +43,46 @@ def contract(name: str) -> dict[str, Any]:
     return dict(found)
 
 
-def test_top_level_names_are_ours() -> None:
-    """`daemon` and the others are common words: an installed package must not stand before them."""
-    for name, package in PACKAGES.items():
-        assert package.__file__ is not None
-        assert Path(package.__file__) == ROOT / name / "__init__.py"
+def test_the_packages_of_swath_are_links_to_the_folders_beside_it() -> None:
+    assert Path(swath.__file__) == ROOT / "swath/__init__.py"
+    links = {path.name: os.readlink(path) for path in (ROOT / "swath").iterdir() if path.is_symlink()}
+    assert links == {name: f"../{name}" for name in PACKAGES}
 
 
-def test_every_package_is_listed_for_installation() -> None:
-    folders = {
-        str(path.parent.relative_to(ROOT)).replace("/", ".")
-        for name in PACKAGES
-        for path in (ROOT / name).rglob("__init__.py")
-    }
-    assert set(project()["tool"]["setuptools"]["packages"]) == folders
+def test_every_folder_of_modules_is_a_package() -> None:
+    """setuptools installs no other."""
+    folders = {path.parent for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+    assert [str(folder) for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
 
 
 def test_data_files_of_packages_are_listed_for_installation() -> None:
     data = project()["tool"]["setuptools"]["package-data"]
-    listed = {path for name in PACKAGES for pattern in data[name] for path in (ROOT / name).glob(pattern)}
+    listed = {path for name in PACKAGES for pattern in data[f"swath.{name}"] for path in (ROOT / name).glob(pattern)}
     lying = {path for path in tracked() if path.relative_to(ROOT).parts[0] in PACKAGES and path.suffix != ".py"}
     assert lying <= listed, f"not installed: {sorted(str(path) for path in lying - listed)}"
 
 
 def test_sim_is_forbidden_every_module_of_georef_but_the_shared_ones() -> None:
     modules = {
-        f"georef.{path.stem}"
+        f"swath.georef.{path.stem}"
         for path in (ROOT / "georef").iterdir()
         if (path.suffix == ".py" and path.stem != "__init__") or (path / "__init__.py").exists()
     }
     forbidden = set(contract("sim does not share the mathematics it tests")["forbidden_modules"])
-    assert forbidden == (modules - SHARED_OF_GEOREF) | {"calib"}
+    assert forbidden == (modules - SHARED_OF_GEOREF) | {"swath.calib"}
 
 
 def georef_modules_imported(path: Path) -> set[str]:
-    """What a file imports of georef, as ``georef.<module>``."""
+    """What a file imports of georef, as ``swath.georef.<module>``."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module == "georef":
-            found |= {f"georef.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module == "swath.georef":
+            found |= {f"swath.georef.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
-    return {".".join(name.split(".")[:2]) for name in found if name.split(".")[0] == "georef"}
+    return {".".join(name.split(".")[:3]) for name in found if name.startswith("swath.georef.")}
 
 
 def test_drivers_and_the_shared_modules_use_of_georef_only_what_is_shared() -> None:
@@ -121,7 +118,7 @@ def test_modules_stay_readable_in_one_sitting() -> None:
 
 
 def test_every_device_has_a_page() -> None:
-    from drivers.core.registry import KINDS, all_drivers
+    from swath.drivers.core.registry import KINDS, all_drivers
 
     protocols = {protocol for kind in KINDS for protocol in all_drivers(kind)}
     pages = {path.stem for path in (ROOT / "docs/devices").glob("*.md")}
@@ -174,8 +171,8 @@ def test_every_event_is_explained() -> None:
 
 
 def test_the_example_of_a_new_device_is_a_driver() -> None:
-    from drivers.core.parser import DeviceSettings, Driver
-    from georef.records import Chunk
+    from swath.drivers.core.parser import DeviceSettings, Driver
+    from swath.georef.records import Chunk
 
     (example,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/adding-a-device.md").read_text(), re.M | re.S)
     names: dict[str, Any] = {}
@@ -188,40 +185,47 @@ def test_the_example_of_a_new_device_is_a_driver() -> None:
 
 
 def loaded_by(code: str) -> set[str]:
-    """Top-level names of all modules that a new interpreter has after running this."""
+    """Names of all modules, without what stands below packages, that a new interpreter has after running this."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    return {name.partition(".")[0] for name in done.stdout.split()}
+    names = done.stdout.split()
+    return {".".join(name.split(".")[: 2 if name.startswith("swath.") else 1]) for name in names}
 
 
 def test_importing_the_recorder_loads_nothing_of_processing() -> None:
-    loaded = loaded_by("import daemon.run, drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]")
-    assert "daemon" in loaded
-    assert loaded & (PROCESSING_ONLY | {"sim"}) == set()
+    loaded = loaded_by("import swath.daemon.run, swath.drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]")
+    assert "swath.daemon" in loaded
+    assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
 
 def test_importing_the_command_line_loads_nothing_of_processing_or_of_the_virtual_aircraft() -> None:
-    commands = sorted(f"daemon.cli.{path.stem}" for path in (ROOT / "daemon/cli").glob("[a-z]*.py"))
-    assert {"daemon.cli.georef", "daemon.cli.live", "daemon.cli.view", "daemon.cli.warm_up"} <= set(commands)
-    loaded = loaded_by(
-        f"import {', '.join(commands)}, daemon.sim_plans, daemon.sim_log, daemon.sim_wire, daemon.sim_ahead"
-    )
-    assert "daemon" in loaded
-    assert loaded & (PROCESSING_ONLY | {"sim"}) == set()
+    commands = sorted(f"swath.daemon.cli.{path.stem}" for path in (ROOT / "daemon/cli").glob("[a-z]*.py"))
+    assert {
+        "swath.daemon.cli.georef",
+        "swath.daemon.cli.live",
+        "swath.daemon.cli.view",
+        "swath.daemon.cli.warm_up",
+    } <= set(commands)
+    flying = ("sim_plans", "sim_log", "sim_wire", "sim_ahead")
+    loaded = loaded_by(f"import {', '.join([*commands, *(f'swath.daemon.{name}' for name in flying)])}")
+    assert "swath.daemon" in loaded
+    assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
 
 def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
     """And but for them the folder of processing alone is let through the contract that keeps the recorder light."""
     light = contract("the recorder stays light")
-    assert light["source_modules"] == ["daemon", "drivers"]
-    assert {"numba", "scipy", "pyproj", "laspy", "matplotlib", "calib", "sim"} <= set(light["forbidden_modules"])
-    processing = ["calib.**", "georef.**", "laspy", "matplotlib", "numba", "pyproj", "scipy"]
+    assert light["source_modules"] == ["swath.daemon", "swath.drivers"]
+    assert {"numba", "scipy", "pyproj", "laspy", "matplotlib", "swath.calib", "swath.sim"} <= set(
+        light["forbidden_modules"]
+    )
+    processing = ["swath.calib.**", "swath.georef.**", "laspy", "matplotlib", "numba", "pyproj", "scipy"]
     assert light["ignore_imports"] == [
-        "drivers.compiled.rows -> numba",
-        "daemon.sim_plans -> sim.*",
-        "daemon.processing.calibration_plan -> sim.*",
-        "daemon.processing.calibration_plan_page -> sim.*",
-        "daemon.processing.planned_navigation -> sim.*",
-        *(f"daemon.processing.** -> {name}" for name in processing),
+        "swath.drivers.compiled.rows -> numba",
+        "swath.daemon.sim_plans -> swath.sim.*",
+        "swath.daemon.processing.calibration_plan -> swath.sim.*",
+        "swath.daemon.processing.calibration_plan_page -> swath.sim.*",
+        "swath.daemon.processing.planned_navigation -> swath.sim.*",
+        *(f"swath.daemon.processing.** -> {name}" for name in processing),
     ]

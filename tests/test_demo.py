@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from daemon.wire_player import Output, PlayReport
 from demo.proof import Hashed, prove
+from swath.daemon.wire_player import Output, PlayReport
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S
 

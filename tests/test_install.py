@@ -93,23 +93,26 @@ def test_scripts_start_with_the_python_beside_them(installed: Path) -> None:
 
 
 def test_bare_install_imports_all_packages_and_nothing_of_processing(installed: Path) -> None:
-    code = f"import importlib.util as u, {', '.join(PACKAGES)}; print([n for n in {PROCESSING_ONLY} if u.find_spec(n)])"
+    packages = ", ".join(f"swath.{name}" for name in PACKAGES)
+    code = f"import importlib.util as u, {packages}; print([n for n in {PROCESSING_ONLY} if u.find_spec(n)])"
     done = run_installed(installed, "-c", code)
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
 def wants_an_extra(name: str) -> bool:
     """Whether a module imports what only an extra brings: compiled loops, the virtual aircraft, processing."""
-    package, _, module = name.partition(".")
+    _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    return name == "drivers.compiled.rows" or name.startswith(("sim.", "calib.", "daemon.processing."))
+    return name == "swath.drivers.compiled.rows" or name.startswith(
+        ("swath.sim.", "swath.calib.", "swath.daemon.processing.")
+    )
 
 
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
     """All modules are there; all that want no extra import without the extras."""
     names = [
-        str(path.relative_to(ROOT).with_suffix("")).replace("/", ".").removesuffix(".__init__")
+        f"swath.{path.relative_to(ROOT).with_suffix('')}".replace("/", ".").removesuffix(".__init__")
         for package in PACKAGES
         for path in sorted((ROOT / package).rglob("*.py"))
     ]
@@ -124,7 +127,7 @@ def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
 
 
 def test_bare_install_says_what_the_virtual_aircraft_wants(installed: Path, tmp_path: Path) -> None:
-    done = run_installed(installed, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(tmp_path / "small"))
+    done = run_installed(installed, "-m", "swath.daemon.cli.main", "sim", "fly", "small", "-o", str(tmp_path / "small"))
     assert done.returncode == 2
     assert "pip install '.[sim]'" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -132,13 +135,14 @@ def test_bare_install_says_what_the_virtual_aircraft_wants(installed: Path, tmp_
 
 
 def test_presets_are_installed(installed: Path) -> None:
-    code = "from importlib import resources as r; print(sorted(p.name for p in (r.files('sim') / 'presets').iterdir()))"
+    folder = "(importlib.resources.files('swath.sim') / 'presets')"
+    code = f"import importlib.resources; print(sorted(path.name for path in {folder}.iterdir()))"
     done = run_installed(installed, "-c", code)
     assert "'small.toml'" in done.stdout, done.stderr
 
 
 def test_bare_install_lists_its_devices(installed: Path) -> None:
-    done = run_installed(installed, "-m", "daemon.cli.main", "devices", "--json")
+    done = run_installed(installed, "-m", "swath.daemon.cli.main", "devices", "--json")
     assert done.returncode == 0, done.stderr
     assert {"ubx", "novatel", "nmea", "canmod-gps", "srep"} <= {
         row["protocol"] for row in json.loads(done.stdout)["devices"]
@@ -147,7 +151,7 @@ def test_bare_install_lists_its_devices(installed: Path) -> None:
 
 def test_installed_example_configuration_is_valid(installed: Path) -> None:
     done = run_installed(
-        installed, "-m", "daemon.cli.main", "check", "--offline", str(installed / "etc/swath/swath.toml")
+        installed, "-m", "swath.daemon.cli.main", "check", "--offline", str(installed / "etc/swath/swath.toml")
     )
     assert done.returncode == 0, done.stderr
 

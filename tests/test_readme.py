@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from daemon.cli.main import make_app
-from daemon.config import load_config
+from swath.daemon.cli.main import make_app
+from swath.daemon.config import load_config
 from tests.daemon.rig import HANGS_S, Recorder, session_table
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,7 +47,7 @@ def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
 
 def swath(*arguments: str | Path) -> str:
     """`swath` as installed from here."""
-    return run(sys.executable, "-m", "daemon.cli.main", *arguments).stdout
+    return run(sys.executable, "-m", "swath.daemon.cli.main", *arguments).stdout
 
 
 def make_target(name: str, *what_it_runs: str) -> Callable[[Path], None]:
@@ -81,7 +81,15 @@ def run_check_offline(folder: Path) -> None:
 
 def run_check(folder: Path) -> None:
     """The aircraft's devices are not here, nor its clock: each is said to be wrong, and that is exit status 1."""
-    command = [sys.executable, "-m", "daemon.cli.main", "check", "--seconds", "0.2", str(aircraft_of_readme(folder))]
+    command = [
+        sys.executable,
+        "-m",
+        "swath.daemon.cli.main",
+        "check",
+        "--seconds",
+        "0.2",
+        str(aircraft_of_readme(folder)),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode == 1, done.stderr
     assert "/dev/pps0" in done.stdout
@@ -114,7 +122,7 @@ def run_setup(folder: Path) -> None:
 
 def run_doctor(folder: Path) -> None:
     """This computer may well be found wanting: exit status 1, with what mends it."""
-    command = [sys.executable, "-m", "daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "doctor", str(aircraft_of_readme(folder))]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert done.returncode in (0, 1), done.stderr
     assert "receive buffers" in done.stdout

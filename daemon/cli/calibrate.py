@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import (
+from swath.daemon.cli.options import (
     AcceptVerdict,
     ForceCrs,
     ForceTrajectory,
@@ -18,8 +18,8 @@ from daemon.cli.options import (
     TrajectoryPoint,
     TrajectoryWeek,
 )
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
 
 OBSERVE = ("planes", "ties", "markings")
 
@@ -86,16 +86,16 @@ def command(
     is given: the verdict stands in the file all the same.
     """
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
-    from daemon.cli.georef import calibrations_given
-    from daemon.config import load_config
-    from daemon.processing.calibrate_model import file_of, model_of
-    from daemon.processing.calibrate_products import write_products
-    from daemon.processing.calibrate_record import facts_of
-    from daemon.processing.calibrate_run import CalibrateWish, calibrate
-    from daemon.processing.flights import Wish
-    from daemon.processing.flown import TrajectoryWish
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.setup import Options
+    from swath.daemon.cli.georef import calibrations_given
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.calibrate_model import file_of, model_of
+    from swath.daemon.processing.calibrate_products import write_products
+    from swath.daemon.processing.calibrate_record import facts_of
+    from swath.daemon.processing.calibrate_run import CalibrateWish, calibrate
+    from swath.daemon.processing.flights import Wish
+    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.setup import Options
 
     _refuse(output, observe, overwrite=overwrite)
     if facts is not None and report is None:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode
+from swath.daemon.errors import ExitCode
 
 if TYPE_CHECKING:
-    from daemon.check import Report
-    from daemon.config import Config
+    from swath.daemon.check import Report
+    from swath.daemon.config import Config
 
 
 def command(
@@ -22,7 +22,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """Validate CONFIG, then open every device and say of each: opens, bytes, records, time, what is wrong."""
-    from daemon.config import load_config
+    from swath.daemon.config import load_config
 
     loaded = load_config(config)
     if offline:
@@ -41,7 +41,7 @@ def command(
 def _listen(config: Config, seconds: float) -> list[Report]:
     from rich.console import Console
 
-    from daemon.check import check_everything
+    from swath.daemon.check import check_everything
 
     with Console(stderr=True).status(f"listening for {seconds:g} s"):
         return check_everything(config, seconds)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode, one_line
-from daemon.places import DEFAULT_CONFIG
+from swath.daemon.errors import ExitCode, one_line
+from swath.daemon.places import DEFAULT_CONFIG
 
 if TYPE_CHECKING:
-    from daemon.doctor import Finding
+    from swath.daemon.doctor import Finding
 
 
 def command(
@@ -31,8 +31,8 @@ def command(
 
     Exit code 1 when something would cost data.
     """
-    from daemon.config import load_config
-    from daemon.doctor import Verdict, examine
+    from swath.daemon.config import load_config
+    from swath.daemon.doctor import Verdict, examine
 
     path = config if config is not None else DEFAULT_CONFIG if DEFAULT_CONFIG.exists() else None
     loaded = None if path is None else load_config(path)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
-    from daemon.exporting import ExportReport
-    from daemon.log.reader import Session
+    from swath.daemon.exporting import ExportReport
+    from swath.daemon.log.reader import Session
 
 
 def command(
@@ -27,9 +27,9 @@ def command(
     """
     from rich.console import Console
 
-    from daemon.exporting import export_session
-    from daemon.log.format import LogError
-    from daemon.log.reader import open_logs
+    from swath.daemon.exporting import export_session
+    from swath.daemon.log.format import LogError
+    from swath.daemon.log.reader import open_logs
 
     passed_over: list[str] = []
     done: list[tuple[Session, ExportReport]] = []

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.cli.options import (
+from swath.daemon.cli.options import (
     AcceptVerdict,
     ForceCrs,
     ForceTrajectory,
@@ -17,9 +17,9 @@ from daemon.cli.options import (
     TrajectoryPoint,
     TrajectoryWeek,
 )
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
-from daemon.text_files import text_of
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
+from swath.daemon.text_files import text_of
 
 
 def command(
@@ -66,13 +66,13 @@ def command(
     partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
     """
     require_installed("swath georef")
-    from daemon.config import load_config
-    from daemon.processing.flights import Wish
-    from daemon.processing.flown import TrajectoryWish
-    from daemon.processing.products import georeference
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.setup import Options
-    from georef.strips import StripRules
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.flights import Wish
+    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.products import georeference
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.setup import Options
+    from swath.georef.strips import StripRules
 
     wish = Wish(
         logs=logs,
@@ -118,7 +118,7 @@ def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
 
 
 def _scanner_of(text: str, file: Path) -> str:
-    from georef.calibration import CalibrationError, read_calibration
+    from swath.georef.calibration import CalibrationError, read_calibration
 
     try:
         return read_calibration(text, str(file)).scanner
@@ -127,7 +127,7 @@ def _scanner_of(text: str, file: Path) -> str:
 
 
 def _tell(record: dict[str, Any], sidecar: Path, *, as_json: bool) -> None:
-    from daemon.processing.carried_verdict import first_lines, refusal
+    from swath.daemon.processing.carried_verdict import first_lines, refusal
 
     if as_json:
         print(json.dumps(record, indent=2))

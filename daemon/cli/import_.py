@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
-    from daemon.capture_routes import Routes
-    from daemon.captures import Capture
-    from daemon.config import Config
-    from daemon.importing import ImportReport
+    from swath.daemon.capture_routes import Routes
+    from swath.daemon.captures import Capture
+    from swath.daemon.config import Config
+    from swath.daemon.importing import ImportReport
 
 ValueT = TypeVar("ValueT")
 
@@ -50,9 +50,9 @@ def command(
     UDP ports and CAN interfaces of CONFIG say whose the units of a pcap file or candump log are; `--source` says it of
     a serial stream. Exit code 4 when a capture is damaged, 1 when one holds nothing of CONFIG's devices.
     """
-    from daemon.capture_files import Told, find_captures
-    from daemon.capture_routes import Routes
-    from daemon.config import load_config
+    from swath.daemon.capture_files import Told, find_captures
+    from swath.daemon.capture_routes import Routes
+    from swath.daemon.config import load_config
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # what is told of captures stands below
     told = Told(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
@@ -75,9 +75,9 @@ def command(
 def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
     from rich.console import Console
 
-    from daemon.importing import import_captures
-    from daemon.places import take_directory
-    from drivers.transports.base import TransportError
+    from swath.daemon.importing import import_captures
+    from swath.daemon.places import take_directory
+    from swath.drivers.transports.base import TransportError
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # captures are merged: all are open at once

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,9 +26,9 @@ def command(
     """
     from rich.console import Console
 
-    from daemon.log.format import LogError
-    from daemon.log.reader import open_logs
-    from daemon.statistics import session_statistics
+    from swath.daemon.log.format import LogError
+    from swath.daemon.log.reader import open_logs
+    from swath.daemon.statistics import session_statistics
 
     passed_over: list[str] = []
     try:
@@ -65,7 +65,7 @@ def _unaccounted(numbers: dict[str, Any]) -> int:
 def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from daemon.health import clock_text
+    from swath.daemon.health import clock_text
 
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
     console.print(

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daemon.cli.options import AcceptVerdict
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.places import DEFAULT_CONFIG, log_directory
-from daemon.processing.installed import require_installed
+from swath.daemon.cli.options import AcceptVerdict
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.places import DEFAULT_CONFIG, log_directory
+from swath.daemon.processing.installed import require_installed
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
 
-    from daemon.config import Config
-    from daemon.config.tables import LiveConfig
+    from swath.daemon.config import Config
+    from swath.daemon.config.tables import LiveConfig
 
 JOURNAL_S = 60.0  # between two lines for the journal, which has the status beside
 
@@ -69,7 +69,7 @@ def command(
 
 def _told(found: dict[str, Any]) -> None:
     """UserError where the points were made with what is not to be used."""
-    from daemon.processing.carried_verdict import refusal
+    from swath.daemon.processing.carried_verdict import refusal
 
     unusable = refusal(found.get("verdict") or {})
     if unusable:
@@ -108,12 +108,12 @@ def _follow(
     """Until it ends or is stopped; while loops compile, which looks at no list of signals, a signal ends it at once."""
     from rich.console import Console
 
-    from daemon.config import load_config
-    from daemon.config.tables import LiveConfig
-    from daemon.processing.live import Live, be_humble
-    from daemon.processing.setup import Options, Setup
-    from daemon.processing.warm_up import before_compiling, get_ready, warm_up
-    from daemon.sd_notify import ServiceManager
+    from swath.daemon.config import load_config
+    from swath.daemon.config.tables import LiveConfig
+    from swath.daemon.processing.live import Live, be_humble
+    from swath.daemon.processing.setup import Options, Setup
+    from swath.daemon.processing.warm_up import before_compiling, get_ready, warm_up
+    from swath.daemon.sd_notify import ServiceManager
 
     directory = log_directory(where)
     config = None if where.is_dir() else load_config(where)
@@ -179,7 +179,7 @@ def page(found: dict[str, Any]) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    from daemon.processing.live_status import is_well
+    from swath.daemon.processing.live_status import is_well
 
     style = "bold green" if is_well(found) else "bold yellow"
     parts: list[RenderableType] = [Text(found["sentence"], style=style), Text("")]
@@ -208,11 +208,11 @@ def page(found: dict[str, Any]) -> Group:
 def _replay(
     paths: list[Path], output: Path, points: Path | None, *, accept_verdict: bool, as_json: bool
 ) -> dict[str, Any]:
-    from daemon.config import load_config
-    from daemon.log.format import LogError
-    from daemon.log.reader import open_logs
-    from daemon.processing.live import replay
-    from daemon.processing.setup import Options, Setup
+    from swath.daemon.config import load_config
+    from swath.daemon.log.format import LogError
+    from swath.daemon.log.reader import open_logs
+    from swath.daemon.processing.live import replay
+    from swath.daemon.processing.setup import Options, Setup
 
     configs = [path for path in paths if path.suffix == ".toml"]
     passed_over: list[str] = []

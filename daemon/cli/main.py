@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import functools
 import importlib
-import importlib.metadata
 import importlib.util
 import keyword
 import os
@@ -23,8 +22,9 @@ from typing import Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.memory import keep_freed_memory
+from swath import __version__
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.memory import keep_freed_memory
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 PIPE_CLOSED = 141  # 128 + SIGPIPE
@@ -52,7 +52,7 @@ class Listed:
     def module(self) -> str:
         """The file it is in; one that Python has a word for has an underscore behind it."""
         name = self.name.replace("-", "_")
-        return f"daemon.cli.{name}_" if keyword.iskeyword(name) else f"daemon.cli.{name}"
+        return f"swath.daemon.cli.{name}_" if keyword.iskeyword(name) else f"swath.daemon.cli.{name}"
 
 
 COMMANDS = (
@@ -85,7 +85,7 @@ COMMANDS = (
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"swath {importlib.metadata.version('swath')}")
+        print(f"swath {__version__}")
         raise typer.Exit
 
 

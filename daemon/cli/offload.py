@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.places import log_directory
-from daemon.transfer_bar import transfer_bar
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.places import log_directory
+from swath.daemon.transfer_bar import transfer_bar
 
 if TYPE_CHECKING:
-    from daemon.offload import OffloadReport
+    from swath.daemon.offload import OffloadReport
 
 
 def command(
@@ -36,8 +36,8 @@ def command(
     Goes on where an interrupted run ended. A log being recorded is passed over; nothing is deleted or overwritten.
     Exit code 3 when a log could not be copied or DEST is full, 4 when a copy is not what the log holds.
     """
-    from daemon.offload import is_growing, offload
-    from daemon.priority import give_way
+    from swath.daemon.offload import is_growing, offload
+    from swath.daemon.priority import give_way
 
     directory = log_directory(where)
     if any(map(is_growing, directory.glob("*.mcap"))):

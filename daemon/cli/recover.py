@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
-    from daemon.log.recover import RecoveryReport
+    from swath.daemon.log.recover import RecoveryReport
 
 
 def command(
@@ -28,9 +28,9 @@ def command(
     The log itself is never touched. Of a directory, logs that are being recorded and those already recovered are left
     alone. Exit code 4 when damage was found, 3 when a log could not be recovered; the others are all the same.
     """
-    from daemon.log.format import LogError
-    from daemon.log.recover import recover
-    from daemon.priority import give_way
+    from swath.daemon.log.format import LogError
+    from swath.daemon.log.recover import recover
+    from swath.daemon.priority import give_way
 
     if background:
         give_way()
@@ -59,8 +59,8 @@ def command(
 
 def _files(paths: list[Path], output: Path | None) -> list[Path]:
     """The files named, and those of directories that may need it."""
-    from daemon.log.claim import is_being_written
-    from daemon.log.reader import RECOVERED
+    from swath.daemon.log.claim import is_being_written
+    from swath.daemon.log.reader import RECOVERED
 
     files: list[Path] = []
     for path in paths:

@@ -13,8 +13,8 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from daemon.log.reader import Session
-    from daemon.wire_player import Output, PlayReport
+    from swath.daemon.log.reader import Session
+    from swath.daemon.wire_player import Output, PlayReport
 
 
 def command(
@@ -26,10 +26,10 @@ def command(
     """Play a log's bytes back to ptys, CAN and UDP, and its PPS edges into fixed: FIFOs."""
     from rich.console import Console
 
-    from daemon.config import load_config
-    from daemon.errors import ExitCode, UserError
-    from daemon.replay import close_outputs, open_outputs
-    from daemon.wire_player import wait_for_readers
+    from swath.daemon.config import load_config
+    from swath.daemon.errors import ExitCode, UserError
+    from swath.daemon.replay import close_outputs, open_outputs
+    from swath.daemon.wire_player import wait_for_readers
 
     if not 0 < pace < math.inf:
         raise UserError(f"--pace {pace}: must be a number above 0", exit_code=ExitCode.USAGE)
@@ -56,9 +56,9 @@ def command(
 
 
 def _open_sessions(logs: list[Path], console: Console) -> list[Session]:
-    from daemon.errors import ExitCode, UserError, one_line
-    from daemon.log.format import LogError
-    from daemon.log.reader import open_logs
+    from swath.daemon.errors import ExitCode, UserError, one_line
+    from swath.daemon.log.format import LogError
+    from swath.daemon.log.reader import open_logs
 
     left_out: list[str] = []
     try:
@@ -75,8 +75,8 @@ def _play_session(
 ) -> PlayReport:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from daemon.replay import timed_units
-    from daemon.wire_player import play
+    from swath.daemon.replay import timed_units
+    from swath.daemon.wire_player import play
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

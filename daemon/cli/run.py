@@ -12,7 +12,7 @@ import typer
 
 
 def _log_to_stderr() -> None:
-    from daemon.journal import JournalFormatter, JournalHandler
+    from swath.daemon.journal import JournalFormatter, JournalHandler
 
     handler = JournalHandler(sys.stderr.fileno())
     if "JOURNAL_STREAM" in os.environ:
@@ -28,8 +28,8 @@ def command(
     seconds: Annotated[float | None, typer.Option(help="Stop after so many seconds.", min=0.0)] = None,
 ) -> None:
     """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP starts a new part."""
-    from daemon.config import load_config
-    from daemon.run import record
+    from swath.daemon.config import load_config
+    from swath.daemon.run import record
 
     _log_to_stderr()
     raise typer.Exit(int(record(load_config(config), seconds)))

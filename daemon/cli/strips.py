@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
+from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
 
 if TYPE_CHECKING:
-    from daemon.processing.flights import Wish
+    from swath.daemon.processing.flights import Wish
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.05, 100.0
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
@@ -78,11 +78,11 @@ def command(
     be compared; 2 and 3 as ever.
     """
     require_installed("swath strips", *(["matplotlib"] if output else []))
-    from daemon.cli.georef import calibrations_given
-    from daemon.config import load_config
-    from daemon.processing.flights import Wish
-    from daemon.processing.flown import TrajectoryWish
-    from daemon.processing.setup import Options
+    from swath.daemon.cli.georef import calibrations_given
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.flights import Wish
+    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.setup import Options
 
     if cell is not None and not SMALLEST_CELL_M <= cell <= LARGEST_CELL_M:
         wanted = f"{SMALLEST_CELL_M:g} to {LARGEST_CELL_M:g} metres"
@@ -120,8 +120,8 @@ def _compare(
     *,
     as_json: bool,
 ) -> None:
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.strips_run import StripsWish, compare_strips, rules_of
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.strips_run import StripsWish, compare_strips, rules_of
 
     wish = StripsWish(logs.logs, logs, before, rules_of(*cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
@@ -134,10 +134,10 @@ def _compare(
 def _adjust(
     logs: Wish, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
-    from daemon.processing.carried_verdict import refusal
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.strip_adjust_products import write_adjustment
-    from daemon.processing.strip_adjust_run import AdjustWish, correct_strips
+    from swath.daemon.processing.carried_verdict import refusal
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.strip_adjust_products import write_adjustment
+    from swath.daemon.processing.strip_adjust_run import AdjustWish, correct_strips
 
     wish = AdjustWish(logs, folder, control, strip_model, overwrite)
     with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:

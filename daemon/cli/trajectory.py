@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
 
 
 def command(
@@ -56,11 +56,11 @@ def command(
     not to be used: data damaged, parts missing, inputs that do not go together; 2 and 3 when there is none.
     """
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
-    from daemon.config import load_config
-    from daemon.processing.navigate import NavigateWish, arm_of_text, attitude_of_text
-    from daemon.processing.navigation_inputs import INS_USES, InputWish
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.trajectory_run import TrajectoryWish, make_trajectory
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.navigate import NavigateWish, arm_of_text, attitude_of_text
+    from swath.daemon.processing.navigation_inputs import INS_USES, InputWish
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.trajectory_run import TrajectoryWish, make_trajectory
 
     if ins not in INS_USES:
         raise UserError(f'--ins: got "{ins}", want {", ".join(INS_USES)}', ExitCode.USAGE)

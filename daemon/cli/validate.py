@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
-from daemon.text_files import text_of
+from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
+from swath.daemon.text_files import text_of
 
 
 def command(
@@ -62,12 +62,12 @@ def command(
     that was asked for, could be tested; 2 and 3 as ever.
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
-    from daemon.config import load_config
-    from daemon.processing.flights import Wish
-    from daemon.processing.flown import TrajectoryWish
-    from daemon.processing.progress import progress_bar
-    from daemon.processing.setup import Options
-    from daemon.processing.validate_run import ValidateWish, read_file, run_validation
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.flights import Wish
+    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.processing.setup import Options
+    from swath.daemon.processing.validate_run import ValidateWish, read_file, run_validation
 
     if not logs and not past:
         raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.installed import require_installed
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.installed import require_installed
 
 
 def command(
@@ -63,10 +63,10 @@ def _make(
     """Read, draw, write, tell; gives whether a file could be read in part only."""
     from rich.console import Console
 
-    from daemon.processing.json_values import finite
-    from daemon.processing.quicklook import look_at, numbers_of
-    from daemon.processing.quicklook_page import make_page
-    from daemon.processing.quicklook_read import QuickLookError
+    from swath.daemon.processing.json_values import finite
+    from swath.daemon.processing.quicklook import look_at, numbers_of
+    from swath.daemon.processing.quicklook_page import make_page
+    from swath.daemon.processing.quicklook_read import QuickLookError
 
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     first = paths[0]

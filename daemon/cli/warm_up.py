@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.processing.installed import require_installed
+from swath.daemon.processing.installed import require_installed
 
 
 def command(
@@ -21,9 +21,9 @@ def command(
     program and the computer stay the same.
     """
     require_installed("swath warm-up")
-    from daemon.config import load_config
-    from daemon.processing.setup import Options, Setup
-    from daemon.processing.warm_up import warm_up
+    from swath.daemon.config import load_config
+    from swath.daemon.processing.setup import Options, Setup
+    from swath.daemon.processing.warm_up import warm_up
 
     setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
     print(warm_up(setups, calibration=True).text(), flush=True)

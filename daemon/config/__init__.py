@@ -1,8 +1,8 @@
 """The configuration: one TOML file, validated whole before anything starts."""
 
-from daemon.config.config import Config, DeviceEntry, DeviceTable
-from daemon.config.loading import load_config, parse_config
-from daemon.config.tables import (
+from swath.daemon.config.config import Config, DeviceEntry, DeviceTable
+from swath.daemon.config.loading import load_config, parse_config
+from swath.daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,
     CorrectionsConfig,

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.config.tables import ScannerConfig
-from georef.text_encoding import decoded
-from georef.toml_tables import TomlError, toml_tables
+from swath.daemon.config.tables import ScannerConfig
+from swath.georef.text_encoding import decoded
+from swath.georef.toml_tables import TomlError, toml_tables
 
 CONVENTIONS_VERSION = 1
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")

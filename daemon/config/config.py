@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from daemon.config.tables import (
+from swath.daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,
     CalibrationConfig,
@@ -22,10 +22,10 @@ from daemon.config.tables import (
     SessionConfig,
     Tables,
 )
-from drivers.core.parser import DeviceKind, DeviceSettings
+from swath.drivers.core.parser import DeviceKind, DeviceSettings
 
 if TYPE_CHECKING:
-    from drivers.transports.uri import TransportSpec
+    from swath.drivers.transports.uri import TransportSpec
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
@@ -161,7 +161,7 @@ class Config:
 
     def devices(self) -> Iterator[DeviceEntry]:
         """Every device: GNSS, IMU, scanners, corrections, in the order of the file."""
-        from drivers.transports.uri import parse_transport
+        from swath.drivers.transports.uri import parse_transport
 
         for kind, name, table in self.device_tables():
             auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None

@@ -13,12 +13,12 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from daemon.config.checks import check_devices
-from daemon.config.config import Config
-from daemon.config.tables import Tables
-from daemon.errors import ConfigError, ExitCode, UserError
-from georef.text_encoding import decoded
-from georef.toml_tables import TomlError, toml_tables
+from swath.daemon.config.checks import check_devices
+from swath.daemon.config.config import Config
+from swath.daemon.config.tables import Tables
+from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.georef.text_encoding import decoded
+from swath.georef.toml_tables import TomlError, toml_tables
 
 MAX_CONFIG_BYTES = 4 * 1024 * 1024  # no sane configuration is larger; a log given by mistake is not read whole
 _SHOWN_CHARACTERS = 60

@@ -9,16 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from shutil import disk_usage
 
-from daemon.config import Config
-from daemon.doctor import clock, devices, disk, host
-from daemon.doctor.finding import Finding, Tree, Verdict
-from daemon.host_clock import read_clock_discipline
-from daemon.log.claim import is_being_written
-from daemon.parts import read_sign
-from daemon.places import nearest_there
-from drivers.transports.can_link import interface_bitrate
-from drivers.transports.udp_socket import DEFAULT_BUFFER_MB
-from drivers.transports.uri import TransportSpec
+from swath.daemon.config import Config
+from swath.daemon.doctor import clock, devices, disk, host
+from swath.daemon.doctor.finding import Finding, Tree, Verdict
+from swath.daemon.host_clock import read_clock_discipline
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.parts import read_sign
+from swath.daemon.places import nearest_there
+from swath.drivers.transports.can_link import interface_bitrate
+from swath.drivers.transports.udp_socket import DEFAULT_BUFFER_MB
+from swath.drivers.transports.uri import TransportSpec
 
 DEFAULT_DIRECTORY = Path("/var/lib/swath")
 DEFAULT_RESERVE_BYTES = 512e6

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.doctor.finding import Finding, Tree, Verdict, read_text
+from swath.daemon.doctor.finding import Finding, Tree, Verdict, read_text
 
 SERVICE_USER = "swath"
 EDGE_S = 3.0  # without an edge for so long no pulse comes

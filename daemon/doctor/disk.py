@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.doctor.devices import User
-from daemon.doctor.finding import Finding, Tree, Verdict
-from daemon.health import duration_text
-from daemon.places import nearest_there
+from swath.daemon.doctor.devices import User
+from swath.daemon.doctor.finding import Finding, Tree, Verdict
+from swath.daemon.health import duration_text
+from swath.daemon.places import nearest_there
 
 SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
 OTHER_BYTES_PER_S = 0.2e6

@@ -6,7 +6,7 @@ import platform
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from daemon.doctor.finding import Finding, Tree, Verdict, read_text
+from swath.daemon.doctor.finding import Finding, Tree, Verdict, read_text
 
 RMEM_MAX_BYTES = 64 << 20  # what systemd/sysctl/90-swath.conf sets
 FRAGMENTS_BYTES = 32 << 20

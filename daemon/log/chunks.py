@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from mcap import records
 
-from daemon.log.format import ChannelSpec, ChunkClass, LogError
-from daemon.log.scan import OP_CHANNEL, OP_MESSAGE, OP_SCHEMA, Damage, Record, parse_record
-from georef.records import ByteRows, Int64Array
+from swath.daemon.log.format import ChannelSpec, ChunkClass, LogError
+from swath.daemon.log.scan import OP_CHANNEL, OP_MESSAGE, OP_SCHEMA, Damage, Record, parse_record
+from swath.georef.records import ByteRows, Int64Array
 
 TopicFilter = Callable[[str], bool]
 _MESSAGE_HEAD = 31

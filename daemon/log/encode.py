@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from georef.records import ByteRows, Int64Array
+from swath.georef.records import ByteRows, Int64Array
 
 MESSAGE_HEADER_BYTES = 31
 _OP_MESSAGE, _OP_MESSAGE_INDEX = 5, 7

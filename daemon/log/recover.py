@@ -17,13 +17,13 @@ from typing import BinaryIO
 
 from mcap import records
 
-from daemon.log.chunks import chunk_batches, damage_within, take_description
-from daemon.log.claim import claim, is_being_written, stands_at
-from daemon.log.durable import sync_directory
-from daemon.log.encode import encode_raw
-from daemon.log.format import SCHEMAS, SESSION_METADATA, ChannelSpec, LogError
-from daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
-from daemon.log.scan import (
+from swath.daemon.log.chunks import chunk_batches, damage_within, take_description
+from swath.daemon.log.claim import claim, is_being_written, stands_at
+from swath.daemon.log.durable import sync_directory
+from swath.daemon.log.encode import encode_raw
+from swath.daemon.log.format import SCHEMAS, SESSION_METADATA, ChannelSpec, LogError
+from swath.daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
+from swath.daemon.log.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
     OP_CHUNK,
@@ -37,7 +37,7 @@ from daemon.log.scan import (
     scan,
     summary_records,
 )
-from daemon.log.writer import PartWriter, create_exclusively
+from swath.daemon.log.writer import PartWriter, create_exclusively
 
 UNFINISHED = ".part"  # behind the name of a copy that is not whole yet
 

@@ -20,7 +20,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
-from daemon.log.format import MAGIC, LogError
+from swath.daemon.log.format import MAGIC, LogError
 
 # Chunks of ours are 1 MiB and one block: 16 MiB. A stranger's may be larger; beyond this they are refused. Its messages
 # may be as small as 31 bytes, each then an object of several hundred.

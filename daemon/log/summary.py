@@ -10,7 +10,7 @@ from typing import Any
 from mcap import records
 from mcap.data_stream import RecordBuilder
 
-from daemon.log.format import SCHEMA_IDS, SCHEMAS, ChannelSpec
+from swath.daemon.log.format import SCHEMA_IDS, SCHEMAS, ChannelSpec
 
 
 @dataclass(slots=True)

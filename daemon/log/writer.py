@@ -21,10 +21,10 @@ import zstandard
 from fastcrc.crc32 import iso_hdlc as crc32
 from mcap import records
 
-from daemon.log.claim import claim, stands_at
-from daemon.log.durable import begin_writing_out, sync_directory
-from daemon.log.encode import EncodedBlock, message_index
-from daemon.log.format import (
+from swath.daemon.log.claim import claim, stands_at
+from swath.daemon.log.durable import begin_writing_out, sync_directory
+from swath.daemon.log.encode import EncodedBlock, message_index
+from swath.daemon.log.format import (
     CHUNK_BYTES,
     CHUNK_CLASSES,
     CHUNK_OPEN_NS,
@@ -36,7 +36,7 @@ from daemon.log.format import (
     ChunkClass,
     SessionInfo,
 )
-from daemon.log.summary import ChunkPieces, SchemaTable, Summary, record_bytes
+from swath.daemon.log.summary import ChunkPieces, SchemaTable, Summary, record_bytes
 
 _OP_CHUNK, _OP_FOOTER = 6, 2
 WRITE_OUT_BYTES = 8 << 20  # that the disk is given to write at once; a second's worth is too much to wait for

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from calib.parameters import MODELS, Wish
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.model_file import SUFFIX, ModelTables, read_model
-from georef.calibration import PARAMETERS
+from swath.calib.parameters import MODELS, Wish
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.model_file import SUFFIX, ModelTables, read_model
+from swath.georef.calibration import PARAMETERS
 
 FREE, FIXED = "free", "fixed"
 # of keys in files the names here, and SI units a unit of the key
@@ -32,7 +32,7 @@ def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = 
     An option stands above what a file says of the same parameter; that of all scanners also above what it says of one.
 
     Args:
-        model: of `calib.parameters.MODELS`, or a file (`daemon.processing.model_file`).
+        model: of `swath.calib.parameters.MODELS`, or a file (`swath.daemon.processing.model_file`).
         fix, free: keys, with commas between.
         priors: ``KEY=SIGMA``, each in its key's unit; of one that is fixed, how well its value is known.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import hashlib
-import importlib.metadata
 import io
 import json
 import math
@@ -15,31 +14,32 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration_file import CalibrationFileError, Header, calibration_text
-from calib.effects import SeenFrom
-from calib.need import POINT, Need, need_of
-from calib.outcome import Adjusted
-from calib.parameters import ANGLES
-from calib.profile_check import Check
-from calib.record_values import Plain
-from calib.report_input import Finding, ReportInput
-from calib.report_verdict import DEG, Verdict, held_words, judge
-from calib.signatures import signatures
-from calib.strip_cells import StripRules
-from calib.strips import differences
-from calib.validation import Asked, validate
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.calibrate_model import in_words, key_of
-from daemon.processing.calibrate_record import instruments_of
-from daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
-from daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
-from daemon.processing.flights import trajectory_verdicts_of
-from daemon.processing.json_values import finite
-from daemon.processing.navigation_verdict import Level
-from daemon.processing.sidecar import sha256_of
-from daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
-from daemon.processing.trajectory_files import write_whole
-from georef.calibration import INDEX, PARAMETERS
+from swath import __version__
+from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
+from swath.calib.effects import SeenFrom
+from swath.calib.need import POINT, Need, need_of
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import ANGLES
+from swath.calib.profile_check import Check
+from swath.calib.record_values import Plain
+from swath.calib.report_input import Finding, ReportInput
+from swath.calib.report_verdict import DEG, Verdict, held_words, judge
+from swath.calib.signatures import signatures
+from swath.calib.strip_cells import StripRules
+from swath.calib.strips import differences
+from swath.calib.validation import Asked, validate
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.calibrate_model import in_words, key_of
+from swath.daemon.processing.calibrate_record import instruments_of
+from swath.daemon.processing.calibrate_run import OUTCOME, Calibrated, CalibrateWish, paths_of
+from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
+from swath.daemon.processing.flights import trajectory_verdicts_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.navigation_verdict import Level
+from swath.daemon.processing.sidecar import sha256_of
+from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
+from swath.daemon.processing.trajectory_files import write_whole
+from swath.georef.calibration import INDEX, PARAMETERS
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 MAP_CELLS = 400  # across a map of differences
@@ -210,7 +210,7 @@ def _record(
     return {
         "format": "swath.calibration",
         "version": 1,
-        "software": f"swath {importlib.metadata.version('swath')}",
+        "software": f"swath {__version__}",
         "calibrations": {name: header.id for name, header in headers.items()},
         "unknowns": [
             {"name": name, "start": start, "value": value, "sigma": sigma}
@@ -347,9 +347,9 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
     """The page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
-    from calib.record import RecordInput, record_json, record_of, record_xml
-    from calib.report import html, pdf
-    from calib.report_profiles import pictures
+    from swath.calib.record import RecordInput, record_json, record_of, record_xml
+    from swath.calib.report import html, pdf
+    from swath.calib.report_profiles import pictures
 
     report = replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
     files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
@@ -374,7 +374,7 @@ def _npz(arrays: Mapping[str, Any]) -> bytes:
 def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
     air = done.kept.logged[0].setup.config.atmosphere
     return {
-        "Swath": importlib.metadata.version("swath"),
+        "Swath": __version__,
         "model": in_words(wish.model),
         "observed": ", ".join(wish.observe) + (", control" if done.control else ""),
         "trajectory": "; ".join(trajectory.name for trajectory in done.flight.trajectories),

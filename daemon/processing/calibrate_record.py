@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.record import RecordError, told_value
-from calib.record_values import Plain, Value
-from daemon.errors import UserError
-from daemon.processing.calibration_flight import KeptFlight
-from daemon.processing.navigate import Navigated
-from daemon.processing.navigation_series import used_positions
-from daemon.text_files import text_of
-from georef.timescales import SECOND_NS
-from georef.toml_tables import TomlError, key_text, toml_tables
+from swath.calib.record import RecordError, told_value
+from swath.calib.record_values import Plain, Value
+from swath.daemon.errors import UserError
+from swath.daemon.processing.calibration_flight import KeptFlight
+from swath.daemon.processing.navigate import Navigated
+from swath.daemon.processing.navigation_series import used_positions
+from swath.daemon.text_files import text_of
+from swath.georef.timescales import SECOND_NS
+from swath.georef.toml_tables import TomlError, key_text, toml_tables
 
 
 def facts_of(file: Path) -> dict[str, Plain]:

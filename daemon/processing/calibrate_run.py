@@ -1,9 +1,9 @@
 """`swath calibrate`: from the logs of a calibration flight to parameters, their sigmas and the proof.
 
     returns of the strips as measured, and the trajectory's own joint covariance     calibration_flight
-    coarse boresight, so that the same roof is found in every strip                  calib.prealign
-    planes, tie points, control                                                      calib.plane_search, …
-    adjustment, with correspondences found anew until they stay                      calib.adjust
+    coarse boresight, so that the same roof is found in every strip                  swath.calib.prealign
+    planes, tie points, control                                                      swath.calib.plane_search, …
+    adjustment, with correspondences found anew until they stay                      swath.calib.adjust
     height differences of strips, before and after; files, record, report            calibrate_products
 
 All files are made out of sight and put in their place at the end: what looks like a calibration is one.
@@ -17,46 +17,46 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from calib.adjust import adjust
-from calib.control import ControlError, control_planes, in_t, read_control
-from calib.control_doubts import doubts
-from calib.features import ControlPoint, Features
-from calib.flight import Flight, FlightError
-from calib.normals import NormalError
-from calib.outcome import Adjusted
-from calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
-from calib.parameters import Wish as Model
-from calib.picked_points import PickedError
-from calib.picked_points import carried as carried_points
-from calib.plane_given import given_planes
-from calib.plane_matching import rematch
-from calib.plane_returns import limited
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneError, PlaneSettings
-from calib.prealign import PrealignError, PrealignSettings, prealigned
-from calib.profile_check import Check, check
-from calib.record_values import Plain
-from calib.report_input import Finding
-from calib.report_words import number, unknown
-from calib.trajectory_errors import TrajectoryPrior, gauss_markov
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_inputs import PolygonError, rings_of, ties_of
-from daemon.processing.calibration_flight import (
+from swath.calib.adjust import adjust
+from swath.calib.control import ControlError, control_planes, in_t, read_control
+from swath.calib.control_doubts import doubts
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.normals import NormalError
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
+from swath.calib.parameters import Wish as Model
+from swath.calib.picked_points import PickedError
+from swath.calib.picked_points import carried as carried_points
+from swath.calib.plane_given import given_planes
+from swath.calib.plane_matching import rematch
+from swath.calib.plane_returns import limited
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneError, PlaneSettings
+from swath.calib.prealign import PrealignError, PrealignSettings, prealigned
+from swath.calib.profile_check import Check, check
+from swath.calib.record_values import Plain
+from swath.calib.report_input import Finding
+from swath.calib.report_words import number, unknown
+from swath.calib.trajectory_errors import TrajectoryPrior, gauss_markov
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibrate_inputs import PolygonError, rings_of, ties_of
+from swath.daemon.processing.calibration_flight import (
     KeptFlight,
     read_flight,
     refuse_without_noise,
     replaced,
     smoothed_prior,
 )
-from daemon.processing.carried_verdict import told_before
-from daemon.processing.flights import Wish, trajectory_verdicts_of
-from daemon.processing.strips_run import refuse_installations
-from daemon.processing.user_errors import told_in_a_line
-from daemon.text_files import text_of
-from georef.calibration import Calibration
-from georef.mapping import MappingError
-from georef.strips import StripError
-from georef.trajectory import TrajectoryError
+from swath.daemon.processing.carried_verdict import told_before
+from swath.daemon.processing.flights import Wish, trajectory_verdicts_of
+from swath.daemon.processing.strips_run import refuse_installations
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.text_files import text_of
+from swath.georef.calibration import Calibration
+from swath.georef.mapping import MappingError
+from swath.georef.strips import StripError
+from swath.georef.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best
@@ -342,13 +342,13 @@ def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Seq
     """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
     found = [planes]
     if "ties" in wish.observe:
-        from calib.tie_points import find_ties
+        from swath.calib.tie_points import find_ties
 
         found = [find_ties(flight, planes)]
     if points:
         found.append(control_planes(flight, points))
     if "markings" in wish.observe:
-        from calib.markings import find_markings
+        from swath.calib.markings import find_markings
 
         found.append(find_markings(flight))
     return Features.joined(found)

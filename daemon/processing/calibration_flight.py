@@ -1,4 +1,4 @@
-"""From logs to a `calib.flight.Flight`: all returns of the strips, as measured, kept in files that are mapped.
+"""From logs to a `swath.calib.flight.Flight`: all returns of the strips, as measured, kept in files that are mapped.
 
 The first pass and the strips are those of `swath georef`; then each strip is a job, whose returns are kept as they came
 beside their points in t.
@@ -16,28 +16,28 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Head, Swath, Tangent
-from calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
-from daemon.config.config import Config
-from daemon.config.tables import ScannerConfig
-from daemon.errors import UserError
-from daemon.processing.feed import LogFeed
-from daemon.processing.flights import Flight as LoggedFlight
-from daemon.processing.flights import Wish, note_times, read_flights
-from daemon.processing.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
-from daemon.processing.models import motion_of
-from daemon.processing.workers import run_jobs
-from georef.calibration import Calibration
-from georef.georeference import Georeferencer
-from georef.points import ByteArray, Fate, Points
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
-from georef.stream import GivenMotion
-from georef.strips import Segment, segments
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
+from swath.daemon.config.config import Config
+from swath.daemon.config.tables import ScannerConfig
+from swath.daemon.errors import UserError
+from swath.daemon.processing.feed import LogFeed
+from swath.daemon.processing.flights import Flight as LoggedFlight
+from swath.daemon.processing.flights import Wish, note_times, read_flights
+from swath.daemon.processing.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
+from swath.daemon.processing.models import motion_of
+from swath.daemon.processing.workers import run_jobs
+from swath.georef.calibration import Calibration
+from swath.georef.georeference import Georeferencer
+from swath.georef.points import ByteArray, Fate, Points
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.stream import GivenMotion
+from swath.georef.strips import Segment, segments
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 
 if TYPE_CHECKING:
-    from georef.navigation.cross_covariance import ErrorChain
+    from swath.georef.navigation.cross_covariance import ErrorChain
 
 KNOT_S = 0.2  # between knots of the trajectory's errors
 TRAJECTORY_MARGIN_NS = 2_000_000_000

@@ -10,29 +10,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint, Features
-from calib.flight import Flight, FlightError, Head, Tangent
-from calib.normals import NormalError
-from calib.observability import RULES_OF_ALL
-from calib.outcome import Held
-from calib.parameters import ParameterError, Wish
-from calib.plan import Line, Predicted, Scan, Surface, planned, predict
-from calib.trajectory_errors import gauss_markov
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.processing.calibrate_model import of_parameters, tables_in_words
-from daemon.processing.calibrate_run import EVERY, PLANES
-from daemon.processing.planned_navigation import navigated
-from georef.beams import LineGeometry
-from georef.calibration import PARAMETERS, read_calibration
-from georef.navigation.inputs import NavigationError
-from georef.rotations import quaternion_from_rot
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
-from sim.calibration_files import calibration_text
-from sim.coverage import Survey, control_points, fan_of
-from sim.plan import Plan
-from sim.shots import GROUND, MARKING, ROAD, ROOF
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError, Head, Tangent
+from swath.calib.normals import NormalError
+from swath.calib.observability import RULES_OF_ALL
+from swath.calib.outcome import Held
+from swath.calib.parameters import ParameterError, Wish
+from swath.calib.plan import Line, Predicted, Scan, Surface, planned, predict
+from swath.calib.trajectory_errors import gauss_markov
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.calibrate_model import of_parameters, tables_in_words
+from swath.daemon.processing.calibrate_run import EVERY, PLANES
+from swath.daemon.processing.planned_navigation import navigated
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import PARAMETERS, read_calibration
+from swath.georef.navigation.inputs import NavigationError
+from swath.georef.rotations import quaternion_from_rot
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
+from swath.sim.calibration_files import calibration_text
+from swath.sim.coverage import Survey, control_points, fan_of
+from swath.sim.plan import Plan
+from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 
 FloatArray = NDArray[np.float64]
 

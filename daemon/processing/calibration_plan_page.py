@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibration_plan import PlannedCalibration
-from sim.picture_map import INK, MUTED, draw_map
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration_plan import PlannedCalibration
+from swath.sim.picture_map import INK, MUTED, draw_map
 
 FloatArray = NDArray[np.float64]
 

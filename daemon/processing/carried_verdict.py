@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.navigation_figures import figures_of
-from daemon.processing.navigation_series import Flight, separation_of
-from daemon.processing.navigation_verdict import Level, judge
-from georef.calibration import INDEX
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.navigation_figures import figures_of
+from swath.daemon.processing.navigation_series import Flight, separation_of
+from swath.daemon.processing.navigation_verdict import Level, judge
+from swath.georef.calibration import INDEX
 
 if TYPE_CHECKING:
-    from daemon.processing.navigate import Navigated
-    from daemon.processing.setup import Setup
-    from georef.calibration import Calibration
-    from georef.trajectory import Trajectory
+    from swath.daemon.processing.navigate import Navigated
+    from swath.daemon.processing.setup import Setup
+    from swath.georef.calibration import Calibration
+    from swath.georef.trajectory import Trajectory
 
 LEVELS = {level.words: level for level in Level}
 OF_TRAJECTORY, OF_POINTS = "swath.trajectory", "swath.georef"  # formats of summaries and sidecars

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.navigation_inputs import Mark
-from georef.points import Fate
-from georef.trajectory import Trajectory
+from swath.daemon.processing.navigation_inputs import Mark
+from swath.georef.points import Fate
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.log.chunks import LogBatch, json_objects
-from daemon.log.reader import Session
-from daemon.processing.models import connect
-from daemon.processing.setup import Setup
-from daemon.replay import source_of_topic
-from drivers.core.parser import Parser
-from georef.mount import AngleSeries, MountError
-from georef.points import Points
-from georef.records import (
+from swath.daemon.log.chunks import LogBatch, json_objects
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.models import connect
+from swath.daemon.processing.setup import Setup
+from swath.daemon.replay import source_of_topic
+from swath.drivers.core.parser import Parser
+from swath.georef.mount import AngleSeries, MountError
+from swath.georef.points import Points
+from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
     ChunkBatch,
@@ -40,12 +40,12 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.stream import CONTEXT_FLAG, Stream, StreamSettings
-from georef.stream_clocks import FrozenClocks, HostClocks
-from georef.trajectory_buffer import SOLUTION_STATUS
+from swath.georef.stream import CONTEXT_FLAG, Stream, StreamSettings
+from swath.georef.stream_clocks import FrozenClocks, HostClocks
+from swath.georef.trajectory_buffer import SOLUTION_STATUS
 
 if TYPE_CHECKING:
-    from daemon.processing.navigator import Navigator
+    from swath.daemon.processing.navigator import Navigator
 
 TICK_NS = 200_000_000
 TICK_BYTES = 32 << 20

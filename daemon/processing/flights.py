@@ -10,33 +10,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daemon.errors import ConfigError, ExitCode, UserError
-from daemon.log.reader import Session, open_logs
-from daemon.processing import refusals
-from daemon.processing.carried_verdict import (
+from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing import refusals
+from swath.daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
     file_verdicts,
     navigated_verdicts,
     verdict_entry,
 )
-from daemon.processing.feed import LogClocks, read_clocks
-from daemon.processing.flown import TrajectoryWish, choose_trajectory
-from daemon.processing.head_clocks import find_stamps, stamp_lines
-from daemon.processing.log_index import Listening, LogIndex, index_log
-from daemon.processing.setup import Options, Setup
-from daemon.processing.workers import refuse_in_import
-from daemon.text_files import text_of
-from georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
-from georef.trajectory import Trajectory
+from swath.daemon.processing.feed import LogClocks, read_clocks
+from swath.daemon.processing.flown import TrajectoryWish, choose_trajectory
+from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
+from swath.daemon.processing.log_index import Listening, LogIndex, index_log
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.workers import refuse_in_import
+from swath.daemon.text_files import text_of
+from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
+from swath.georef.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daemon.config.config import Config
-    from daemon.processing.jobs import JobResult
-    from daemon.processing.navigate import Navigated
-    from georef.timescales import ClockStatus
+    from swath.daemon.config.config import Config
+    from swath.daemon.processing.jobs import JobResult
+    from swath.daemon.processing.navigate import Navigated
+    from swath.georef.timescales import ClockStatus
 
     Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 

@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.given_trajectory import Given, judge_given, points_of
-from daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
-from daemon.processing.trajectory_files import smrmsg_beside
-from georef.formats.trajectory_file import read_trajectory
-from georef.stream_path import SHORTEST_TRAJECTORY
-from georef.trajectory import Trajectory, TrajectoryError
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.given_trajectory import Given, judge_given, points_of
+from swath.daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
+from swath.daemon.processing.trajectory_files import smrmsg_beside
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.stream_path import SHORTEST_TRAJECTORY
+from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
-    from daemon.log.reader import Session
-    from daemon.processing.feed import LogClocks
-    from daemon.processing.navigate import Navigated
-    from daemon.processing.setup import Setup
+    from swath.daemon.log.reader import Session
+    from swath.daemon.processing.feed import LogClocks
+    from swath.daemon.processing.navigate import Navigated
+    from swath.daemon.processing.setup import Setup
 
 Vector = tuple[float, float, float]
 FROM_LOG = "INS solution in the log"
@@ -58,7 +58,7 @@ class Chosen:
     Attributes:
         trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
         doubts: about it, a line each.
-        solutions: of the device's INS, by what became of them (`georef.trajectory_buffer`); none of a file.
+        solutions: of the device's INS, by what became of them (`swath.georef.trajectory_buffer`); none of a file.
         navigated: what it was smoothed from; None: it comes from elsewhere.
     """
 
@@ -150,8 +150,8 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
 
 def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
     """Smoothed from IMU and GNSS."""
-    from daemon.processing.navigate import NavigateWish, navigate_session
-    from daemon.processing.navigation_inputs import InputWish
+    from swath.daemon.processing.navigate import NavigateWish, navigate_session
+    from swath.daemon.processing.navigation_inputs import InputWish
 
     log = session.parts[0].path
     if setup.imu_source is None or not setup.config.gnss:

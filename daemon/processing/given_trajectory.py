@@ -11,20 +11,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.navigation_observations import fix_observations, gps_times
-from georef.agreement import MUCH_BETTER, Apart, apart_from_fixes, compare_motion, heading_offset, time_that_explains
-from georef.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
-from georef.earth import e_from_geodetic, geodetic_from_e
-from georef.navigation.inputs import Kind
-from georef.records import StructArray
-from georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_from_gps
+from swath.daemon.processing.navigation_observations import fix_observations, gps_times
+from swath.georef.agreement import (
+    MUCH_BETTER,
+    Apart,
+    apart_from_fixes,
+    compare_motion,
+    heading_offset,
+    time_that_explains,
+)
+from swath.georef.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
+from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.navigation.inputs import Kind
+from swath.georef.records import StructArray
+from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_from_gps
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from daemon.processing.feed import LogClocks
-    from daemon.processing.setup import Setup
-    from georef.trajectory import Trajectory
+    from swath.daemon.processing.feed import LogClocks
+    from swath.daemon.processing.setup import Setup
+    from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

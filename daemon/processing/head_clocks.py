@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.log.reader import PartDamage
-from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
-from daemon.replay import source_of_topic
-from georef.records import (
+from swath.daemon.log.reader import PartDamage
+from swath.daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from swath.daemon.replay import source_of_topic
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     ChunkBatch,
     DeviceClockSamples,
@@ -26,8 +26,8 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.stream_clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
-from georef.timescales import (
+from swath.georef.stream_clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
+from swath.georef.timescales import (
     SECOND_NS,
     Stamps,
     StampScale,
@@ -36,12 +36,12 @@ from georef.timescales import (
     table_leap_seconds,
     utc_from_gps,
 )
-from georef.timescales.coarse import SETTLED_SPAN_NS
-from georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
-from georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
+from swath.georef.timescales.coarse import SETTLED_SPAN_NS
+from swath.georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
+from swath.georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 
 if TYPE_CHECKING:
-    from daemon.processing.setup import Setup
+    from swath.daemon.processing.setup import Setup
 
 LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
 PIECES = 12

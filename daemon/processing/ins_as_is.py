@@ -6,17 +6,17 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daemon.errors import UserError
-from daemon.processing.feed import read_clocks
-from daemon.processing.navigation_log import session_holes
-from daemon.processing.navigation_sources import config_of_log, files_of, without_scanners
-from daemon.processing.setup import Options, Setup
-from georef.trajectory import Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.daemon.errors import UserError
+from swath.daemon.processing.feed import read_clocks
+from swath.daemon.processing.navigation_log import session_holes
+from swath.daemon.processing.navigation_sources import config_of_log, files_of, without_scanners
+from swath.daemon.processing.setup import Options, Setup
+from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
-    from daemon.config.config import Config
-    from daemon.log.reader import Session
+    from swath.daemon.config.config import Config
+    from swath.daemon.log.reader import Session
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 
-from daemon.errors import ExitCode, UserError
-from drivers.core.extras import how_to_install
+from swath.daemon.errors import ExitCode, UserError
+from swath.drivers.core.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
 EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it

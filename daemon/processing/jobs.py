@@ -20,23 +20,23 @@ from typing import BinaryIO, Protocol
 import lazrs
 import numpy as np
 
-from daemon.log.chunks import LogBatch
-from daemon.log.reader import PartDamage
-from daemon.processing.dropped import Dropped
-from daemon.processing.feed import LogFeed
-from daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
-from daemon.processing.setup import Setup
-from daemon.processing.unread import Unread
-from daemon.replay import source_of_topic
-from georef.earth import geodetic_from_e
-from georef.formats.copc import CopcWriter
-from georef.formats.las import Clipped, LasError, LasSettings, LasWriter
-from georef.mapping import MappingError
-from georef.points import Fate, Points
-from georef.records import ChunkBatch, ScannerReturns
-from georef.stream_clocks import FrozenClocks
-from georef.strips import Segment
-from georef.trajectory import Trajectory
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.reader import PartDamage
+from swath.daemon.processing.dropped import Dropped
+from swath.daemon.processing.feed import LogFeed
+from swath.daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from swath.daemon.processing.setup import Setup
+from swath.daemon.processing.unread import Unread
+from swath.daemon.replay import source_of_topic
+from swath.georef.earth import geodetic_from_e
+from swath.georef.formats.copc import CopcWriter
+from swath.georef.formats.las import Clipped, LasError, LasSettings, LasWriter
+from swath.georef.mapping import MappingError
+from swath.georef.points import Fate, Points
+from swath.georef.records import ChunkBatch, ScannerReturns
+from swath.georef.stream_clocks import FrozenClocks
+from swath.georef.strips import Segment
+from swath.georef.trajectory import Trajectory
 
 MARGIN_NS = 5_000_000_000  # of log time read on either side: edges a device latched, revolutions, pulses in air
 BETWEEN_STRIPS = "between_strips"

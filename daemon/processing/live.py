@@ -13,21 +13,21 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from daemon.config.tables import LiveConfig
-from daemon.errors import ExitCode, UserError, one_line
-from daemon.log.chunks import LogBatch
-from daemon.log.format import SessionInfo
-from daemon.log.reader import Session
-from daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
-from daemon.processing.feed import LogFeed, Placed
-from daemon.processing.live_follow import LiveFollower, Skipped
-from daemon.processing.live_points import PointsFile
-from daemon.processing.live_products import LiveProducts, Room
-from daemon.processing.live_status import LiveStatus, sentence, write_status
-from daemon.processing.setup import Options, Setup
-from daemon.run import read_boot_id
-from georef.records import StructArray
-from georef.trajectory import Trajectory
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
+from swath.daemon.processing.feed import LogFeed, Placed
+from swath.daemon.processing.live_follow import LiveFollower, Skipped
+from swath.daemon.processing.live_points import PointsFile
+from swath.daemon.processing.live_products import LiveProducts, Room
+from swath.daemon.processing.live_status import LiveStatus, sentence, write_status
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.run import read_boot_id
+from swath.georef.records import StructArray
+from swath.georef.trajectory import Trajectory
 
 FOLDER = "live"  # in the log directory
 POLL_S = 0.05

@@ -16,12 +16,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.log.chunks import LogBatch
-from daemon.log.claim import is_being_written
-from daemon.log.follow import PartFollower
-from daemon.log.format import LogError
-from daemon.log.scan import OP_CHUNK, OP_DATA_END, OP_MESSAGE_INDEX, next_chunk
-from daemon.parts import Sign, read_sign
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.follow import PartFollower
+from swath.daemon.log.format import LogError
+from swath.daemon.log.scan import OP_CHUNK, OP_DATA_END, OP_MESSAGE_INDEX, next_chunk
+from swath.daemon.parts import Sign, read_sign
 
 BEHIND_NS = 5_000_000_000  # more than this behind the end of the log, and scanners' chunks are passed over
 WARM_NS = 120_000_000_000  # of what lies before a late start: enough for clocks to lock and a trajectory to begin

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from daemon.processing.live_mcap import CLOUD_DTYPE
-from georef.compiled import kept
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.kernels.rotations import rot_of
-from georef.points import Points
+from swath.daemon.processing.live_mcap import CLOUD_DTYPE
+from swath.georef.compiled import kept
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.kernels.rotations import rot_of
+from swath.georef.points import Points
 
 FloatArray = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _ENU_SIGNS = np.array([1.0, 1.0, -1.0])
 
 
 class Maps(Protocol):
-    """`georef.mapping.Mapping`, as far as it is wanted here."""
+    """`swath.georef.mapping.Mapping`, as far as it is wanted here."""
 
     @property
     def unit_m(self) -> FloatArray:

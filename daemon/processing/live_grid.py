@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept
+from swath.georef.compiled import kept
 
 TILE = 256  # cells along a side
 _TILE_BITS = 8

@@ -8,8 +8,8 @@ from typing import IO
 
 import numpy as np
 
-from daemon.processing.live_products import Room
-from georef.points import Points
+from swath.daemon.processing.live_products import Room
+from swath.georef.points import Points
 
 POINT_DTYPE = np.dtype(
     [

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config.tables import LiveConfig
-from daemon.processing.live_frame import LocalFrame, Maps
-from daemon.processing.live_grid import CountGrid
-from daemon.processing.live_mcap import NAME, LiveMcap, LivePose
-from georef.compiled import kept
-from georef.earth import geodetic_from_e
-from georef.points import Points
-from georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
-from georef.trajectory import Trajectory
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.processing.live_frame import LocalFrame, Maps
+from swath.daemon.processing.live_grid import CountGrid
+from swath.daemon.processing.live_mcap import NAME, LiveMcap, LivePose
+from swath.georef.compiled import kept
+from swath.georef.earth import geodetic_from_e
+from swath.georef.points import Points
+from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
+from swath.georef.trajectory import Trajectory
 
 POSE_NS = 100_000_000  # between two poses
 ROOM_AGAIN = 1.05  # of the free space at which writing stopped: where it begins again

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.log.chunks import LogBatch
-from daemon.processing.carried_verdict import first_lines
-from daemon.processing.live_follow import BEHIND_NS, LiveFollower
-from daemon.processing.live_products import LiveProducts, replace_file
-from daemon.processing.refusals import time_trouble
-from daemon.processing.setup import Setup
-from daemon.replay import source_of_topic
-from georef.points import FATE_NAMES
-from georef.stream import Stream
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.processing.carried_verdict import first_lines
+from swath.daemon.processing.live_follow import BEHIND_NS, LiveFollower
+from swath.daemon.processing.live_products import LiveProducts, replace_file
+from swath.daemon.processing.refusals import time_trouble
+from swath.daemon.processing.setup import Setup
+from swath.daemon.replay import source_of_topic
+from swath.georef.points import FATE_NAMES
+from swath.georef.stream import Stream
 
 STATUS = "live.json"
 WINDOW_S = 10.0  # of which latencies are told

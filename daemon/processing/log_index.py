@@ -16,10 +16,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from mcap import records
 
-from daemon.log.chunks import LogBatch, TopicFilter, chunk_batches, damage_within, json_objects, take_description
-from daemon.log.format import ChannelSpec, LogError
-from daemon.log.reader import PartDamage, Session
-from daemon.log.scan import (
+from swath.daemon.log.chunks import LogBatch, TopicFilter, chunk_batches, damage_within, json_objects, take_description
+from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.reader import PartDamage, Session
+from swath.daemon.log.scan import (
     OP_CHANNEL,
     OP_CHUNK,
     OP_SCHEMA,
@@ -31,7 +31,7 @@ from daemon.log.scan import (
     summary_records,
     unpack_chunk,
 )
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 OP_CHUNK_INDEX = 8
 _RECORD_HEAD_BYTES = 9

@@ -21,12 +21,12 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.config.loading import describe, shown
-from daemon.config.tables import Section
-from daemon.errors import ConfigError
-from daemon.text_files import text_of
-from georef.calibration import MOST, PARAMETERS
-from georef.toml_tables import TomlError, toml_tables
+from swath.daemon.config.loading import describe, shown
+from swath.daemon.config.tables import Section
+from swath.daemon.errors import ConfigError
+from swath.daemon.text_files import text_of
+from swath.georef.calibration import MOST, PARAMETERS
+from swath.georef.toml_tables import TomlError, toml_tables
 
 SUFFIX = ".toml"
 PRIOR = "prior"

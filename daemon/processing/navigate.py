@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.reader import Session
-from daemon.processing.ins_point import point_doubts
-from daemon.processing.mapped_storage import MappedStorage
-from daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
-from daemon.processing.navigation_sources import noise_of
-from daemon.processing.navigation_times import Stretch
-from georef.navigation.inputs import (
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.ins_point import point_doubts
+from swath.daemon.processing.mapped_storage import MappedStorage
+from swath.daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from swath.daemon.processing.navigation_sources import noise_of
+from swath.daemon.processing.navigation_times import Stretch
+from swath.georef.navigation.inputs import (
     GRADES,
     OBSERVATION_DTYPE,
     Kind,
@@ -25,15 +25,15 @@ from georef.navigation.inputs import (
     Solution,
     sort_observations,
 )
-from georef.navigation.stores import IN_MEMORY, Storage
-from georef.records import FixType, StructArray
-from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.navigation.stores import IN_MEMORY, Storage
+from swath.georef.records import FixType, StructArray
+from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 if TYPE_CHECKING:
-    from georef.navigation.diagnosis import Finding
-    from georef.navigation.inputs import Setup, Start
-    from georef.navigation.solve import Solved
+    from swath.georef.navigation.diagnosis import Finding
+    from swath.georef.navigation.inputs import Setup, Start
+    from swath.georef.navigation.solve import Solved
 
 FloatArray = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
@@ -186,12 +186,12 @@ def navigate_inputs(
 
 
 def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: Storage) -> NavigatedLeg:
-    from georef.navigation.alignment import align
-    from georef.navigation.diagnosis import diagnose
-    from georef.navigation.earlier_start import earlier_start
-    from georef.navigation.solve import solve, stretch_of
-    from georef.navigation.stillness import with_still_seconds
-    from georef.navigation.unit_noise import noise_findings
+    from swath.georef.navigation.alignment import align
+    from swath.georef.navigation.diagnosis import diagnose
+    from swath.georef.navigation.earlier_start import earlier_start
+    from swath.georef.navigation.solve import solve, stretch_of
+    from swath.georef.navigation.stillness import with_still_seconds
+    from swath.georef.navigation.unit_noise import noise_findings
 
     rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
     start = align(leg.inertial, rows, inputs.setup)
@@ -211,7 +211,7 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: 
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
     """What is wrong with a leg's data that gave no start."""
-    from georef.navigation.diagnosis import diagnose
+    from swath.georef.navigation.diagnosis import diagnose
 
     found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
     return [f"{inputs.log}: {finding.text}" for finding in found]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.navigation_series import (
+from swath.daemon.processing.navigation_series import (
     GAP_INTERVALS,
     USED,
     Flight,
@@ -16,9 +16,9 @@ from daemon.processing.navigation_series import (
     outages_of,
     used_positions,
 )
-from georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Setup, Solution
-from georef.records import FixType, StructArray
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Setup, Solution
+from swath.georef.records import FixType, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 Figures = dict[str, Any]

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.navigation_doubts import (
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.navigation_doubts import (
     TIME_IS_KNOWN_S,
     height_findings,
     input_doubts,
@@ -20,8 +20,8 @@ from daemon.processing.navigation_doubts import (
     refuse_elsewhere,
     refuse_nothing,
 )
-from daemon.processing.navigation_log import NavigationLog, read_navigation_log, session_holes
-from daemon.processing.navigation_observations import (
+from swath.daemon.processing.navigation_log import NavigationLog, read_navigation_log, session_holes
+from swath.daemon.processing.navigation_observations import (
     Observed,
     fix_observations,
     gps_times,
@@ -30,26 +30,26 @@ from daemon.processing.navigation_observations import (
     ins_observations,
     joined,
 )
-from daemon.processing.navigation_sources import NavigationSources, config_of_log, files_of
-from daemon.processing.navigation_times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
-from daemon.processing.outside_positions import (
+from swath.daemon.processing.navigation_sources import NavigationSources, config_of_log, files_of
+from swath.daemon.processing.navigation_times import LEAST_HOLE_S, ImuTimes, Stretch, imu_times, stretches
+from swath.daemon.processing.outside_positions import (
     OutsidePositions,
     outside_observations,
     refuse_shifted,
     refuse_unreadable,
 )
-from daemon.processing.refusals import refuse_no_time
-from georef.navigation.diagnosis_data import Finding
-from georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
-from georef.navigation.samples import Sampler
-from georef.navigation.stores import IN_MEMORY, Storage
-from georef.records import EventMark, GnssFix, GnssHeading, StructArray, TimeTag
-from georef.timescales import SECOND_NS
-from georef.trajectory_buffer import SOLUTION_STATUS
+from swath.daemon.processing.refusals import refuse_no_time
+from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
+from swath.georef.navigation.samples import Sampler
+from swath.georef.navigation.stores import IN_MEMORY, Storage
+from swath.georef.records import EventMark, GnssFix, GnssHeading, StructArray, TimeTag
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory_buffer import SOLUTION_STATUS
 
 if TYPE_CHECKING:
-    from daemon.config.config import Config
-    from daemon.log.reader import Session
+    from swath.daemon.config.config import Config
+    from swath.daemon.log.reader import Session
 
 ROWS_AT_ONCE = 1 << 16
 MIN_LEG_S = 10.0  # shorter pieces between gaps of the IMU are not navigated

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daemon.log.reader import Session
-from daemon.processing.feed import edges_of, readings_of
-from daemon.processing.log_index import SCANNER, Listening
-from daemon.processing.unread import refused_by
-from daemon.replay import source_of_topic
-from drivers.core.parser import PacketParser
-from georef.records import (
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.feed import edges_of, readings_of
+from swath.daemon.processing.log_index import SCANNER, Listening
+from swath.daemon.processing.unread import refused_by
+from swath.daemon.replay import source_of_topic
+from swath.drivers.core.parser import PacketParser
+from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
     ChunkBatch,
@@ -27,11 +27,11 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.stream_clocks import HostClocks
+from swath.georef.stream_clocks import HostClocks
 
 if TYPE_CHECKING:
-    from daemon.log.chunks import LogBatch
-    from daemon.processing.navigation_sources import NavigationSources
+    from swath.daemon.log.chunks import LogBatch
+    from swath.daemon.processing.navigation_sources import NavigationSources
 
 
 @dataclass(slots=True)

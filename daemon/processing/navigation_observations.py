@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import e_from_geodetic
-from georef.navigation.alignment_noise import white_factor
-from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
-from georef.stream_clocks import HostClocks
-from georef.timescales import complete_time
+from swath.georef.earth import e_from_geodetic
+from swath.georef.navigation.alignment_noise import white_factor
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
+from swath.georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
+from swath.georef.stream_clocks import HostClocks
+from swath.georef.timescales import complete_time
 
 FloatArray = NDArray[np.float64]
 

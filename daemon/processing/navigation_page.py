@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures, figures_of
-from daemon.processing.navigation_plots import (
+from swath.daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures, figures_of
+from swath.daemon.processing.navigation_plots import (
     draw_attitude,
     draw_attitude_separation,
     draw_attitude_sigma,
@@ -27,12 +27,12 @@ from daemon.processing.navigation_plots import (
     draw_time_offset,
     draw_velocity_sigma,
 )
-from daemon.processing.navigation_series import Flight, course_of, separation_of
-from daemon.processing.navigation_sheet import NARROW, WIDE, Drawn, Format
-from daemon.processing.navigation_verdict import Found, Level, Verdict, judge
-from daemon.processing.quicklook_maps import thousands
-from daemon.processing.quicklook_page import STYLE
-from georef.trajectory import gps_text
+from swath.daemon.processing.navigation_series import Flight, course_of, separation_of
+from swath.daemon.processing.navigation_sheet import NARROW, WIDE, Drawn, Format
+from swath.daemon.processing.navigation_verdict import Found, Level, Verdict, judge
+from swath.daemon.processing.quicklook_maps import thousands
+from swath.daemon.processing.quicklook_page import STYLE
+from swath.georef.trajectory import gps_text
 
 MOST_REASONS = 40
 NARROW_PX = 640  # of the window, up to which the narrow pictures are shown

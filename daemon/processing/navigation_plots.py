@@ -15,13 +15,13 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.processing.navigation_figures import AXES_B, AXES_L
-from daemon.processing.navigation_series import COLUMNS, Pixels, fix_types_at
-from daemon.processing.navigation_sheet import NARROW, Drawn, Format, Sheet, dress, picture_of
-from daemon.processing.quicklook_maps import INK, MUTED, round_down
-from georef.navigation.inputs import Fate, Kind
-from georef.records import FixType
-from georef.timescales.gps_time import SECOND_NS
+from swath.daemon.processing.navigation_figures import AXES_B, AXES_L
+from swath.daemon.processing.navigation_series import COLUMNS, Pixels, fix_types_at
+from swath.daemon.processing.navigation_sheet import NARROW, Drawn, Format, Sheet, dress, picture_of
+from swath.daemon.processing.quicklook_maps import INK, MUTED, round_down
+from swath.georef.navigation.inputs import Fate, Kind
+from swath.georef.records import FixType
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

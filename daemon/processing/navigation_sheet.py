@@ -17,11 +17,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
 
-from daemon.processing.navigation_series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
-from daemon.processing.quicklook_maps import INK, MUTED
-from georef.navigation.inputs import Solution
-from georef.records import Int64Array
-from georef.timescales.gps_time import SECOND_NS
+from swath.daemon.processing.navigation_series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
+from swath.daemon.processing.quicklook_maps import INK, MUTED
+from swath.georef.navigation.inputs import Solution
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

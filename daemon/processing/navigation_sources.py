@@ -9,27 +9,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config.checks import check_antennas
-from daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
-from daemon.config.tables import GnssConfig, ImuConfig, MtaConfig, NoiseConfig, OutputConfig
-from daemon.errors import ConfigError, ExitCode, UserError
-from daemon.log.format import LogError, SessionInfo
-from daemon.log_parsers import stored_config
-from daemon.processing.models import gimbal_sources
-from daemon.processing.setup import Options
-from daemon.processing.setup import Setup as PointSetup
-from drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
-from drivers.core.registry import UnknownProtocolError, find_driver
-from georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
-from georef.stream_clocks import ClockPlan, DevicePlan
+from swath.daemon.config.checks import check_antennas
+from swath.daemon.config.config import PARSER_FILES, Config, attachment_name, plain_table
+from swath.daemon.config.tables import GnssConfig, ImuConfig, MtaConfig, NoiseConfig, OutputConfig
+from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.log.format import LogError, SessionInfo
+from swath.daemon.log_parsers import stored_config
+from swath.daemon.processing.models import gimbal_sources
+from swath.daemon.processing.setup import Options
+from swath.daemon.processing.setup import Setup as PointSetup
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.core.registry import UnknownProtocolError, find_driver
+from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
+from swath.georef.stream_clocks import ClockPlan, DevicePlan
 
 if TYPE_CHECKING:
-    from daemon.log.reader import Session
+    from swath.daemon.log.reader import Session
 
 FloatArray = NDArray[np.float64]
 
 # Receivers' sigmas of positions are taken for those of all their error. Half of its variance lasts for a minute or so:
-# multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`georef.navigation.noise`).
+# multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`swath.georef.navigation.noise`).
 CORRELATED_SHARE, CORRELATION_S = 0.5, 60.0
 HEADING_SHARE, HEADING_CORRELATION_S = 0.36, 60.0  # the same of dual-antenna headings (multipath)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
-from daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures, accuracy_words
+from swath.daemon.processing.navigation_figures import ANGLES, AXES_B, AXES_L, Figures, accuracy_words
 
 Measure = Callable[[Figures], Iterator[tuple[str, float | None]]]
 
@@ -81,7 +81,7 @@ class Rule:
 
 
 class Found(Protocol):
-    """A finding of `georef.navigation.diagnosis`."""
+    """A finding of `swath.georef.navigation.diagnosis`."""
 
     @property
     def code(self) -> str: ...

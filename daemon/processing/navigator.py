@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import UserError
-from daemon.processing.navigation_observations import (
+from swath.daemon.errors import UserError
+from swath.daemon.processing.navigation_observations import (
     fix_observations,
     gps_times,
     heading_observations,
     heading_times,
 )
-from daemon.processing.navigation_sources import NavigationSources
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.alignment import Aligner
-from georef.navigation.filter import NavigationFilter
-from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
-from georef.navigation.samples import Sampler
-from georef.records import (
+from swath.daemon.processing.navigation_sources import NavigationSources
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.alignment import Aligner
+from swath.georef.navigation.filter import NavigationFilter
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
+from swath.georef.navigation.samples import Sampler
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     IMU_DTYPE,
     INS_DTYPE,
@@ -37,13 +37,13 @@ from georef.records import (
     Record,
     StructArray,
 )
-from georef.rotations import attitude_of, rot_from_quaternion
-from georef.timescales import SECOND_NS, WEEK_NS
+from swath.georef.rotations import attitude_of, rot_from_quaternion
+from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 if TYPE_CHECKING:
-    from daemon.config.config import Config
-    from georef.navigation.filter_types import Path
-    from georef.stream_clocks import StreamClocks
+    from swath.daemon.config.config import Config
+    from swath.georef.navigation.filter_types import Path
+    from swath.georef.stream_clocks import StreamClocks
 
 HOLD_S = 0.3  # fixes come so much later than the samples of their time, at most
 TIME_WAIT_NS = 5 * SECOND_NS  # for a clock that is not known yet

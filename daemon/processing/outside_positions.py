@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.navigation_observations import DEFAULT_SIGMAS, Observed
-from georef.earth import e_from_geodetic
-from georef.formats.antenna_positions import read_antenna_positions
-from georef.formats.trajectory_columns import TrajectoryColumns
-from georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from georef.navigation.measurements import POSITION_FLOORS_M
-from georef.records import FixType, StructArray
-from georef.timescales import SECOND_NS
-from georef.trajectory import TrajectoryError, gps_text
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.navigation_observations import DEFAULT_SIGMAS, Observed
+from swath.georef.earth import e_from_geodetic
+from swath.georef.formats.antenna_positions import read_antenna_positions
+from swath.georef.formats.trajectory_columns import TrajectoryColumns
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
+from swath.georef.navigation.measurements import POSITION_FLOORS_M
+from swath.georef.records import FixType, StructArray
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import TrajectoryError, gps_text
 
 FEWEST_SHIFTED = 10
 MOST_SHIFT_S = 40  # TAI is 37 s from UTC, 19 s from GPS time

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight
-from calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
-from daemon.config.tables import NoiseConfig
-from daemon.processing.navigation_observations import heading_observations
-from daemon.processing.navigation_sources import filter_setup, noise_of
-from georef.earth import e_from_geodetic
-from georef.navigation.cross_covariance import error_chain
-from georef.navigation.filter import FilterRun
-from georef.navigation.inputs import (
+from swath.calib.flight import Flight
+from swath.calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
+from swath.daemon.config.tables import NoiseConfig
+from swath.daemon.processing.navigation_observations import heading_observations
+from swath.daemon.processing.navigation_sources import filter_setup, noise_of
+from swath.georef.earth import e_from_geodetic
+from swath.georef.navigation.cross_covariance import error_chain
+from swath.georef.navigation.filter import FilterRun
+from swath.georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     Inertial,
     Kind,
@@ -31,14 +31,14 @@ from georef.navigation.inputs import (
     Start,
     sort_observations,
 )
-from georef.navigation.solve import solve
-from georef.records import FixType, GnssHeading, Int64Array, StructArray
-from georef.timescales import SECOND_NS
-from sim.coverage import Survey
-from sim.imu_wire import config_table
-from sim.inertial import true_increments
-from sim.plan_tables import GnssTable, ImuTable
-from sim.satellites import Epochs, Receiver
+from swath.georef.navigation.solve import solve
+from swath.georef.records import FixType, GnssHeading, Int64Array, StructArray
+from swath.georef.timescales import SECOND_NS
+from swath.sim.coverage import Survey
+from swath.sim.imu_wire import config_table
+from swath.sim.inertial import true_increments
+from swath.sim.plan_tables import GnssTable, ImuTable
+from swath.sim.satellites import Epochs, Receiver
 
 FloatArray = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ import numpy as np
 from laspy.header import GpsTimeType
 from numpy.typing import NDArray
 
-from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, open_points
-from georef.records import Int64Array
-from georef.timescales.gps_time import (
+from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, open_points
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import (
     GPS_EPOCH,
     GPS_EPOCH_UNIX_S,
     LAS_ADJUSTED_ZERO_S,

@@ -8,7 +8,6 @@ and put in its place at the end, the sidecar last.
 from __future__ import annotations
 
 import glob
-import importlib.metadata
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -21,22 +20,23 @@ from typing import Any
 
 import numpy as np
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.durable import sync_file, try_sync_directory
-from daemon.processing import refusals
-from daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
-from daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
-from daemon.processing.quicklook_sidecar import read_sidecar, sessions_in
-from daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
-from daemon.processing.trajectory_files import TrajectoryFiles, put_in_place, write_trajectory
-from daemon.processing.unread import unread_lines
-from daemon.processing.user_errors import told_in_a_line
-from daemon.processing.workers import run_jobs
-from drivers.core.registry import find_driver
-from georef.formats.las import LasSettings
-from georef.mapping import MappingError
-from georef.strips import Segment, StripError, segments
-from georef.timescales.gps_time import table_leap_seconds, utc_from_gps
+from swath import __version__
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.durable import sync_file, try_sync_directory
+from swath.daemon.processing import refusals
+from swath.daemon.processing.flights import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
+from swath.daemon.processing.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
+from swath.daemon.processing.quicklook_sidecar import read_sidecar, sessions_in
+from swath.daemon.processing.sidecar import count_unread, reasons_text, run_record, sha256_of, write_sidecar
+from swath.daemon.processing.trajectory_files import TrajectoryFiles, put_in_place, write_trajectory
+from swath.daemon.processing.unread import unread_lines
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.workers import run_jobs
+from swath.drivers.core.registry import find_driver
+from swath.georef.formats.las import LasSettings
+from swath.georef.mapping import MappingError
+from swath.georef.strips import Segment, StripError, segments
+from swath.georef.timescales.gps_time import table_leap_seconds, utc_from_gps
 
 DROPPED = ".dropped.csv.gz"
 ENDINGS = (".laz", DROPPED)  # of a strip's files
@@ -105,11 +105,11 @@ def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float], number
         scale=(wish.scale, wish.scale, wish.scale),
         sigmas=wish.sigmas,
         creation_date=day,
-        software=f"swath {importlib.metadata.version('swath')}",
+        software=f"swath {__version__}",
         system_identifier=" ".join(protocols.values()),
         provenance=json.dumps(
             {
-                "software": f"swath {importlib.metadata.version('swath')}",
+                "software": f"swath {__version__}",
                 "session": flight.session.session_id,
                 "calibrations": {name: calibration.id for name, calibration in setup.calibrations.items()},
             }

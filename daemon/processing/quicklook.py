@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.point_times import time_notes
-from daemon.processing.quicklook_grids import FIRST, Surface, cell_for, frame_of, inner
-from daemon.processing.quicklook_profile import (
+from swath.daemon.processing.point_times import time_notes
+from swath.daemon.processing.quicklook_grids import FIRST, Surface, cell_for, frame_of, inner
+from swath.daemon.processing.quicklook_profile import (
     Line,
     Profile,
     axis_of,
@@ -21,7 +21,7 @@ from daemon.processing.quicklook_profile import (
     line_through,
     read_profile,
 )
-from daemon.processing.quicklook_read import (
+from swath.daemon.processing.quicklook_read import (
     QuickLookError,
     Source,
     StripBook,
@@ -33,8 +33,15 @@ from daemon.processing.quicklook_read import (
     read_blocks,
     units_of,
 )
-from daemon.processing.quicklook_strips import FINEST_CELL_M, MOST_STRIPS, Overlap, StripCells, compare, strip_frame
-from daemon.processing.strip_agreement import Agreement
+from swath.daemon.processing.quicklook_strips import (
+    FINEST_CELL_M,
+    MOST_STRIPS,
+    Overlap,
+    StripCells,
+    compare,
+    strip_frame,
+)
+from swath.daemon.processing.strip_agreement import Agreement
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.quicklook_read import Block
-from georef.compiled import kept
+from swath.daemon.processing.quicklook_read import Block
+from swath.georef.compiled import kept
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

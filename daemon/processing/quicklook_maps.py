@@ -18,10 +18,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from daemon.processing.quicklook import Look
-from daemon.processing.quicklook_grids import COUNT, HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame, filled, round_up
-from daemon.processing.quicklook_profile import axis_of
-from daemon.processing.quicklook_strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
+from swath.daemon.processing.quicklook import Look
+from swath.daemon.processing.quicklook_grids import COUNT, HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame, filled, round_up
+from swath.daemon.processing.quicklook_profile import axis_of
+from swath.daemon.processing.quicklook_strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-from calib.accuracy_standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
-from daemon.processing.quicklook import Look
-from daemon.processing.quicklook_maps import (
+from swath.calib.accuracy_standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from swath.daemon.processing.quicklook import Look
+from swath.daemon.processing.quicklook_maps import (
     draw_density,
     draw_differences,
     draw_height,
@@ -18,9 +18,9 @@ from daemon.processing.quicklook_maps import (
     draw_sigma,
     thousands,
 )
-from daemon.processing.quicklook_section import draw_profile
-from daemon.processing.quicklook_sidecar import calibrations_in, rows_of, warnings_in
-from daemon.processing.quicklook_strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
+from swath.daemon.processing.quicklook_section import draw_profile
+from swath.daemon.processing.quicklook_sidecar import calibrations_in, rows_of, warnings_in
+from swath.daemon.processing.quicklook_strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
 
 PAGE_NAME = "index.html"
 MOST_ROWS = 300

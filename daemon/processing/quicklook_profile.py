@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.quicklook_read import Source, StripBook, Units, read_blocks
-from daemon.processing.quicklook_strips import ROUGHEST_M, Overlap, Pair, StripCells
+from swath.daemon.processing.quicklook_read import Source, StripBook, Units, read_blocks
+from swath.daemon.processing.quicklook_strips import ROUGHEST_M, Overlap, Pair, StripCells
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

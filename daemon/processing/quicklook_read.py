@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError
 
-from daemon.processing.point_times import PointTimes, point_times_of
-from daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
-from daemon.processing.quicklook_sidecar import height_unit_in, sessions_in, sidecar_of
-from georef.map_fit import misfit_of, scales_at
+from swath.daemon.processing.point_times import PointTimes, point_times_of
+from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
+from swath.daemon.processing.quicklook_sidecar import height_unit_in, sessions_in, sidecar_of
+from swath.georef.map_fit import misfit_of, scales_at
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

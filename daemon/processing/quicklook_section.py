@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from daemon.processing.quicklook import Look
-from daemon.processing.quicklook_maps import DPI, INK, MUTED, shortened, strip_colour, thousands
-from daemon.processing.quicklook_profile import Profile, steps_of
+from swath.daemon.processing.quicklook import Look
+from swath.daemon.processing.quicklook_maps import DPI, INK, MUTED, shortened, strip_colour, thousands
+from swath.daemon.processing.quicklook_profile import Profile, steps_of
 
 PAGE_IN = (12.2, 6.4)
 MOST_DRAWN = 150_000

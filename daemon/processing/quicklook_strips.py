@@ -17,10 +17,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.strips import single_return_sigma_m
-from daemon.processing.quicklook_grids import Frame, inner
-from daemon.processing.quicklook_read import Block
-from georef.compiled import kept
+from swath.calib.strips import single_return_sigma_m
+from swath.daemon.processing.quicklook_grids import Frame, inner
+from swath.daemon.processing.quicklook_read import Block
+from swath.georef.compiled import kept
 
 FloatArray: TypeAlias = NDArray[np.float64]
 

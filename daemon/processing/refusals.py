@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from pyproj import CRS
 
-from daemon.errors import ExitCode, UserError, one_line
-from georef.points import Fate
-from georef.timescales import StampScale, TimeState
-from georef.trajectory import gps_text
-from georef.trajectory_buffer import COLUMNS
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.georef.points import Fate
+from swath.georef.timescales import StampScale, TimeState
+from swath.georef.trajectory import gps_text
+from swath.georef.trajectory_buffer import COLUMNS
 
 if TYPE_CHECKING:
-    from daemon.config.config import Config
-    from daemon.processing.feed import LogClocks
-    from daemon.processing.flights import Flight
-    from daemon.processing.setup import Options
-    from georef.timescales import ClockStatus, Stamps
-    from georef.trajectory import Trajectory
+    from swath.daemon.config.config import Config
+    from swath.daemon.processing.feed import LogClocks
+    from swath.daemon.processing.flights import Flight
+    from swath.daemon.processing.setup import Options
+    from swath.georef.timescales import ClockStatus, Stamps
+    from swath.georef.trajectory import Trajectory
 
 Span = tuple[int, int]
 NO_TIME = Fate.NO_TIME.name.lower()
@@ -102,7 +102,7 @@ def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
 
 
 def _datum_of(config: Config) -> str | None:
-    """As `daemon.processing.setup.Setup` takes it."""
+    """As `swath.daemon.processing.setup.Setup` takes it."""
     return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
 
 
@@ -297,7 +297,7 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
     """
     if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
         return []
-    from georef.trajectory_time import correlate_turn_rates  # scipy.signal, which takes seconds to load
+    from swath.georef.trajectory_time import correlate_turn_rates  # scipy.signal, which takes seconds to load
 
     shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
     if shift.is_wrong:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
-from daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
-from daemon.errors import ConfigError, UserError
-from daemon.log.format import LogError, SessionInfo
-from daemon.log_parsers import stored_config
-from daemon.processing.models import (
+from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
+from swath.daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
+from swath.daemon.errors import ConfigError, UserError
+from swath.daemon.log.format import LogError, SessionInfo
+from swath.daemon.log_parsers import stored_config
+from swath.daemon.processing.models import (
     TerrainRanges,
     calibration_mistakes,
     gimbal_sources,
@@ -28,22 +28,22 @@ from daemon.processing.models import (
     make_resolver,
     refuse_logged_gimbals,
 )
-from daemon.processing.terrain import terrain_of
-from drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
-from drivers.core.registry import UnknownProtocolError, find_driver
-from georef.calibration import Calibration, CalibrationError, nominal, read_calibration
-from georef.coarse_terrain import CoarseTerrain
-from georef.mapping import Mapping as MappingFrame
-from georef.mapping import MappingError
-from georef.mount import AngleSeries
-from georef.records import InsSolution, NamesEdge, StructArray
-from georef.rotations import attitude_of, rot_l_from_b
-from georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
-from georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
-from georef.text_encoding import decoded
-from georef.timescales import StampScale
-from georef.trajectory import Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.daemon.processing.terrain import terrain_of
+from swath.drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
+from swath.drivers.core.registry import UnknownProtocolError, find_driver
+from swath.georef.calibration import Calibration, CalibrationError, nominal, read_calibration
+from swath.georef.coarse_terrain import CoarseTerrain
+from swath.georef.mapping import Mapping as MappingFrame
+from swath.georef.mapping import MappingError
+from swath.georef.mount import AngleSeries
+from swath.georef.records import InsSolution, NamesEdge, StructArray
+from swath.georef.rotations import attitude_of, rot_l_from_b
+from swath.georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
+from swath.georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
+from swath.georef.text_encoding import decoded
+from swath.georef.timescales import StampScale
+from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 SECOND_NS = 1_000_000_000
 ARCSEC = math.pi / 648_000
@@ -303,7 +303,7 @@ class Setup:
 
     def navigator(self, clocks: StreamClocks) -> Any:
         """What finds the way of a growing log, a `Navigator`; None: there are not both an IMU and a receiver."""
-        from daemon.processing.navigator import navigator_of
+        from swath.daemon.processing.navigator import navigator_of
 
         return navigator_of(self.config, self._attachments, clocks)
 

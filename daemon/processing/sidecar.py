@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import math
 from collections import Counter
@@ -12,18 +11,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daemon.processing.carried_verdict import trajectory_entry
-from daemon.processing.models import air_of
-from daemon.processing.trajectory_files import write_whole
-from daemon.processing.unread import unread_lines
-from georef.calibration import PARAMETERS
-from georef.points import Fate
+from swath import __version__
+from swath.daemon.processing.carried_verdict import trajectory_entry
+from swath.daemon.processing.models import air_of
+from swath.daemon.processing.trajectory_files import write_whole
+from swath.daemon.processing.unread import unread_lines
+from swath.georef.calibration import PARAMETERS
+from swath.georef.points import Fate
 
 if TYPE_CHECKING:
-    from daemon.processing.flights import Flight
-    from daemon.processing.jobs import JobResult
-    from daemon.processing.setup import Setup
-    from georef.calibration import Calibration
+    from swath.daemon.processing.flights import Flight
+    from swath.daemon.processing.jobs import JobResult
+    from swath.daemon.processing.setup import Setup
+    from swath.georef.calibration import Calibration
 
 FORMAT = "swath.georef"
 FORMAT_VERSION = 1
@@ -141,7 +141,7 @@ def run_record(
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
-        "software": f"swath {importlib.metadata.version('swath')}",
+        "software": f"swath {__version__}",
         "complete": not holes,
         "holes": holes,
         "warnings": warnings,

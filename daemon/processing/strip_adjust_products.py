@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -13,18 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.strip_functions import StripChoice
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_products import Told, strips_entry
-from daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
-from daemon.processing.flights import Flight as LoggedFlight
-from daemon.processing.flights import verdict_of
-from daemon.processing.json_values import finite
-from daemon.processing.sidecar import sha256_of
-from daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, files_of
-from daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
-from daemon.processing.trajectory_summary import write_json
-from georef.trajectory import Trajectory
+from swath import __version__
+from swath.calib.strip_functions import StripChoice
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibrate_products import Told, strips_entry
+from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
+from swath.daemon.processing.flights import Flight as LoggedFlight
+from swath.daemon.processing.flights import verdict_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.sidecar import sha256_of
+from swath.daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, files_of
+from swath.daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
+from swath.daemon.processing.trajectory_summary import write_json
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def _record(wish: AdjustWish, done: StripsCorrected, written: list[tuple[Path, P
     return {
         "format": "swath.strip-adjustment",
         "version": 1,
-        "software": f"swath {importlib.metadata.version('swath')}",
+        "software": f"swath {__version__}",
         "what": f"{WHAT} {KEPT[0].upper()}{KEPT[1:]}.",
         "verdict": verdict_of(wish.logs, done.kept.logged),
         "flights": [

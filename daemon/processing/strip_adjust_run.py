@@ -1,9 +1,9 @@
 """`swath strips --adjust`: corrections of the trajectory, strip by strip, while the calibration is held.
 
 returns of the strips, placed with the calibration               calibration_flight
-planes, control                                                  calib.plane_search, calib.control
-corrections; planes found anew with them; corrections again      calib.strip_functions
-height differences of strips, before and after                   calib.strips
+planes, control                                                  swath.calib.plane_search, swath.calib.control
+corrections; planes found anew with them; corrections again      swath.calib.strip_functions
+height differences of strips, before and after                   swath.calib.strips
 """
 
 from __future__ import annotations
@@ -15,38 +15,38 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calib.control import ControlError, control_planes
-from calib.effects import SeenFrom
-from calib.features import ControlPoint, Features
-from calib.flight import Flight, FlightError
-from calib.normals import NormalError
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneError
-from calib.signatures import signatures
-from calib.strip_cells import StripRules
-from calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
-from calib.strips import differences
-from daemon.errors import ExitCode, UserError
-from daemon.places import nearest_there
-from daemon.processing.calibrate_inputs import control_of
-from daemon.processing.calibrate_run import PLANES, refuse_lost_control, refuse_no_planes
-from daemon.processing.calibration_flight import (
+from swath.calib.control import ControlError, control_planes
+from swath.calib.effects import SeenFrom
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.normals import NormalError
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneError
+from swath.calib.signatures import signatures
+from swath.calib.strip_cells import StripRules
+from swath.calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
+from swath.calib.strips import differences
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.places import nearest_there
+from swath.daemon.processing.calibrate_inputs import control_of
+from swath.daemon.processing.calibrate_run import PLANES, refuse_lost_control, refuse_no_planes
+from swath.daemon.processing.calibration_flight import (
     KeptFlight,
     read_flight,
     refuse_without_noise,
     replaced,
     smoothed_prior,
 )
-from daemon.processing.carried_verdict import ADJUSTMENT, told_before
-from daemon.processing.flights import Flight as LoggedFlight
-from daemon.processing.flights import Wish, verdicts_of
-from daemon.processing.strip_agreement import FlightStrips, before_and_after
-from daemon.processing.strips_run import is_of_logs, refuse_installations
-from daemon.processing.trajectory_files import TrajectoryFiles
-from daemon.processing.user_errors import told_in_a_line
-from georef.mapping import MappingError
-from georef.strips import StripError as StripTimesError
-from georef.trajectory import TrajectoryError
+from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
+from swath.daemon.processing.flights import Flight as LoggedFlight
+from swath.daemon.processing.flights import Wish, verdicts_of
+from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
+from swath.daemon.processing.strips_run import is_of_logs, refuse_installations
+from swath.daemon.processing.trajectory_files import TrajectoryFiles
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.mapping import MappingError
+from swath.georef.strips import StripError as StripTimesError
+from swath.georef.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 
@@ -72,7 +72,7 @@ class AdjustWish:
         logs: what is read and how; what it says of products does not count.
         output: folder for the corrected trajectories and the record.
         control: CSV of surveyed points; None: none.
-        model: that all strips get, of `calib.strip_functions.MODELS`; ``auto``: each what its returns ask for.
+        model: that all strips get, of `swath.calib.strip_functions.MODELS`; ``auto``: each what its returns ask for.
         overwrite: files of an earlier run are replaced.
     """
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.accuracy_standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
-from calib.flight import Flight
-from calib.report_input import DifferenceMap, PairDifference
-from daemon.processing.quicklook_read import Block
-from daemon.processing.quicklook_strips import (
+from swath.calib.accuracy_standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
+from swath.calib.flight import Flight
+from swath.calib.report_input import DifferenceMap, PairDifference
+from swath.daemon.processing.quicklook_read import Block
+from swath.daemon.processing.quicklook_strips import (
     FEWEST_CELLS,
     FEWEST_PLACES,
     STEEPEST_DEG,
@@ -28,7 +28,7 @@ from daemon.processing.quicklook_strips import (
     compare,
     strip_frame,
 )
-from georef.mapping import Mapping
+from swath.georef.mapping import Mapping
 
 FloatArray = NDArray[np.float64]
 

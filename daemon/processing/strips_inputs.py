@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.effects import SeenFrom
-from calib.flight import Flight, Tangent
-from calib.strip_cells import (
+from swath.calib.effects import SeenFrom
+from swath.calib.flight import Flight, Tangent
+from swath.calib.strip_cells import (
     Cells,
     FlightStrip,
     Gathered,
@@ -26,22 +26,22 @@ from calib.strip_cells import (
     overlap_cells,
     thinned,
 )
-from calib.trajectory_errors import TrajectoryPrior
-from daemon.errors import ExitCode, UserError
-from daemon.processing.carried_verdict import Carried
-from daemon.processing.point_times import PointClock
-from daemon.processing.quicklook import Look, StripFacts, look_at
-from daemon.processing.quicklook_grids import Surface, cell_for, frame_of
-from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
-from daemon.processing.quicklook_read import NOISE_CLASSES, QuickLookError, StripBook, Units
-from daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE
-from daemon.processing.strip_agreement import compare_flight, corners_of
-from georef.formats.trajectory_columns import LATEST_NS
-from georef.formats.trajectory_file import read_trajectory
-from georef.mapping import Mapping, MappingError
-from georef.records import Int64Array
-from georef.timescales.gps_time import WEEK_NS
-from georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.carried_verdict import Carried
+from swath.daemon.processing.point_times import PointClock
+from swath.daemon.processing.quicklook import Look, StripFacts, look_at
+from swath.daemon.processing.quicklook_grids import Surface, cell_for, frame_of
+from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
+from swath.daemon.processing.quicklook_read import NOISE_CLASSES, QuickLookError, StripBook, Units
+from swath.daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE
+from swath.daemon.processing.strip_agreement import compare_flight, corners_of
+from swath.georef.formats.trajectory_columns import LATEST_NS
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.mapping import Mapping, MappingError
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import WEEK_NS
+from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
 
 FloatArray = NDArray[np.float64]
 Told = Callable[[str, int, int], None]

@@ -9,20 +9,20 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib.flight import FlightError
-from calib.signatures import Signatures, record_of, signatures
-from calib.strip_cells import StripRules
-from calib.strips import Numbers, PairReport, StripReport, report_of
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibration_flight import read_flight, smoothed_prior
-from daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
-from daemon.processing.flights import Wish, verdicts_of
-from daemon.processing.json_values import finite
-from daemon.processing.strip_agreement import Agreement, difference_of
-from daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
-from daemon.processing.user_errors import told_in_a_line
-from georef.mapping import MappingError
-from georef.strips import StripError
+from swath.calib.flight import FlightError
+from swath.calib.signatures import Signatures, record_of, signatures
+from swath.calib.strip_cells import StripRules
+from swath.calib.strips import Numbers, PairReport, StripReport, report_of
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration_flight import read_flight, smoothed_prior
+from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
+from swath.daemon.processing.flights import Wish, verdicts_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.strip_agreement import Agreement, difference_of
+from swath.daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.mapping import MappingError
+from swath.georef.strips import StripError
 
 Told = Callable[[str, int, int], None]
 
@@ -238,7 +238,7 @@ def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:
 def _draw(wish: StripsWish, now: Judgement, then: Judgement | None) -> list[Path]:
     if wish.output is None:
         return []
-    from daemon.processing.quicklook_maps import draw_differences
+    from swath.daemon.processing.quicklook_maps import draw_differences
 
     made = []
     try:

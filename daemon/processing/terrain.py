@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
-from daemon.config.config import Config
-from daemon.errors import ConfigError
-from drivers.core.extras import how_to_install
-from georef.coarse_terrain import CoarseTerrain
+from swath.daemon.config.config import Config
+from swath.daemon.errors import ConfigError
+from swath.drivers.core.extras import how_to_install
+from swath.georef.coarse_terrain import CoarseTerrain
 
 FloatArray = NDArray[np.float64]
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer

@@ -16,12 +16,12 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.durable import try_sync_directory
-from georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
-from georef.formats.trajectory_csv import csv_text
-from georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
-from georef.trajectory import Trajectory
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.durable import try_sync_directory
+from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -11,23 +11,23 @@ from typing import IO, Any
 
 import numpy as np
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.reader import Session, open_logs
-from daemon.processing.event_marks import EventTable, event_table
-from daemon.processing.ins_as_is import ins_as_is
-from daemon.processing.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
-from daemon.processing.navigation_inputs import Mark
-from daemon.processing.refusals import refuse_no_name
-from daemon.processing.trajectory_files import (
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.event_marks import EventTable, event_table
+from swath.daemon.processing.ins_as_is import ins_as_is
+from swath.daemon.processing.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
+from swath.daemon.processing.navigation_inputs import Mark
+from swath.daemon.processing.refusals import refuse_no_name
+from swath.daemon.processing.trajectory_files import (
     TrajectoryFiles,
     put_in_place,
     remove,
     write_aside,
     write_trajectory,
 )
-from daemon.processing.trajectory_summary import pages_of, summary_head, summary_of_run, write_json
-from daemon.processing.user_errors import told_in_a_line
-from georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.daemon.processing.trajectory_summary import pages_of, summary_head, summary_of_run, write_json
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 Written = list[tuple[Path, Path]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -13,20 +12,21 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from daemon.log.durable import sync_file
-from daemon.processing.navigation_figures import figures_of
-from daemon.processing.navigation_series import Flight, separation_of
-from daemon.processing.navigation_verdict import judge
-from daemon.processing.sidecar import sha256_of, utc_text
-from daemon.processing.trajectory_files import PARTIAL, gone_on_failure
+from swath import __version__
+from swath.daemon.log.durable import sync_file
+from swath.daemon.processing.navigation_figures import figures_of
+from swath.daemon.processing.navigation_series import Flight, separation_of
+from swath.daemon.processing.navigation_verdict import judge
+from swath.daemon.processing.sidecar import sha256_of, utc_text
+from swath.daemon.processing.trajectory_files import PARTIAL, gone_on_failure
 
 if TYPE_CHECKING:
-    from daemon.log.reader import Session
-    from daemon.processing.event_marks import EventTable
-    from daemon.processing.navigate import Navigated, NavigatedLeg
-    from daemon.processing.trajectory_run import TrajectoryWish
-    from georef.navigation.diagnosis import Finding
-    from georef.navigation.inputs import Setup, Start
+    from swath.daemon.log.reader import Session
+    from swath.daemon.processing.event_marks import EventTable
+    from swath.daemon.processing.navigate import Navigated, NavigatedLeg
+    from swath.daemon.processing.trajectory_run import TrajectoryWish
+    from swath.georef.navigation.diagnosis import Finding
+    from swath.georef.navigation.inputs import Setup, Start
 
 FORMAT = "swath.trajectory"
 FORMAT_VERSION = 1
@@ -41,7 +41,7 @@ class Page:
 
     def write(self, path: Path) -> tuple[Any, Any, Path]:
         """Write it beside its place: verdict, figures, and where it stands; raises OSError."""
-        from daemon.processing.navigation_page import write_page  # matplotlib, which the rest does without
+        from swath.daemon.processing.navigation_page import write_page  # matplotlib, which the rest does without
 
         aside = path.with_name(path.name + PARTIAL)
         with gone_on_failure([(aside, path)]):
@@ -88,7 +88,7 @@ def summary_head(
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
-        "software": f"swath {importlib.metadata.version('swath')}",
+        "software": f"swath {__version__}",
         "complete": not holes,
         "holes": list(holes),
         "warnings": list(warnings),

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from daemon.errors import ExitCode, UserError
-from daemon.log.format import LogError
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.format import LogError
 
 
 @contextmanager

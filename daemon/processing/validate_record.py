@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.record import Document, RecordError, document_json, document_xml, read_document, with_told
-from calib.record_values import Plain
-from calib.validation import Validation
-from daemon.errors import ExitCode, UserError
-from daemon.text_files import text_of
-from georef.calibration import Calibration
+from swath.calib.record import Document, RecordError, document_json, document_xml, read_document, with_told
+from swath.calib.record_values import Plain
+from swath.calib.validation import Validation
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.text_files import text_of
+from swath.georef.calibration import Calibration
 
 
 @dataclass(frozen=True)

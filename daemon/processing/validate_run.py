@@ -10,35 +10,35 @@ from typing import Any
 
 import numpy as np
 
-from calib.adjust import adjust
-from calib.control import ControlError, control_planes
-from calib.features import ControlPoint, Features
-from calib.flight import Flight, FlightError
-from calib.history import History, HistoryError, history
-from calib.normals import NormalError
-from calib.parameters import Wish as Model
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneError
-from calib.record import Document
-from calib.trajectory_errors import TrajectoryPrior
-from calib.validation import SIGMAS_DEG, SIGMAS_M, Asked, Method, Validation, same_logs, validate, with_sigmas
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_inputs import control_of
-from daemon.processing.calibrate_run import PLANES, prior_of
-from daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
-from daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
-from daemon.processing.flights import Wish, verdicts_of
-from daemon.processing.json_values import finite
-from daemon.processing.sidecar import sha256_of
-from daemon.processing.strips_run import refuse_installations
-from daemon.processing.trajectory_files import write_whole
-from daemon.processing.user_errors import told_in_a_line
-from daemon.processing.validate_record import record_files, records_of
-from daemon.text_files import text_of
-from georef.calibration import Calibration, CalibrationError, read_calibration
-from georef.mapping import MappingError
-from georef.strips import StripError
-from georef.text_encoding import decoded
+from swath.calib.adjust import adjust
+from swath.calib.control import ControlError, control_planes
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.history import History, HistoryError, history
+from swath.calib.normals import NormalError
+from swath.calib.parameters import Wish as Model
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneError
+from swath.calib.record import Document
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.calib.validation import SIGMAS_DEG, SIGMAS_M, Asked, Method, Validation, same_logs, validate, with_sigmas
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibrate_inputs import control_of
+from swath.daemon.processing.calibrate_run import PLANES, prior_of
+from swath.daemon.processing.calibration_flight import KeptFlight, read_flight, replaced
+from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
+from swath.daemon.processing.flights import Wish, verdicts_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.sidecar import sha256_of
+from swath.daemon.processing.strips_run import refuse_installations
+from swath.daemon.processing.trajectory_files import write_whole
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.validate_record import record_files, records_of
+from swath.daemon.text_files import text_of
+from swath.georef.calibration import Calibration, CalibrationError, read_calibration
+from swath.georef.mapping import MappingError
+from swath.georef.strips import StripError
+from swath.georef.text_encoding import decoded
 
 Told = Callable[[str, int, int], None]
 RECORD, PICTURE = "validation.json", "history.png"
@@ -307,7 +307,7 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
     if found.validation is not None and found.validation.passed is not None:
         files |= record_files(output, found.documents, found.validation, found.logs)
     if found.histories:
-        from calib.history_plots import history_png
+        from swath.calib.history_plots import history_png
 
         files[output / PICTURE] = history_png(found.histories)
     files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()

@@ -6,19 +6,19 @@ import contextlib
 
 import numpy as np
 
-from calib.adjust import adjust
-from calib.flight import Flight, Head, Swath, Tangent
-from calib.parameters import Wish
-from calib.plane_matching import rematch
-from calib.plane_search import find_planes
-from calib.trajectory_errors import gauss_markov
-from georef.beams import LineGeometry
-from georef.calibration import nominal
-from georef.earth import e_from_geodetic, geodetic_from_e
-from georef.records import RETURN_DTYPE
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.adjust import adjust
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.calib.parameters import Wish
+from swath.calib.plane_matching import rematch
+from swath.calib.plane_search import find_planes
+from swath.calib.trajectory_errors import gauss_markov
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import nominal
+from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 
 START_NS = 1_465_000_000 * SECOND_NS
 SECONDS, APART_S = 4, 60

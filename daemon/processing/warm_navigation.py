@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import e_from_geodetic
-from georef.navigation.alignment import Aligner
-from georef.navigation.filter import NavigationFilter, run_filter
-from georef.navigation.gravity import gravity_e
-from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, sort_observations
-from georef.navigation.smoother import forward, smooth
-from georef.records import FixType, StructArray
-from georef.timescales import SECOND_NS
+from swath.georef.earth import e_from_geodetic
+from swath.georef.navigation.alignment import Aligner
+from swath.georef.navigation.filter import NavigationFilter, run_filter
+from swath.georef.navigation.gravity import gravity_e
+from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, sort_observations
+from swath.georef.navigation.smoother import forward, smooth
+from swath.georef.records import FixType, StructArray
+from swath.georef.timescales import SECOND_NS
 
 SECONDS, RATE_HZ = 12, 50
 START_NS = 1_465_000_000 * SECOND_NS

@@ -24,25 +24,25 @@ import numba.core.event
 import numpy as np
 import pyproj
 
-from daemon.config.config import Config
-from daemon.config.tables import Tables
-from daemon.log.format import SessionInfo
-from daemon.processing.live_frame import LocalFrame, Maps
-from daemon.processing.live_grid import CountGrid, count_points
-from daemon.processing.live_products import Thinning
-from daemon.processing.setup import Options, Setup
-from daemon.processing.warm_navigation import warm_navigation
-from drivers.core.parser import DeviceSettings, Parser
-from drivers.core.registry import find_driver
-from drivers.scanner.hesai import MODE_LAST_STRONGEST, encode_point_packet
-from drivers.scanner.hesai import MODE_STRONGEST as HESAI_STRONGEST
-from drivers.scanner.hesai_heads import XT32
-from drivers.scanner.ouster import OusterParser
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
-from georef.formats.las import LasSettings, LasWriter
-from georef.points import Points
-from georef.records import (
+from swath.daemon.config.config import Config
+from swath.daemon.config.tables import Tables
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.processing.live_frame import LocalFrame, Maps
+from swath.daemon.processing.live_grid import CountGrid, count_points
+from swath.daemon.processing.live_products import Thinning
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.warm_navigation import warm_navigation
+from swath.drivers.core.parser import DeviceSettings, Parser
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.hesai import MODE_LAST_STRONGEST, encode_point_packet
+from swath.drivers.scanner.hesai import MODE_STRONGEST as HESAI_STRONGEST
+from swath.drivers.scanner.hesai_heads import XT32
+from swath.drivers.scanner.ouster import OusterParser
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from swath.georef.formats.las import LasSettings, LasWriter
+from swath.georef.points import Points
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,
     RETURN_DTYPE,
@@ -56,8 +56,8 @@ from georef.records import (
     TimeScale,
     TimeTag,
 )
-from georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
-from georef.trajectory import Trajectory
+from swath.georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
+from swath.georef.trajectory import Trajectory
 
 COMPILE_EVENT = "numba:compile"
 ROWS = 500
@@ -170,7 +170,7 @@ def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False) -> WarmU
         for setup in setups:
             warm_setup(setup)
         if calibration:
-            from daemon.processing.warm_calibration import warm_calibration
+            from swath.daemon.processing.warm_calibration import warm_calibration
 
             warm_calibration()
     return WarmUp(len(names), time.monotonic() - began_s, cache_folder())

@@ -13,9 +13,9 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from daemon.errors import ExitCode, UserError
-from daemon.processing.jobs import Job, JobResult, run_job
-from drivers.core.extras import how_to_install
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.jobs import Job, JobResult, run_job
+from swath.drivers.core.extras import how_to_install
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10
@@ -51,7 +51,7 @@ def run_jobs(
     """Do all jobs.
 
     Args:
-        plans: of the sessions, `daemon.processing.jobs.JobPlan`.
+        plans: of the sessions, `swath.daemon.processing.jobs.JobPlan`.
         jobs: in any order.
         workers: processes here; 1: in this one.
         scheduler: address of a Dask scheduler; None: none.

@@ -13,8 +13,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from drivers.scanner.slots import ReturnSlots
-from georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
+from swath.drivers.scanner.slots import ReturnSlots
+from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
 
 # A row's last word is written as one number, as `slots.common_words` begins it.
 _WORDS = RETURN_DTYPE.itemsize // 8

@@ -6,8 +6,8 @@ import re
 import struct
 from functools import lru_cache
 
-from drivers.core.checksums import crc16_ccitt, crc24q, crc24q_marks, crc32_novatel, nmea_xor, ubx_fletcher
-from drivers.core.framing import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
+from swath.drivers.core.checksums import crc16_ccitt, crc24q, crc24q_marks, crc32_novatel, nmea_xor, ubx_fletcher
+from swath.drivers.core.framing import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
 
 # --- NMEA 0183: $ttsss,field,…*hh CR LF -----------------------------------------------------------------------------
 
@@ -175,7 +175,7 @@ def measure_novatel_short(buffer: bytes, start: int, final: bool) -> int:
 
 
 def novatel_name(frame: bytes) -> str:
-    """``NOVATEL-42``: the message id; `drivers.gnss.novatel` knows the names."""
+    """``NOVATEL-42``: the message id; `swath.drivers.gnss.novatel` knows the names."""
     return f"NOVATEL-{NOVATEL_MESSAGE_ID.unpack_from(frame)[0]}"
 
 
@@ -237,7 +237,7 @@ def intact_sbf(frame: bytes) -> bool:
 
 
 def sbf_name(frame: bytes) -> str:
-    """``SBF-4007``: the block's number; `drivers.gnss.sbf` knows the names."""
+    """``SBF-4007``: the block's number; `swath.drivers.gnss.sbf` knows the names."""
     return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
 
 

@@ -1,7 +1,7 @@
 """Finds frames of several protocols in one stream of bytes, whatever lies between them.
 
 One port often carries UBX, NMEA and RTCM3 together, or NovAtel logs with prompts between. The framer knows a table of
-frame kinds (`drivers.core.frame_kinds`); a new kind is an entry there.
+frame kinds (`swath.drivers.core.frame_kinds`); a new kind is an entry there.
 
 Rules, the same however the stream is cut:
 
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import ParserCounters
+from swath.drivers.core.parser import ParserCounters
 
 UNDECIDED = 0  # what a measure says while the bytes there are do not tell the length
 FALSE_SYNC = -1  # … when this is no frame after all
@@ -120,7 +120,7 @@ class Framer:
     """A bounded buffer and the scan over it; counts into the parser's counters.
 
     Args:
-        kinds: what may come, `drivers.core.frame_kinds`.
+        kinds: what may come, `swath.drivers.core.frame_kinds`.
         counters: bytes, bytes_framed, bytes_skipped, messages, bad_checksums and errors are kept here.
     """
 

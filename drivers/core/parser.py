@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+from swath.georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
 
 if TYPE_CHECKING:
-    from drivers.core.startup import StartupMessage, StartupWish
+    from swath.drivers.core.startup import StartupMessage, StartupWish
 
 DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
 TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
@@ -173,7 +173,7 @@ class Driver:
         tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
         needs: configuration keys without which it cannot work.
         line_scanner: of a scanner: one beam, which goes as the configuration's ``geometry`` declares. The parser of any
-            other has ``beams``, a `drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
+            other has ``beams``, a `swath.drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
         wavelength_nm: of a scanner's light, by its maker's data sheet; None: 1064, as of most airborne ones.
         eight_bit_intensity: whether a scanner's intensities are 0 to 255.
         past_hour: whether a scanner's device time is that past the full hour of UTC.

@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 from functools import cache
 
-from drivers.core.parser import DeviceKind, Driver
+from swath.drivers.core.parser import DeviceKind, Driver
 
 KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
 

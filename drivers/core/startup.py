@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from drivers.core.parser import DeviceSettings
+from swath.drivers.core.parser import DeviceSettings
 
 DEFAULT_RATE_HZ = 5
 MAX_REPLY_BYTES = 4096  # of a command line's reply; Septentrio's longest command has 2000

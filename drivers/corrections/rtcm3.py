@@ -6,10 +6,10 @@ they came: the log holds the bytes.
 
 from __future__ import annotations
 
-from drivers.core.frame_kinds import RTCM3
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, StreamParser
-from georef.records import Chunk, DeviceStatus, Record
+from swath.drivers.core.frame_kinds import RTCM3
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, StreamParser
+from swath.georef.records import Chunk, DeviceStatus, Record
 
 HEADER_BYTES, CRC_BYTES = 3, 3
 STATION = {1005: 152, 1006: 168}  # bits of the stationary reference point's messages (3.5.2)

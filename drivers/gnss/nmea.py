@@ -4,9 +4,9 @@ Time: RMC and ZDA name the previous PPS edge, in UTC. RMC vouches for its time b
 is believed while the stream's latest GGA, GNS or RMC has a fix, or where it has none of them. A tag off the whole
 second does not vote.
 
-Fix: the sentences of one time of day make one `GnssFix` (`drivers.gnss.epochs`): position and quality of GGA, else of
-GNS, else of RMC; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and so
-belongs to the epoch it comes in; sigmas of GST. Height is the altitude plus the geoid separation of GGA or GNS, None
+Fix: the sentences of one time of day make one `GnssFix` (`swath.drivers.gnss.epochs`): position and quality of GGA,
+else of GNS, else of RMC; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and
+so belongs to the epoch it comes in; sigmas of GST. Height is the altitude plus the geoid separation of GGA or GNS, None
 where the receiver leaves either empty. No vertical velocity. Empty fields are a receiver without a fix, not an error.
 GNS has a mode for each constellation; the best of them is the fix's, as one position is made of all. Where a receiver
 adds a GNS for each constellation, these have no mode and tell satellites only: they are not taken.
@@ -22,13 +22,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.frame_kinds import GNSS_KINDS
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, StreamParser
-from drivers.gnss.date_floor import ReceiverDates
-from drivers.gnss.epochs import EpochGatherer
-from drivers.gnss.nmea_sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
-from georef.records import (
+from swath.drivers.core.frame_kinds import GNSS_KINDS
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.gnss.date_floor import ReceiverDates
+from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.nmea_sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
+from swath.georef.records import (
     Chunk,
     FixType,
     GnssFix,

@@ -13,7 +13,7 @@ from typing import Any
 
 import pynmea2
 
-from drivers.core.checksums import nmea_xor
+from swath.drivers.core.checksums import nmea_xor
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS

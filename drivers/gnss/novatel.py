@@ -1,7 +1,7 @@
 """NovAtel OEM7 (and OEM4 to OEM6) binary logs, long and short headers, with or without SPAN.
 
-Framing and checksum are `drivers.core.framing`'s; layouts and tables `drivers.gnss.novatel_layouts`'. Prompts
-(``[COM1]``), ASCII logs, NMEA and RTCM3 between the logs are framed or skipped, and counted.
+Framing and checksum are `swath.drivers.core.framing`'s; layouts and tables `swath.drivers.gnss.novatel_layouts`'.
+Prompts (``[COM1]``), ASCII logs, NMEA and RTCM3 between the logs are framed or skipped, and counted.
 
 What each log gives:
 
@@ -19,16 +19,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from drivers.core.frame_kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss import novatel_tables as tables
-from drivers.gnss.date_floor import ReceiverDates
-from drivers.gnss.novatel_records import DECODERS, Header, State
-from drivers.gnss.novatel_startup import startup_messages
-from drivers.gnss.rows import Row, join_rows
-from georef.records import (
+from swath.drivers.core.frame_kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss import novatel_tables as tables
+from swath.drivers.gnss.date_floor import ReceiverDates
+from swath.drivers.gnss.novatel_records import DECODERS, Header, State
+from swath.drivers.gnss.novatel_startup import startup_messages
+from swath.drivers.gnss.rows import Row, join_rows
+from swath.georef.records import (
     Chunk,
     DeviceStatus,
     EventMark,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.core.checksums import crc32_novatel
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss.novatel_tables import TIME_STATUS_FINESTEERING
+from swath.drivers.core.checksums import crc32_novatel
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss.novatel_tables import TIME_STATUS_FINESTEERING
 
 PORT_COM1 = 32  # port identifiers of the OEM7 manual
 SOFTWARE = 17002

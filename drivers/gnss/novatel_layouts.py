@@ -1,7 +1,7 @@
 """NovAtel OEM7 binary: headers and messages (docs.novatel.com/OEM7); status and scale tables: `novatel_tables`.
 
 A message is a `NamedTuple` of its fields in wire order, and a `struct.Struct` in `LAYOUTS`. Angles are degrees and
-heights above the receiver's geoid where the manual has them so: `drivers.gnss.novatel` converts.
+heights above the receiver's geoid where the manual has them so: `swath.drivers.gnss.novatel` converts.
 """
 
 from __future__ import annotations

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.core.parser import ParserCounters
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss import novatel_tables as tables
-from drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
-from drivers.gnss.rows import Row
-from georef.records import (
+from swath.drivers.core.parser import ParserCounters
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss import novatel_tables as tables
+from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.rows import Row
+from swath.georef.records import (
     DeviceStatus,
     EventMark,
     FixType,

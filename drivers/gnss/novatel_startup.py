@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.startup import PhraseListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.startup import PhraseListener, StartupMessage, StartupWish, read_setup
 
 ACCEPTED = re.compile(rb"<OK\r?\n")
 REFUSED = re.compile(rb"<ERROR:?([^\r\n]*)\r?\n")

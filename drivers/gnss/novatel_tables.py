@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import radians
 
-from georef.records import FixType
+from swath.georef.records import FixType
 
 FOOT_M = 0.3048
 STANDARD_GRAVITY = 9.80665

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from georef.records import IMU_DTYPE, INS_DTYPE, ImuSamples, InsSolution, Record
+from swath.georef.records import IMU_DTYPE, INS_DTYPE, ImuSamples, InsSolution, Record
 
 
 class Row(NamedTuple):

@@ -9,7 +9,7 @@ edge's own error, negative when the pulse came early. ReceiverTime names the pre
 So do PVTGeodetic, PVTCartesian and INSNavGeod on the whole second, once an epoch. What they name is the second of
 their time stamp; the clock's bias is taken off the records' times only.
 
-Fix: PVTGeodetic, PosCovGeodetic and VelCovGeodetic of one time stamp make one `GnssFix` (`drivers.gnss.epochs`),
+Fix: PVTGeodetic, PosCovGeodetic and VelCovGeodetic of one time stamp make one `GnssFix` (`swath.drivers.gnss.epochs`),
 complete at EndOfPVT at the latest. So do AttEuler and AttCovEuler one `GnssHeading`.
 """
 
@@ -20,18 +20,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from drivers.core.frame_kinds import NMEA, RTCM3, SBF
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, StreamParser
-from drivers.gnss import sbf_blocks as sbf
-from drivers.gnss import sbf_frame as wire
-from drivers.gnss import sbf_records as records
-from drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
-from drivers.gnss.epochs import EpochGatherer
-from drivers.gnss.rows import Row, join_rows
-from drivers.gnss.sbf_records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
-from drivers.gnss.sbf_startup import startup_messages
-from georef.records import (
+from swath.drivers.core.frame_kinds import NMEA, RTCM3, SBF
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.gnss import sbf_blocks as sbf
+from swath.drivers.gnss import sbf_frame as wire
+from swath.drivers.gnss import sbf_records as records
+from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.rows import Row, join_rows
+from swath.drivers.gnss.sbf_records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
+from swath.drivers.gnss.sbf_startup import startup_messages
+from swath.georef.records import (
     Chunk,
     EventMark,
     GnssFix,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple, TypeAlias
 
-from drivers.gnss.sbf_frame import BlockError, Layout
+from swath.drivers.gnss.sbf_frame import BlockError, Layout
 
 Triple: TypeAlias = tuple[float, float, float]
 

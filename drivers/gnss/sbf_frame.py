@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 from typing import Generic, NamedTuple, TypeVar
 
-from drivers.core.checksums import crc16_ccitt
-from drivers.core.frame_kinds import SBF_CRC_START, SBF_HEADER, SBF_NUMBER_BITS
+from swath.drivers.core.checksums import crc16_ccitt
+from swath.drivers.core.frame_kinds import SBF_CRC_START, SBF_HEADER, SBF_NUMBER_BITS
 
 BlockT = TypeVar("BlockT", bound=tuple[float, ...])
 

@@ -14,10 +14,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import ParserCounters
-from drivers.gnss import sbf_blocks as sbf
-from drivers.gnss.rows import Row
-from georef.records import (
+from swath.drivers.core.parser import ParserCounters
+from swath.drivers.gnss import sbf_blocks as sbf
+from swath.drivers.gnss.rows import Row
+from swath.georef.records import (
     EventMark,
     FixType,
     GnssFix,

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.startup import PhraseListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.startup import PhraseListener, StartupMessage, StartupWish, read_setup
 
 PORT = re.compile(r"(COM[1-4]|USB[12])")
 PROMPT = rb"(?:[^>$]*\n)?[A-Z]+[0-9]+>"

@@ -15,7 +15,7 @@ the receiver's UTC goes by, right or stale, and the second is iTOW's. Where NAV-
 vouch for another count, UTC is set right by theirs (``utc_contradicts_leap``). A UTC that is no whole number of
 seconds, up to 60, off its iTOW is not valid (``utc_contradicts_itow``).
 
-Fix: the NAV messages of one iTOW make one `GnssFix` (`drivers.gnss.epochs`), complete at NAV-EOE at the latest:
+Fix: the NAV messages of one iTOW make one `GnssFix` (`swath.drivers.gnss.epochs`), complete at NAV-EOE at the latest:
 NAV-PVT, refined by NAV-HPPOSLLH, with the covariances of NAV-COV or else of the accuracies, and NAV-TIMEGPS's week.
 """
 
@@ -26,15 +26,15 @@ import math
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-from drivers.core.frame_kinds import GNSS_KINDS
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, StreamParser
-from drivers.gnss import ubx_messages as ubx
-from drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
-from drivers.gnss.epochs import EpochGatherer
-from drivers.gnss.ubx_fix import NavMessage, merge_epoch
-from drivers.gnss.ubx_startup import startup_messages
-from georef.records import (
+from swath.drivers.core.frame_kinds import GNSS_KINDS
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.gnss import ubx_messages as ubx
+from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.ubx_fix import NavMessage, merge_epoch
+from swath.drivers.gnss.ubx_startup import startup_messages
+from swath.georef.records import (
     Chunk,
     EventMark,
     GnssFix,

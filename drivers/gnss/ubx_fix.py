@@ -8,8 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.gnss import ubx_messages as ubx
-from georef.records import FixType, GnssFix, TimeScale, TimeTag
+from swath.drivers.gnss import ubx_messages as ubx
+from swath.georef.records import FixType, GnssFix, TimeScale, TimeTag
 
 NavMessage: TypeAlias = ubx.NavPvt | ubx.NavHpposllh | ubx.NavCov | ubx.NavTimegps
 Position: TypeAlias = tuple[float, float, float, NDArray[np.float64]]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import Generic, NamedTuple, TypeVar
 
-from drivers.core.checksums import ubx_fletcher
+from swath.drivers.core.checksums import ubx_fletcher
 
 MessageT = TypeVar("MessageT", bound=tuple[float, ...])
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-from drivers.core.frame_kinds import GNSS_KINDS
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, DriverSettingsError, ParserCounters
-from drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish, read_setup
-from drivers.gnss.ubx_messages import encode_frame
+from swath.drivers.core.frame_kinds import GNSS_KINDS
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, ParserCounters
+from swath.drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.gnss.ubx_messages import encode_frame
 
 CFG_VALSET = b"\x06\x8a"
 ACK_ACK, ACK_NAK = b"\x05\x01", b"\x05\x00"  # payload: class and id of what is answered

@@ -1,6 +1,7 @@
 """CSS Electronics CANmod.gps: an automotive IMU (100 Hz) and a GNSS receiver (1 Hz) on one CAN bus.
 
-A preset over `drivers.imu.dbc` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence inside). The
+A preset over `swath.drivers.imu.dbc` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence inside).
+The
 device has no counter and no PPS output: its samples are timed by their arrival, and its time message, a second old
 and some 0.5 s late, names the edge before it for a host that has PPS from elsewhere.
 """
@@ -14,11 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.core.can_frames import decode_can_frames
-from drivers.core.parser import DeviceSettings, Driver
-from drivers.imu.dbc import DbcParser
-from drivers.imu.dbc_signals import SignalLayout, find_signal, load_database
-from georef.records import (
+from swath.drivers.core.can_frames import decode_can_frames
+from swath.drivers.core.parser import DeviceSettings, Driver
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.imu.dbc_signals import SignalLayout, find_signal, load_database
+from swath.georef.records import (
     ByteRows,
     DeviceStatus,
     FixType,

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 RESTART_TOLERANCE_S = 2.0  # host stamps may be late by stalls of this size
 RESTART_TOLERANCE_RATE = 0.01  # and both clocks together off by this

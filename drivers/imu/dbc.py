@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
-from drivers.core.parser import DeviceSettings, Driver, PacketParser
-from drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
-from drivers.imu.dbc_settings import MappedSignal, Part, SignalMap, map_signals
-from drivers.imu.sample_groups import (
+from swath.drivers.core.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
+from swath.drivers.core.parser import DeviceSettings, Driver, PacketParser
+from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
+from swath.drivers.imu.dbc_settings import MappedSignal, Part, SignalMap, map_signals
+from swath.drivers.imu.sample_groups import (
     Frames,
     GroupRule,
     SampleGrouper,
@@ -25,7 +25,7 @@ from drivers.imu.sample_groups import (
     has_evidence,
     no_frames,
 )
-from georef.records import (
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     IMU_DTYPE,
     ByteRows,

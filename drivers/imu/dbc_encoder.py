@@ -1,6 +1,6 @@
 """Writes the CAN frames of an inertial unit by the same signal map its parser reads them with.
 
-For the virtual aircraft and the tests, for any unit described by a DBC: what `drivers.imu.dbc` reads back.
+For the virtual aircraft and the tests, for any unit described by a DBC: what `swath.drivers.imu.dbc` reads back.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.can_frames import CAN_FRAME_BYTES, CAN_FRAME_DTYPE
-from drivers.imu.dbc_settings import MappedSignal, SignalMap
-from drivers.imu.dbc_signals import FLOAT_TYPES, SignalLayout
-from georef.records import ByteRows, Int64Array
+from swath.drivers.core.can_frames import CAN_FRAME_BYTES, CAN_FRAME_DTYPE
+from swath.drivers.imu.dbc_settings import MappedSignal, SignalMap
+from swath.drivers.imu.dbc_signals import FLOAT_TYPES, SignalLayout
+from swath.georef.records import ByteRows, Int64Array
 
 Float64Array = NDArray[np.float64]
 CLASSIC_BYTES = 8

@@ -1,4 +1,4 @@
-"""From the configuration's signal names to found signals, parts and units (`drivers.imu.dbc`)."""
+"""From the configuration's signal names to found signals, parts and units (`swath.drivers.imu.dbc`)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fractions import Fraction
 from math import radians
 from typing import Any
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.imu.dbc_signals import FoundSignal, SignalLayout, find_signal, load_database
-from drivers.imu.sample_groups import GroupRule
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.imu.dbc_signals import FoundSignal, SignalLayout, find_signal, load_database
+from swath.drivers.imu.sample_groups import GroupRule
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 UNITS = {  # as `_plain_unit` spells them -> factor to SI

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.can_frames import frame_id
-from drivers.core.parser import DriverSettingsError
-from georef.records import ByteRows
-from georef.text_encoding import decoded
+from swath.drivers.core.can_frames import frame_id
+from swath.drivers.core.parser import DriverSettingsError
+from swath.georef.records import ByteRows
+from swath.georef.text_encoding import decoded
 
 UInt64Array = NDArray[np.uint64]
 Float64Array = NDArray[np.float64]

@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.can_frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from drivers.imu.fast_packets import FastPackets
-from georef.records import (
+from swath.drivers.core.can_frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.imu.fast_packets import FastPackets
+from swath.georef.records import (
     ByteRows,
     DeviceStatus,
     FixType,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.core.parser import DeviceSettings, Driver
-from drivers.gnss.novatel import NovatelParser
-from drivers.gnss.novatel_startup import imu_startup_messages
-from georef.records import ImuSamples, InsSolution
+from swath.drivers.core.parser import DeviceSettings, Driver
+from swath.drivers.gnss.novatel import NovatelParser
+from swath.drivers.gnss.novatel_startup import imu_startup_messages
+from swath.georef.records import ImuSamples, InsSolution
 
 
 def make_imu_parser(settings: DeviceSettings) -> NovatelParser:

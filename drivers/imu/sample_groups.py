@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import ByteRows, Int64Array
+from swath.georef.records import ByteRows, Int64Array
 
 GroupRule = Literal["last", "first", "repeat"]
 EVIDENCE = 32  # frames of each part that tell where a sample ends

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.core.parser import DeviceSettings, Driver
-from drivers.gnss.sbf import SbfParser
-from drivers.gnss.sbf_startup import imu_startup_messages
-from georef.records import ImuSamples, InsSolution
+from swath.drivers.core.parser import DeviceSettings, Driver
+from swath.drivers.gnss.sbf import SbfParser
+from swath.drivers.gnss.sbf_startup import imu_startup_messages
+from swath.georef.records import ImuSamples, InsSolution
 
 
 def make_imu_parser(settings: DeviceSettings) -> SbfParser:

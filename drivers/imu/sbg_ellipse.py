@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.core.parser import DeviceSettings, Driver
-from drivers.imu.can_profile import profile_map
-from drivers.imu.dbc import DbcParser
-from drivers.imu.dbc_settings import SignalMap
-from georef.records import DeviceClockSamples, ImuSamples
+from swath.drivers.core.parser import DeviceSettings, Driver
+from swath.drivers.imu.can_profile import profile_map
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.imu.dbc_settings import SignalMap
+from swath.georef.records import DeviceClockSamples, ImuSamples
 
 DBC_PATH = Path(__file__).with_name("sbg-ellipse.dbc")
 PREFIX = "SBG_ECAN_MSG_"

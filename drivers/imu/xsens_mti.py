@@ -17,11 +17,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError
-from drivers.imu.can_profile import profile_map
-from drivers.imu.dbc import DbcParser
-from drivers.imu.dbc_settings import SignalMap
-from georef.records import ImuSamples
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError
+from swath.drivers.imu.can_profile import profile_map
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.imu.dbc_settings import SignalMap
+from swath.georef.records import ImuSamples
 
 BYTE_ORDERS = {"big": 0, "little": 1}  # as a DBC numbers them
 

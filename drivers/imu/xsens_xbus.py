@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.core.frame_kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
-from drivers.core.framing import Frame, Framer
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
-from drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
-from georef.records import (
+from swath.drivers.core.frame_kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
+from swath.drivers.core.framing import Frame, Framer
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
+from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
+from swath.georef.records import (
     IMU_DTYPE,
     Chunk,
     ChunkBatch,

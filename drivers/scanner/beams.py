@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import StructArray
+from swath.georef.records import StructArray
 
 FloatArray = NDArray[np.float64]
 

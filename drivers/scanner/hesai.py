@@ -1,9 +1,9 @@
 """Hesai spinning heads of protocols 3.1 (PandarQT) and 6.1 (PandarXT-32): point cloud and GPS data packets.
 
-Wire format: the models' user manuals, 3.1.2 and Appendix II (`drivers.scanner.hesai_heads`), 3.2
-(`drivers.scanner.hesai_gps`). Device time is nanoseconds since 1970 of the UTC the head says, without leap seconds;
-from a virtual date on until it has been given a time. Its microseconds begin anew at each edge of its 1 Hz signal,
-so while the head says that this is locked to the PPS the beginning of its second is the latched edge.
+Wire format: the models' user manuals, 3.1.2 and Appendix II (`swath.drivers.scanner.hesai_heads`), 3.2
+(`swath.drivers.scanner.hesai_gps`). Device time is nanoseconds since 1970 of the UTC the head says, without leap
+seconds; from a virtual date on until it has been given a time. Its microseconds begin anew at each edge of its 1 Hz
+signal, so while the head says that this is locked to the PPS the beginning of its second is the latched edge.
 
 Azimuths are turned on from the block's to the channel's own firing with the motor's speed, as the maker's SDK does.
 """
@@ -16,14 +16,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
-from drivers.scanner.beams import BeamTable, FloatArray
-from drivers.scanner.hesai_gps import GPS_BYTES, NS, GpsReader
-from drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
-from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import Chosen, filler
-from drivers.scanner.spinning import Firings, returns_of_packets
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
+from swath.drivers.scanner.beams import BeamTable, FloatArray
+from swath.drivers.scanner.hesai_gps import GPS_BYTES, NS, GpsReader
+from swath.drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
+from swath.drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from swath.drivers.scanner.slots import Chosen, filler
+from swath.drivers.scanner.spinning import Firings, returns_of_packets
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,

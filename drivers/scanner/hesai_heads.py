@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.core.parser import DriverSettingsError
-from drivers.scanner.beams import BeamTable, beam_table, numbers
-from georef.records import Int64Array
+from swath.drivers.core.parser import DriverSettingsError
+from swath.drivers.scanner.beams import BeamTable, beam_table, numbers
+from swath.georef.records import Int64Array
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from drivers.scanner.ouster_head import FILE, SYNC_PULSE, read_head
-from drivers.scanner.ouster_health import HealthReader
-from drivers.scanner.ouster_imu import imu_packet_bytes, imu_samples
-from drivers.scanner.ouster_layout import (
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.scanner.ouster_head import FILE, SYNC_PULSE, read_head
+from swath.drivers.scanner.ouster_health import HealthReader
+from swath.drivers.scanner.ouster_imu import imu_packet_bytes, imu_samples
+from swath.drivers.scanner.ouster_layout import (
     ENCODER_COUNTS,
     IMU_PACKET,
     LIDAR_PACKET,
@@ -31,10 +31,18 @@ from drivers.scanner.ouster_layout import (
     LidarLayout,
     crc_holds,
 )
-from drivers.scanner.ouster_probe import OusterProbe
-from drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, filler, in_order, returns_table
-from georef.records import (
+from swath.drivers.scanner.ouster_probe import OusterProbe
+from swath.drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from swath.drivers.scanner.slots import (
+    BLOCK_SLOTS,
+    PairRule,
+    ReturnSlots,
+    common_words,
+    filler,
+    in_order,
+    returns_table,
+)
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
     RETURN_FLAG_STRONGEST,

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import DriverSettingsError
-from georef.records import StructArray
+from swath.drivers.core.parser import DriverSettingsError
+from swath.georef.records import StructArray
 
 FloatArray = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.scanner.ouster_head import SYNC_PULSE
-from drivers.scanner.ouster_layout import HEALTH, LidarLayout
-from georef.records import DeviceStatus, Int64Array, StructArray
+from swath.drivers.scanner.ouster_head import SYNC_PULSE
+from swath.drivers.scanner.ouster_layout import HEALTH, LidarLayout
+from swath.georef.records import DeviceStatus, Int64Array, StructArray
 
 
 class HealthReader:

@@ -13,9 +13,9 @@ from math import radians
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.scanner.ouster_head import FloatArray, OusterHead
-from drivers.scanner.ouster_layout import FOOTER_BYTES, HEADER_BYTES, IMU_PACKET, with_crc
-from georef.records import IMU_DTYPE, ByteRows, Int64Array, StructArray
+from swath.drivers.scanner.ouster_head import FloatArray, OusterHead
+from swath.drivers.scanner.ouster_layout import FOOTER_BYTES, HEADER_BYTES, IMU_PACKET, with_crc
+from swath.georef.records import IMU_DTYPE, ByteRows, Int64Array, StructArray
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 NMEA_BYTES = 100

@@ -18,9 +18,9 @@ import numpy as np
 from fastcrc.crc64 import xz as crc64_xz
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.parser import DriverSettingsError
-from drivers.scanner.ouster_head import FILE, FUSA_PROFILE, LARGEST_PACKET_BYTES, OusterHead
-from georef.records import StructArray
+from swath.drivers.core.parser import DriverSettingsError
+from swath.drivers.scanner.ouster_head import FILE, FUSA_PROFILE, LARGEST_PACKET_BYTES, OusterHead
+from swath.georef.records import StructArray
 
 HEADER_BYTES = FOOTER_BYTES = 32
 LIDAR_PACKET = 1  # packet type

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.core.parser import DeviceSettings, PacketParser
-from drivers.scanner.ouster_layout import FOOTER_BYTES, HEADER_BYTES, LIDAR_PACKET
-from drivers.scanner.sequence import BoolArray
-from georef.records import ByteRows, Int64Array, Record
+from swath.drivers.core.parser import DeviceSettings, PacketParser
+from swath.drivers.scanner.ouster_layout import FOOTER_BYTES, HEADER_BYTES, LIDAR_PACKET
+from swath.drivers.scanner.sequence import BoolArray
+from swath.georef.records import ByteRows, Int64Array, Record
 
 COLUMNS_PER_PACKET = 16  # "not user configurable", Firmware User Manual, Get the lidar data format
 LEAST_BEAMS = 16

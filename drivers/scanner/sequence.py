@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 BoolArray = NDArray[np.bool_]
 

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.scanner.beams import FloatArray
-from drivers.scanner.slots import (
+from swath.drivers.scanner.beams import FloatArray
+from swath.drivers.scanner.slots import (
     BLOCK_SLOTS,
     Chosen,
     Fill,
@@ -20,7 +20,7 @@ from drivers.scanner.slots import (
     in_order,
     returns_table,
 )
-from georef.records import Int64Array, StructArray
+from swath.georef.records import Int64Array, StructArray
 
 # A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` is all but the range.
 _CONTENT = np.dtype(

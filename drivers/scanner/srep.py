@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
-from drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, filler, returns_table
-from drivers.scanner.srep_layout import (
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
+from swath.drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, filler, returns_table
+from swath.drivers.scanner.srep_layout import (
     CRC,
     FLAG_LASER_ON,
     FLAG_PPS_LOCKED,
@@ -37,8 +37,8 @@ from drivers.scanner.srep_layout import (
     pulse_dtype,
     pulse_times,
 )
-from drivers.scanner.srep_units import Datagrams, clock_samples
-from georef.records import (
+from swath.drivers.scanner.srep_units import Datagrams, clock_samples
+from swath.georef.records import (
     RETURN_FLAG_PPS_LOCKED,
     ByteRows,
     ChunkBatch,

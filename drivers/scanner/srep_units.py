@@ -10,9 +10,9 @@ import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import NDArray
 
-from drivers.scanner.sequence import BoolArray
-from drivers.scanner.srep_layout import CRC, FLAG_PPS_LOCKED, HEADER_BYTES, HEADER_DTYPE, body_words, nanoseconds
-from georef.records import DEVICE_CLOCK_DTYPE, ByteRows, Int64Array, StructArray
+from swath.drivers.scanner.sequence import BoolArray
+from swath.drivers.scanner.srep_layout import CRC, FLAG_PPS_LOCKED, HEADER_BYTES, HEADER_DTYPE, body_words, nanoseconds
+from swath.georef.records import DEVICE_CLOCK_DTYPE, ByteRows, Int64Array, StructArray
 
 
 @dataclass(frozen=True, slots=True)

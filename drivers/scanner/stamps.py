@@ -7,7 +7,7 @@ from collections import Counter, deque
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 LATE_PACKETS = 16  # a packet at most this far behind its place was delayed by the network; further: the clock was set
 

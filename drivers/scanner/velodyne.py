@@ -1,8 +1,8 @@
 """Velodyne spinning heads: data packets (1206 bytes) and position packets (512 bytes), told apart by their length.
 
 Wire format: VLP-16 User Manual 63-9243 rev. D, sections 9.3 to 9.5. Device time is the packet's microseconds past
-the hour plus the laser's firing offset, nanoseconds, modulo one hour: *which* hour is for georef.timescales to find.
-It is UTC's hour only while the PPS status is locked; otherwise the head counts from power-on.
+the hour plus the laser's firing offset, nanoseconds, modulo one hour: *which* hour is for swath.georef.timescales to
+find. It is UTC's hour only while the PPS status is locked; otherwise the head counts from power-on.
 
 Dual returns (9.3.2): even blocks hold the last return, odd blocks the strongest, or the second-strongest where the
 strongest is the last. Equal ranges are one return. Of two returns the nearer is number 1, the farther is the last,
@@ -17,16 +17,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
-from drivers.scanner.beams import BeamTable, FloatArray
-from drivers.scanner.sequence import BoolArray, SampleThinner
-from drivers.scanner.slots import Chosen, filler
-from drivers.scanner.spinning import Firings, returns_of_packets
-from drivers.scanner.stamps import StampTracker
-from drivers.scanner.velodyne_calibration import read_calibration
-from drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
-from drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings, Driver, PacketParser, Parser
+from swath.drivers.scanner.beams import BeamTable, FloatArray
+from swath.drivers.scanner.sequence import BoolArray, SampleThinner
+from swath.drivers.scanner.slots import Chosen, filler
+from swath.drivers.scanner.spinning import Firings, returns_of_packets
+from swath.drivers.scanner.stamps import StampTracker
+from swath.drivers.scanner.velodyne_calibration import read_calibration
+from swath.drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from swath.drivers.scanner.velodyne_position import HOUR_US, POSITION_BYTES, PositionReader
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,

@@ -14,9 +14,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from drivers.core.parser import DriverSettingsError
-from drivers.scanner.beams import BeamTable, beam_table
-from drivers.scanner.velodyne_heads import SpinningHead
+from swath.drivers.core.parser import DriverSettingsError
+from swath.drivers.scanner.beams import BeamTable, beam_table
+from swath.drivers.scanner.velodyne_heads import SpinningHead
 
 _MOST_BYTES = 256 * 1024  # ten times the file of 128 lasers
 _MOST_LEVELS = 16  # a file has three

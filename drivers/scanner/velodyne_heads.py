@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.scanner.beams import BeamTable, beam_table, numbers
+from swath.drivers.scanner.beams import BeamTable, beam_table, numbers
 
 BLOCKS = 12  # of a data packet
 PLACES = 32  # of a block

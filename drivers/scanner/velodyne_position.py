@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.core.parser import DeviceSettings, ParserCounters
-from drivers.gnss.date_floor import ReceiverDates
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings, ParserCounters
+from swath.drivers.gnss.date_floor import ReceiverDates
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     ByteRows,
     DeviceClockSamples,

@@ -12,7 +12,7 @@ import termios
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from georef.records import ByteRows, Int64Array
+from swath.georef.records import ByteRows, Int64Array
 
 HEAD_ROOM_BYTES = 31  # of a message's header in the log: opcode, length, channel, sequence, two times (MCAP)
 

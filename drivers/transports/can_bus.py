@@ -21,11 +21,11 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
-from drivers.transports.can_frame import ERROR_BUS_OFF, pack_frame, unpack_frame
-from drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
-from drivers.transports.mmsg import DropCounter, ask_receive_buffer, stamping
-from drivers.transports.uri import TransportSpec
+from swath.drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
+from swath.drivers.transports.can_frame import ERROR_BUS_OFF, pack_frame, unpack_frame
+from swath.drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate
+from swath.drivers.transports.mmsg import DropCounter, ask_receive_buffer, stamping
+from swath.drivers.transports.uri import TransportSpec
 
 SOCKETCAND = "can.interfaces.socketcand.socketcand"
 CONNECT_S = 2.0  # to a gateway

@@ -1,7 +1,7 @@
 """SocketCAN: a raw AF_CAN socket with kernel stamps, drop count, CAN FD and error frames.
 
 Bit rate and state belong to the system (``ip link``, systemd-networkd), not to a socket: see
-`drivers.transports.can_link` for what the interface says.
+`swath.drivers.transports.can_link` for what the interface says.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import time
 
 import numpy as np
 
-from drivers.core.can_frames import CAN_ERR_FLAG, CANFD_FRAME_BYTES
-from drivers.transports.base import TransportError, UnitBlock
-from drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
-from drivers.transports.mmsg import DropCounter, MessageReader, ask_receive_buffer, ask_stamps
-from drivers.transports.uri import TransportSpec
+from swath.drivers.core.can_frames import CAN_ERR_FLAG, CANFD_FRAME_BYTES
+from swath.drivers.transports.base import TransportError, UnitBlock
+from swath.drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
+from swath.drivers.transports.mmsg import DropCounter, MessageReader, ask_receive_buffer, ask_stamps
+from swath.drivers.transports.uri import TransportSpec
 
 SLOTS = 256
 BATCH_S = 0.016  # 130 frames of a full 1 Mbit/s bus; the kernel has their stamps

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from drivers.core.can_frames import (
+from swath.drivers.core.can_frames import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
     CAN_ERR_FLAG,
@@ -21,7 +21,14 @@ from drivers.core.can_frames import (
     CANFD_FRAME_BYTES,
     CANFD_LENGTHS,
 )
-from drivers.transports.capture_base import LATEST_NS, CapturedUnit, CaptureTally, read_lines, report, until_damage
+from swath.drivers.transports.capture_base import (
+    LATEST_NS,
+    CapturedUnit,
+    CaptureTally,
+    read_lines,
+    report,
+    until_damage,
+)
 
 _LINE = re.compile(r"\((\d{1,11})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(\S*)(?:\s+[RT])?")
 _SHOWN = re.compile(r"(?:\([^)]*\)\s+)?\S+\s+(?:[RT]X [-B] [-E]\s+)?[0-9A-Fa-f]{3,8}\s+\[\d{1,2}\](?:\s.*)?")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from io import BufferedIOBase
 from pathlib import Path
 
-from drivers.transports.base import TransportError
+from swath.drivers.transports.base import TransportError
 
 Address = tuple[str, int]
 LATEST_NS = 2**63 - 1

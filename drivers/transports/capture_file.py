@@ -5,10 +5,10 @@ magic. For import, replaying, demonstrations and tests. A file that is not what 
 with one line, after the units before the bad place were given; a reader that is given a `CaptureTally` counts instead.
 """
 
-from drivers.transports.candump_file import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
-from drivers.transports.capture_base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning
-from drivers.transports.pcap_file import is_pcap, read_pcap
-from drivers.transports.serial_file import BareTime, chunk_table, read_bare, read_serial, read_tagged
+from swath.drivers.transports.candump_file import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
+from swath.drivers.transports.capture_base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning
+from swath.drivers.transports.pcap_file import is_pcap, read_pcap
+from swath.drivers.transports.serial_file import BareTime, chunk_table, read_bare, read_serial, read_tagged
 
 __all__ = [
     "Address",

@@ -9,7 +9,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Sized
 
-from drivers.transports.base import Transport, TransportCounters, TransportError, UnitBlock
+from swath.drivers.transports.base import Transport, TransportCounters, TransportError, UnitBlock
 
 HUNG_UP = select.POLLHUP | select.POLLERR | select.POLLNVAL
 

@@ -21,8 +21,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transports.base import HEAD_ROOM_BYTES, UnitBlock
-from georef.records import ByteRows, Int64Array
+from swath.drivers.transports.base import HEAD_ROOM_BYTES, UnitBlock
+from swath.georef.records import ByteRows, Int64Array
 
 SO_TIMESTAMPNS = 35  # also SCM_TIMESTAMPNS, <asm-generic/socket.h>
 SO_RCVBUFFORCE = 33

@@ -19,10 +19,10 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from drivers.core.checksums import nmea_xor
-from drivers.transports.base import TransportError, UnitBlock
-from drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
-from drivers.transports.uri import TransportSpec, ntrip_position
+from swath.drivers.core.checksums import nmea_xor
+from swath.drivers.transports.base import TransportError, UnitBlock
+from swath.drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
+from swath.drivers.transports.uri import TransportSpec, ntrip_position
 
 CONNECT_S = 8.0  # for each address of the caster, and again for its answer
 SLICE_S = 0.1

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
 
-from drivers.transports.base import TransportError
-from drivers.transports.capture_base import (
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_base import (
     LATEST_NS,
     CaptureDamageError,
     CapturedUnit,
@@ -22,7 +22,7 @@ from drivers.transports.capture_base import (
     report,
     until_damage,
 )
-from drivers.transports.ip_packets import IpPackets, UnknownLinkError, ip_packet
+from swath.drivers.transports.ip_packets import IpPackets, UnknownLinkError, ip_packet
 
 # pcap file header, magic as read little-endian: byte order of what follows, nanoseconds of one fraction
 _PCAP_KINDS = {

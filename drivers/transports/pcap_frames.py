@@ -11,8 +11,8 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transports.capture_base import Address
-from georef.records import ByteRows, Int64Array
+from swath.drivers.transports.capture_base import Address
+from swath.georef.records import ByteRows, Int64Array
 
 NOBODY: Address = ("0.0.0.0", 0)  # a sender that the log does not name
 FILE_HEADER = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 262_144, 1)  # stamps in nanoseconds, Ethernet

@@ -20,7 +20,7 @@ import threading
 import time
 from collections import Counter
 
-from drivers.transports.base import PpsSource, RawEdge, TransportError
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportError
 
 _TIOCMIWAIT = 0x545C  # <asm-generic/ioctls.h>
 _TIOCGICOUNT = 0x545D

@@ -9,9 +9,9 @@ import struct
 import sys
 import threading
 
-from drivers.transports.base import PpsSource, RawEdge, TransportError
-from drivers.transports.pps_dcd import SerialDcdPps
-from drivers.transports.pps_fixed import FixedPps
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportError
+from swath.drivers.transports.pps_dcd import SerialDcdPps
+from swath.drivers.transports.pps_fixed import FixedPps
 
 __all__ = ["FixedPps", "KernelPps", "SerialDcdPps"]
 

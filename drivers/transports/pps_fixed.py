@@ -12,8 +12,8 @@ import stat
 import threading
 import time
 
-from drivers.transports.base import PpsSource, RawEdge, TransportCounters, TransportError
-from drivers.transports.descriptor import Gate
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters, TransportError
+from swath.drivers.transports.descriptor import Gate
 
 READ_BYTES = 65536
 MAX_LINE_BYTES = 64  # two 64-bit numbers have 41 characters

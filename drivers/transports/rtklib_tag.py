@@ -23,8 +23,8 @@ from io import BufferedIOBase
 
 import numpy as np
 
-from georef.records import Int64Array
-from georef.timescales import SECOND_NS, table_leap_seconds
+from swath.georef.records import Int64Array
+from swath.georef.timescales import SECOND_NS, table_leap_seconds
 
 MARK = b"TIMETAG RTKLIB"
 _TEXT_BYTES = 60

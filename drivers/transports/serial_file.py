@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from io import BufferedIOBase
 from pathlib import Path
 
-from drivers.transports.base import TransportError
-from drivers.transports.capture_base import (
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_base import (
     CaptureDamageError,
     CapturedUnit,
     CaptureTally,
@@ -19,7 +19,7 @@ from drivers.transports.capture_base import (
     read_lines,
     until_damage,
 )
-from drivers.transports.rtklib_tag import read_tags
+from swath.drivers.transports.rtklib_tag import read_tags
 
 _LARGEST_FILE_BYTES = 2**62
 MAX_READ_BYTES = 16 << 20  # of one arrival; the recorder's own reads are far below

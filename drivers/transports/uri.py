@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.transports.base import PpsSource, Transport
+from swath.drivers.transports.base import PpsSource, Transport
 
 FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
@@ -320,17 +320,17 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
         ValueError: the kind has no transport of its own (gnss).
     """
     if spec.kind == "udp":
-        from drivers.transports.udp_socket import UdpTransport
+        from swath.drivers.transports.udp_socket import UdpTransport
 
         return UdpTransport(spec)
     if spec.kind == "serial":
-        from drivers.transports.serial_port import SerialTransport
+        from swath.drivers.transports.serial_port import SerialTransport
 
         return SerialTransport(spec)
     if spec.kind == "can":
         return _open_can(spec)
     if spec.kind == "ntrip":
-        from drivers.transports.ntrip_client import NtripTransport
+        from swath.drivers.transports.ntrip_client import NtripTransport
 
         return NtripTransport(spec, stopped)
     raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
@@ -338,10 +338,10 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
 
 def _open_can(spec: TransportSpec) -> Transport:
     if spec.interface == "socketcan":
-        from drivers.transports.can_socket import SocketCanTransport
+        from swath.drivers.transports.can_socket import SocketCanTransport
 
         return SocketCanTransport(spec)
-    from drivers.transports.can_bus import PythonCanTransport
+    from swath.drivers.transports.can_bus import PythonCanTransport
 
     return PythonCanTransport(spec)
 
@@ -352,7 +352,7 @@ def parse_pps(text: str, edge: str = "assert") -> PpsSource:
     Raises:
         ValueError: one line naming what is wrong and what would be right.
     """
-    from drivers.transports.pps_device import FixedPps, KernelPps, SerialDcdPps
+    from swath.drivers.transports.pps_device import FixedPps, KernelPps, SerialDcdPps
 
     _refuse_unprintable("PPS source", text)
     if edge not in ("assert", "clear"):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
-from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
-from georef.formats.trajectory_csv import is_csv
-from georef.formats.waypoint import is_waypoint, read_waypoint
-from georef.text_encoding import decoded
-from georef.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
+from swath.georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
+from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
+from swath.georef.formats.trajectory_csv import is_csv
+from swath.georef.formats.waypoint import is_waypoint, read_waypoint
+from swath.georef.text_encoding import decoded
+from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
 
 
 def read_antenna_positions(

@@ -16,11 +16,11 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept
-from georef.formats.las import BLOCK, Clipped, LasSettings, PointPacker
-from georef.formats.las_header import POINT_FORMAT, LasHeader, encode_copc_info, encode_evlr, encode_vlr
-from georef.points import FloatArray, Points
-from georef.records import Int64Array
+from swath.georef.compiled import kept
+from swath.georef.formats.las import BLOCK, Clipped, LasSettings, PointPacker
+from swath.georef.formats.las_header import POINT_FORMAT, LasHeader, encode_copc_info, encode_evlr, encode_vlr
+from swath.georef.points import FloatArray, Points
+from swath.georef.records import Int64Array
 
 NODE_POINTS = 65_536
 ALL_OF = 1.5  # times that many: a node takes all that is left, rather than leave crumbs to eight others

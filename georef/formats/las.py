@@ -15,10 +15,10 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
-from georef.points import ByteArray, FloatArray, Points, SingleArray
-from georef.records import Int64Array
+from swath.georef.compiled import kept, kernel
+from swath.georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
+from swath.georef.points import ByteArray, FloatArray, Points, SingleArray
+from swath.georef.records import Int64Array
 
 ADJUSTED_GPS_EPOCH_S = 1_000_000_000
 SCAN_ANGLE_UNIT_RAD = math.radians(0.006)

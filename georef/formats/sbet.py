@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.formats.trajectory_columns import (
+from swath.georef.formats.trajectory_columns import (
     Span,
     TrajectoryColumns,
     continuous_of_week,
@@ -27,10 +27,10 @@ from georef.formats.trajectory_columns import (
     placed_in_week,
     unsaid,
 )
-from georef.quaternions import conjugate, rotated
-from georef.records import Int64Array
-from georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
-from georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.quaternions import conjugate, rotated
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
+from swath.georef.trajectory import Trajectory, TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

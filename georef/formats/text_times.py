@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.gps_time import (
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import (
     DAY_NS,
     GPS_EPOCH,
     LEAP_TABLE_VALID_UNTIL,
@@ -18,7 +18,7 @@ from georef.timescales.gps_time import (
     WEEK_NS,
     table_leap_seconds,
 )
-from georef.trajectory import TrajectoryError
+from swath.georef.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

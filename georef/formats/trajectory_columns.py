@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import e_from_geodetic
-from georef.quaternions import about, conjugate, product, rotated
-from georef.records import Int64Array
-from georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
-from georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.georef.earth import e_from_geodetic
+from swath.georef.quaternions import about, conjugate, product, rotated
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
+from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
 
 FloatArray = NDArray[np.float64]
 Span = tuple[int, int]
@@ -40,7 +40,8 @@ class TrajectoryColumns:
         row: what a row is called in messages: record, line.
         first_row: number of the first one.
         angles_in: the unit which the file should have for attitudes and positions, for messages.
-        fix_type, satellites: (n,) of positions of an antenna, `georef.records.FixType`; None: the file does not say.
+        fix_type, satellites: (n,) of positions of an antenna, `swath.georef.records.FixType`; None: the file does not
+        say.
         velocity_sigma_l: (n, 3) one standard deviation; None likewise.
         position_correlation_l: (n, 3) of north–east, north–down, east–down; None likewise.
     """

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
-from georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, read_smrmsg
-from georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
-from georef.formats.trajectory_csv import is_csv, read_csv
-from georef.formats.waypoint import is_waypoint, read_waypoint
-from georef.text_encoding import decoded, encoding_of
-from georef.timescales.gps_time import SECOND_NS
-from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
+from swath.georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
+from swath.georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, read_smrmsg
+from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
+from swath.georef.formats.trajectory_csv import is_csv, read_csv
+from swath.georef.formats.waypoint import is_waypoint, read_waypoint
+from swath.georef.text_encoding import decoded, encoding_of
+from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
 
 LOOKED_AT = 65_536  # bytes that tell text from numbers
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
-from georef.compiled import kept, kernel
-from georef.earth import A_M, B_M, E2, EP2
+from swath.georef.compiled import kept, kernel
+from swath.georef.earth import A_M, B_M, E2, EP2
 
 FloatArray = NDArray[np.float64]
 

@@ -1,15 +1,15 @@
 """What stands between a point and its errors: vectors in b, for a block of returns that was made points of.
 
-`georef.kernels.rays` hands them over, or makes covariances of them (`georef.kernels.covariance`).
+`swath.georef.kernels.rays` hands them over, or makes covariances of them (`swath.georef.kernels.covariance`).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from georef.compiled import kernel
-from georef.kernels.beam import FIBRE_BY_CHANNEL, FIXED_ANGLE
-from georef.kernels.block import (
+from swath.georef.compiled import kernel
+from swath.georef.kernels.beam import FIBRE_BY_CHANNEL, FIXED_ANGLE
+from swath.georef.kernels.block import (
     ACCELERATION,
     ACROSS,
     ALONG,
@@ -32,7 +32,7 @@ from georef.kernels.block import (
     swing,
     three,
 )
-from georef.kernels.covariance import (
+from swath.georef.kernels.covariance import (
     Doubt,
     Interval,
     doubt_range,
@@ -40,7 +40,7 @@ from georef.kernels.covariance import (
     spread,
     take_axes,
 )
-from georef.kernels.rotations import (
+from swath.georef.kernels.rotations import (
     cross,
     dot,
     matrix_at,
@@ -49,7 +49,7 @@ from georef.kernels.rotations import (
     times,
     vector_at,
 )
-from georef.kernels.types import Axes, FloatArray, Mounted, Scanning, Three, Track
+from swath.georef.kernels.types import Axes, FloatArray, Mounted, Scanning, Three, Track
 
 NOWHERE = (0.0, 0.0, 0.0)
 

@@ -1,7 +1,7 @@
 """One beam in the head's own axes: where it starts, where it points, and how both turn with the scan angle.
 
-A geometry is a row of eight numbers a channel (`georef.beams` fills them). In all of them column 7 is metres added to
-the range; columns 0 to 6 are
+A geometry is a row of eight numbers a channel (`swath.georef.beams` fills them). In all of them column 7 is metres
+added to the range; columns 0 to 6 are
 
     LINE       sin Δη, cos Δη, sin ε, cos ε of a mirror tilted by ε towards x; θ where the channel itself says it
     NUTATING   sin ψ, cos ψ of the normal from its shaft; sin β, cos β of the shaft from the laser's beam
@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 
-from georef.compiled import kernel
-from georef.kernels.types import Eight, Three, Two
+from swath.georef.compiled import kernel
+from swath.georef.kernels.types import Eight, Three, Two
 
 LINE, NUTATING, RISLEY, SPINNING = 0, 1, 2, 3
 ONE, BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER = 0, 1, 2, 3  # how a return chooses its row
@@ -77,8 +77,8 @@ def risley_beam(row: Eight, first: Two, second: Two) -> Three:
     """Through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
 
     Before it the ray is a cone about z that turns with the first prism: the three surfaces before are passed once for
-    all, in `georef.beams`. nan where the light is totally reflected. ``first``, ``second``: sine and cosine of both
-    prisms' angles.
+    all, in `swath.georef.beams`. nan where the light is totally reflected. ``first``, ``second``: sine and cosine of
+    both prisms' angles.
     """
     x, y, z = row[0] * first[1], row[0] * first[0], row[1]
     nx, ny, nz = row[2] * second[1], row[2] * second[0], row[3]

@@ -1,4 +1,4 @@
-"""A block of returns on its way through `georef.kernels.rays`: a table with a row for each quantity.
+"""A block of returns on its way through `swath.georef.kernels.rays`: a table with a row for each quantity.
 
 Each step goes over the block once, reads some rows and fills others. Steps without a branch are compiled for several
 returns at once, and a block stays in the nearest cache.
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from georef.compiled import kernel, whole
-from georef.kernels.beam import (
+from swath.georef.compiled import kernel, whole
+from swath.georef.kernels.beam import (
     LINE,
     NUTATING,
     SPINNING,
@@ -27,7 +27,7 @@ from georef.kernels.beam import (
     spinning_beam,
     spinning_turn,
 )
-from georef.kernels.rotations import (
+from swath.georef.kernels.rotations import (
     LARGE_ANGLE,
     SMALL_ANGLE_2,
     plus,
@@ -40,7 +40,7 @@ from georef.kernels.rotations import (
     turn_factors,
     turned_by,
 )
-from georef.kernels.types import Eight, FloatArray, Matrix, Three
+from swath.georef.kernels.types import Eight, FloatArray, Matrix, Three
 
 BLOCK = 64
 

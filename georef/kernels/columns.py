@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from georef.compiled import kept
-from georef.kernels.types import FloatArray, PointColumns
-from georef.records import Int64Array, StructArray
+from swath.georef.compiled import kept
+from swath.georef.kernels.types import FloatArray, PointColumns
+from swath.georef.records import Int64Array, StructArray
 
 
 @kept

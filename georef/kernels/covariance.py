@@ -5,7 +5,7 @@ shifts, lengthens and tilts the beam. The covariance of a point is the sum of th
 do to it, and of what trajectory, range, angle and time do. Where the errors only turn, shift and lengthen, their sum is
 taken before the returns. What turns with the body is summed in b.
 
-These are steps over a block of returns (`georef.kernels.block`) on its way through `georef.kernels.rays`.
+These are steps over a block of returns (`swath.georef.kernels.block`) on its way through `swath.georef.kernels.rays`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple, TypeAlias
 
-from georef.compiled import kept, kernel
-from georef.earth import down_of, geodetic_of
-from georef.kernels.block import (
+from swath.georef.compiled import kept, kernel
+from swath.georef.earth import down_of, geodetic_of
+from swath.georef.kernels.block import (
     ACCELERATION,
     ACROSS,
     ANGLE_OFF,
@@ -41,9 +41,9 @@ from georef.kernels.block import (
     put,
     three,
 )
-from georef.kernels.rotations import cross, dot, plus, rot_at, transposed_times, vector_at
-from georef.kernels.types import FloatArray, Matrix, Six, Three
-from georef.records import Int64Array
+from swath.georef.kernels.rotations import cross, dot, plus, rot_at, transposed_times, vector_at
+from swath.georef.kernels.types import FloatArray, Matrix, Six, Three
+from swath.georef.records import Int64Array
 
 # Columns of `Known.errors`: what one independent error does.
 TURN, TURN_BY_ANGLE, SHIFT = 0, 3, 6  # rotation vectors of the beam in b, the second times θ; metres in b
@@ -59,7 +59,7 @@ NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Flown(NamedTuple):
-    """Columns of `georef.trajectory.Trajectory`, and its motion between the epochs."""
+    """Columns of `swath.georef.trajectory.Trajectory`, and its motion between the epochs."""
 
     time_ns: Int64Array
     position_e: FloatArray

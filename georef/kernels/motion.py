@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
+from swath.georef.compiled import kept, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

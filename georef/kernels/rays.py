@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from georef.compiled import kept, kernel, whole
-from georef.earth import E2
-from georef.kernels.axes import fill_axes, fill_covariance, take_readings, through_mount, turn_axes
-from georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, ONE, RANGE, SPINNING
-from georef.kernels.block import (
+from swath.georef.compiled import kept, kernel, whole
+from swath.georef.earth import E2
+from swath.georef.kernels.axes import fill_axes, fill_covariance, take_readings, through_mount, turn_axes
+from swath.georef.kernels.beam import FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER, FIXED_ANGLE, ONE, RANGE, SPINNING
+from swath.georef.kernels.block import (
     ACROSS,
     ALONG,
     BEAM,
@@ -40,11 +40,11 @@ from georef.kernels.block import (
     put,
     three,
 )
-from georef.kernels.covariance import (
+from swath.georef.kernels.covariance import (
     Doubt,
     interval_at,
 )
-from georef.kernels.rotations import (
+from swath.georef.kernels.rotations import (
     angle_of,
     cross,
     dot,
@@ -58,10 +58,10 @@ from georef.kernels.rotations import (
     unit,
     vector_at,
 )
-from georef.kernels.types import Axes, FloatArray, Matrix, Model, Out, Ranging, Scanning, Three, Track
-from georef.points import Fate
-from georef.records import Int64Array, StructArray
-from georef.trajectory import locate_epoch
+from swath.georef.kernels.types import Axes, FloatArray, Matrix, Model, Out, Ranging, Scanning, Three, Track
+from swath.georef.points import Fate
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.trajectory import locate_epoch
 
 DONE, NO_TIME, OUTSIDE, GAP = (
     int(fate) for fate in (Fate.GEOREFERENCED, Fate.NO_TIME, Fate.OUTSIDE_TRAJECTORY, Fate.TRAJECTORY_GAP)

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]
@@ -48,7 +48,7 @@ class Scanning(NamedTuple):
     """Encoder reading to θ, θ to the beam.
 
     Attributes:
-        kind, table: of the geometry (`georef.kernels.beam`).
+        kind, table: of the geometry (`swath.georef.kernels.beam`).
         select: how a row chooses its channel of the table.
         scale, offset_rad, latency_s, torsion_s2: of the parameters.
         rate, acceleration: (n,) of the readings; (0,): none of them counts.
@@ -90,7 +90,7 @@ class Track(NamedTuple):
     """The trajectory, and when of it a pulse is.
 
     Attributes:
-        time_ns, position_e, q_e_from_b, rotvec_b, max_gap_ns: of `georef.trajectory.Trajectory`.
+        time_ns, position_e, q_e_from_b, rotvec_b, max_gap_ns: of `swath.georef.trajectory.Trajectory`.
         offset_ns, latency_ns: time_offset, imu_latency.
     """
 
@@ -113,7 +113,7 @@ class Model(NamedTuple):
 
 
 class Out(NamedTuple):
-    """The first half of `georef.points.Rays`."""
+    """The first half of `swath.georef.points.Rays`."""
 
     fate: ByteArray
     time_ns: Int64Array
@@ -137,7 +137,7 @@ class Axes(NamedTuple):
 
 
 class PointColumns(NamedTuple):
-    """Columns (n,) of `georef.points.Points`."""
+    """Columns (n,) of `swath.georef.points.Points`."""
 
     time_ns: Int64Array
     scan_angle_rad: SingleArray

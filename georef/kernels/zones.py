@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
+from swath.georef.compiled import kept, kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -205,7 +205,7 @@ def resolve_zones(
     whole_m: FloatArray,
     angle_rad: FloatArray,
 ) -> int:
-    """Find the emission of each return; see `georef.ranging.ZoneResolver`.
+    """Find the emission of each return; see `swath.georef.ranging.ZoneResolver`.
 
     Args:
         rows: (n,) `RETURN_DTYPE`, in the order of their records.

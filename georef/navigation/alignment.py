@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e
-from georef.navigation.alignment_blocks import Blocks, Felt
-from georef.navigation.alignment_fit import PLACE, TILT, VELOCITY, Fitted, Problem
-from georef.navigation.gravity import EARTH_RATE_RADPS
-from georef.navigation.inputs import (
+from swath.georef.earth import geodetic_from_e
+from swath.georef.navigation.alignment_blocks import Blocks, Felt
+from swath.georef.navigation.alignment_fit import PLACE, TILT, VELOCITY, Fitted, Problem
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     ImuNoise,
     Inertial,
@@ -29,9 +29,9 @@ from georef.navigation.inputs import (
     Start,
     sort_observations,
 )
-from georef.records import Int64Array, StructArray
-from georef.rotations import attitude_of, rot_z
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import attitude_of, rot_z
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

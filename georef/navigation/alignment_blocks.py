@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef import quaternions
-from georef.navigation.inputs import Inertial
-from georef.records import Int64Array
-from georef.rotations import rot_from_quaternion, skew
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef import quaternions
+from swath.georef.navigation.inputs import Inertial
+from swath.georef.records import Int64Array
+from swath.georef.rotations import rot_from_quaternion, skew
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

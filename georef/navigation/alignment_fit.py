@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.alignment_blocks import Felt
-from georef.navigation.alignment_frame import RATE_IE_E, Frame
-from georef.navigation.alignment_noise import covariances as noise_covariances
-from georef.navigation.alignment_noise import spaced_headings
-from georef.navigation.inputs import Kind, Setup
-from georef.quaternions import rotation_vector
-from georef.records import Int64Array, StructArray
-from georef.rotations import quaternion_from_rot, rot_l_from_b, rot_z, skew
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.alignment_blocks import Felt
+from swath.georef.navigation.alignment_frame import RATE_IE_E, Frame
+from swath.georef.navigation.alignment_noise import covariances as noise_covariances
+from swath.georef.navigation.alignment_noise import spaced_headings
+from swath.georef.navigation.inputs import Kind, Setup
+from swath.georef.quaternions import rotation_vector
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b, rot_z, skew
 
 FloatArray = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.alignment_blocks import Felt
-from georef.navigation.gravity import EARTH_RATE_RADPS, gravity_e
-from georef.records import Int64Array, StructArray
-from georef.rotations import rot_z
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.alignment_blocks import Felt
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS, gravity_e
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import rot_z
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.alignment_blocks import FeltAt
-from georef.navigation.inputs import Setup
-from georef.records import StructArray
+from swath.georef.navigation.alignment_blocks import FeltAt
+from swath.georef.navigation.inputs import Setup
+from swath.georef.records import StructArray
 
 FloatArray = NDArray[np.float64]
 

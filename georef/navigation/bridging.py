@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.navigation.strapdown import Samples
-from georef.records import Int64Array
+from swath.georef.compiled import kept, kernel
+from swath.georef.navigation.strapdown import Samples
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

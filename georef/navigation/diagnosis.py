@@ -14,9 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.diagnosis_data import MOSTLY, force, gaps, receiver, times
-from georef.navigation.diagnosis_data import Finding as Finding
-from georef.navigation.diagnosis_motion import (
+from swath.georef.navigation.diagnosis_data import MOSTLY, force, gaps, receiver, times
+from swath.georef.navigation.diagnosis_data import Finding as Finding
+from swath.georef.navigation.diagnosis_motion import (
     FAILS,
     FITS,
     Mounting,
@@ -29,10 +29,10 @@ from georef.navigation.diagnosis_motion import (
     other_signs,
     windows,
 )
-from georef.navigation.diagnosis_time import SIGMAS, TimeOffset, time_offset, velocities
-from georef.navigation.inputs import Fate, Inertial, Kind, Setup, Solution
-from georef.records import StructArray
-from georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
+from swath.georef.navigation.diagnosis_time import SIGMAS, TimeOffset, time_offset, velocities
+from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Solution
+from swath.georef.records import StructArray
+from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
 
 FloatArray = NDArray[np.float64]
 

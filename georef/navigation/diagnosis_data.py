@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from georef.navigation.inputs import Inertial, Kind
-from georef.records import FixType, StructArray
-from georef.timescales.gps_time import SECOND_NS, week_from_gps
+from swath.georef.navigation.inputs import Inertial, Kind
+from swath.georef.records import FixType, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS, week_from_gps
 
 G_MPS2 = 9.80665
 MOSTLY = 0.5

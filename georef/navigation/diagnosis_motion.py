@@ -14,13 +14,13 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.alignment_blocks import Blocks, Felt
-from georef.navigation.alignment_fit import ARM, GYRO, TILT, Fitted, Problem
-from georef.navigation.diagnosis_time import velocities
-from georef.navigation.inputs import Inertial, Kind, Setup
-from georef.records import Int64Array, StructArray
-from georef.rotations import rot_z
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.navigation.alignment_blocks import Blocks, Felt
+from swath.georef.navigation.alignment_fit import ARM, GYRO, TILT, Fitted, Problem
+from swath.georef.navigation.diagnosis_time import velocities
+from swath.georef.navigation.inputs import Inertial, Kind, Setup
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.rotations import rot_z
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 WINDOW_NS = 40 * SECOND_NS

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.inputs import Inertial, Kind
-from georef.records import Int64Array, StructArray
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.inputs import Inertial, Kind
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
-from georef.quaternions import product
-from georef.records import StructArray
-from georef.rotations import attitude_of, rot_from_quaternion, rot_l_from_b, rot_z
-from georef.timescales import SECOND_NS
-from georef.trajectory import EARTH_RATE_RADPS
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
+from swath.georef.quaternions import product
+from swath.georef.records import StructArray
+from swath.georef.rotations import attitude_of, rot_from_quaternion, rot_l_from_b, rot_z
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import EARTH_RATE_RADPS
 
 FloatArray = NDArray[np.float64]
 StartT = TypeVar("StartT", bound=Start)

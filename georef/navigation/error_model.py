@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.kernels.rotations import cross
-from georef.kernels.types import Three
-from georef.navigation.gravity import EARTH_RATE_RADPS, gradient_of
-from georef.navigation.inputs import Setup
-from georef.navigation.strapdown import (
+from swath.georef.compiled import kept, kernel
+from swath.georef.kernels.rotations import cross
+from swath.georef.kernels.types import Three
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS, gradient_of
+from swath.georef.navigation.inputs import Setup
+from swath.georef.navigation.strapdown import (
     ACCEL_SCALE,
     ATTITUDE,
     GYRO_BIAS,

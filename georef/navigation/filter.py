@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.bridging import Bridges, made_up_variance, new_bridges, primed_bridges
-from georef.navigation.error_model import (
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.bridging import Bridges, made_up_variance, new_bridges, primed_bridges
+from swath.georef.navigation.error_model import (
     MOVED,
     Layout,
     begin_accumulation,
@@ -18,8 +18,8 @@ from georef.navigation.error_model import (
     layout_of,
     prior_variance,
 )
-from georef.navigation.filter_loop import advance, end_step, level_sigmas, write_node
-from georef.navigation.filter_types import (
+from swath.georef.navigation.filter_loop import advance, end_step, level_sigmas, write_node
+from swath.georef.navigation.filter_types import (
     CLOCK_SIZE,
     GAPS,
     KINDS,
@@ -32,13 +32,13 @@ from georef.navigation.filter_types import (
     Path,
     Running,
 )
-from georef.navigation.inputs import Fate, Inertial, Kind, Setup, Start
-from georef.navigation.measurements import rules_of
-from georef.navigation.stores import IN_MEMORY, NodeStore, PathStore, RowQueue, Storage, columns_of, told_of
-from georef.navigation.strapdown import LEVER_ARM, STATE_SIZE, SUM_TIME, Samples, samples_of
-from georef.records import StructArray
-from georef.rotations import quaternion_from_rot, rot_l_from_b
-from georef.timescales import SECOND_NS
+from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Start
+from swath.georef.navigation.measurements import rules_of
+from swath.georef.navigation.stores import IN_MEMORY, NodeStore, PathStore, RowQueue, Storage, columns_of, told_of
+from swath.georef.navigation.strapdown import LEVER_ARM, STATE_SIZE, SUM_TIME, Samples, samples_of
+from swath.georef.records import StructArray
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.timescales import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

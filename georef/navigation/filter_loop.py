@@ -11,11 +11,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.kernels.rotations import rot_of
-from georef.kernels.types import Three
-from georef.navigation.bridging import UNKNOWN_FORCE_MPS2, UNKNOWN_RATE_RADPS
-from georef.navigation.error_model import (
+from swath.georef.compiled import kept, kernel
+from swath.georef.kernels.rotations import rot_of
+from swath.georef.kernels.types import Three
+from swath.georef.navigation.bridging import UNKNOWN_FORCE_MPS2, UNKNOWN_RATE_RADPS
+from swath.georef.navigation.error_model import (
     E_ATTITUDE,
     E_POSITION,
     E_VELOCITY,
@@ -29,7 +29,7 @@ from georef.navigation.error_model import (
     propagate,
     transition,
 )
-from georef.navigation.filter_types import (
+from swath.georef.navigation.filter_types import (
     CHI2,
     GAPS,
     INFLATION,
@@ -52,12 +52,12 @@ from georef.navigation.filter_types import (
     Running,
     Told,
 )
-from georef.navigation.gate import drifted, judge, leapt, noise_factor, settling, still_away
-from georef.navigation.inputs import Fate
-from georef.navigation.kalman import factorise, innovation_covariance, take_component, whiten, whiten_rows
-from georef.navigation.level import attitude_rows, level_axes
-from georef.navigation.measurements import predict
-from georef.navigation.strapdown import (
+from swath.georef.navigation.gate import drifted, judge, leapt, noise_factor, settling, still_away
+from swath.georef.navigation.inputs import Fate
+from swath.georef.navigation.kalman import factorise, innovation_covariance, take_component, whiten, whiten_rows
+from swath.georef.navigation.level import attitude_rows, level_axes
+from swath.georef.navigation.measurements import predict
+from swath.georef.navigation.strapdown import (
     ATTITUDE,
     SUM_TIME,
     SUMS_SIZE,

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.error_model import Drive, Layout
-from georef.navigation.inputs import Kind
-from georef.navigation.measurements import Rules
-from georef.records import Int64Array
+from swath.georef.navigation.error_model import Drive, Layout
+from swath.georef.navigation.inputs import Kind
+from swath.georef.navigation.measurements import Rules
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 ByteArray = NDArray[np.uint8]

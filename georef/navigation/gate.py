@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kernel
-from georef.navigation.error_model import E_ATTITUDE, E_POSITION, E_VELOCITY, Layout
-from georef.navigation.filter_types import (
+from swath.georef.compiled import kernel
+from swath.georef.navigation.error_model import E_ATTITUDE, E_POSITION, E_VELOCITY, Layout
+from swath.georef.navigation.filter_types import (
     ALIKE,
     COUNT,
     LEAPT_NS,
@@ -29,7 +29,7 @@ from georef.navigation.filter_types import (
     Model,
     Running,
 )
-from georef.navigation.inputs import Fate, Kind
+from swath.georef.navigation.inputs import Fate, Kind
 
 FloatArray = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.compiled import kept, kernel
-from georef.earth import A_M, B_M, E2, EP2, F
-from georef.kernels.types import Matrix, Three
+from swath.georef.compiled import kept, kernel
+from swath.georef.earth import A_M, B_M, E2, EP2, F
+from swath.georef.kernels.types import Matrix, Three
 
 FloatArray = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.inputs import Kind, Setup
-from georef.navigation.noise import (
+from swath.georef.navigation.inputs import Kind, Setup
+from swath.georef.navigation.noise import (
     ENOUGH,
     EVIDENCE,
     PRIOR_SIGMA,
@@ -32,8 +32,8 @@ from georef.navigation.noise import (
     Run,
     log_likelihoods,
 )
-from georef.records import StructArray
-from georef.timescales import SECOND_NS
+from swath.georef.records import StructArray
+from swath.georef.timescales import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """What navigation takes and gives: inertial samples, observations, noise, installation, start, solution.
 
-SI units, radians, GPS time in nanoseconds; frames as in `georef.navigation`.
+SI units, radians, GPS time in nanoseconds; frames as in `swath.georef.navigation`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array, StructArray
-from georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -281,7 +281,7 @@ class Start:
 class Solution:
     """A navigated trajectory of the body's origin.
 
-    One of `georef.navigation.solve` is in GNSS's time where a time offset was estimated; of the smoothed one the
+    One of `swath.georef.navigation.solve` is in GNSS's time where a time offset was estimated; of the smoothed one the
     positions' sigmas are those of that time, of the forward one those of where the filter had it then.
 
     Attributes:

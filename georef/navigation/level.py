@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kernel
-from georef.kernels.rotations import cross, dot, plus
-from georef.kernels.types import Matrix, Three
-from georef.navigation.gravity import normal_of
-from georef.navigation.strapdown import POSITION
+from swath.georef.compiled import kernel
+from swath.georef.kernels.rotations import cross, dot, plus
+from swath.georef.kernels.types import Matrix, Three
+from swath.georef.navigation.gravity import normal_of
+from swath.georef.navigation.strapdown import POSITION
 
 FloatArray = NDArray[np.float64]
 

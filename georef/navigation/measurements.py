@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from georef.compiled import kept, kernel
-from georef.kernels.rotations import cross, dot, plus, rot_of, times, transposed_times
-from georef.kernels.types import Matrix, Three
-from georef.navigation.error_model import (
+from swath.georef.compiled import kept, kernel
+from swath.georef.kernels.rotations import cross, dot, plus, rot_of, times, transposed_times
+from swath.georef.kernels.types import Matrix, Three
+from swath.georef.navigation.error_model import (
     E_ATTITUDE,
     E_GYRO_BIAS,
     E_GYRO_LEAN,
@@ -32,11 +32,11 @@ from georef.navigation.error_model import (
     E_VELOCITY,
     Layout,
 )
-from georef.navigation.gravity import EARTH_RATE_RADPS, gravity_of, normal_of
-from georef.navigation.inputs import Kind, Setup
-from georef.navigation.kalman import factorise
-from georef.navigation.level import attitude_rows, in_level, level_axes, wrapped
-from georef.navigation.strapdown import (
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS, gravity_of, normal_of
+from swath.georef.navigation.inputs import Kind, Setup
+from swath.georef.navigation.kalman import factorise
+from swath.georef.navigation.level import attitude_rows, in_level, level_axes, wrapped
+from swath.georef.navigation.strapdown import (
     ATTITUDE,
     GYRO_LEAN,
     GYRO_SCALE,
@@ -56,7 +56,7 @@ from georef.navigation.strapdown import (
     row,
     three,
 )
-from georef.records import FixType
+from swath.georef.records import FixType
 
 FloatArray = NDArray[np.float64]
 

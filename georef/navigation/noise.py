@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.inputs import Fate, Kind, Setup
-from georef.records import StructArray
+from swath.georef.navigation.inputs import Fate, Kind, Setup
+from swath.georef.records import StructArray
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]

@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from georef.navigation.inputs import Inertial, NavigationError
-from georef.records import Int64Array, StructArray
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.navigation.inputs import Inertial, NavigationError
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

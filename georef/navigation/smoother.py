@@ -26,9 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.kernels.rotations import dot, rot_of
-from georef.navigation.error_model import (
+from swath.georef.compiled import kept, kernel
+from swath.georef.kernels.rotations import dot, rot_of
+from swath.georef.navigation.error_model import (
     E_ACCEL_LEAN,
     E_ATTITUDE,
     E_GYRO_LEAN,
@@ -39,12 +39,12 @@ from georef.navigation.error_model import (
     inject,
     turned_on_by,
 )
-from georef.navigation.filter import PIECE, FilterRun
-from georef.navigation.filter_loop import level_sigmas
-from georef.navigation.filter_types import Nodes, Path
-from georef.navigation.inputs import Solution
-from georef.navigation.level import attitude_rows, in_level, level_axes
-from georef.navigation.strapdown import (
+from swath.georef.navigation.filter import PIECE, FilterRun
+from swath.georef.navigation.filter_loop import level_sigmas
+from swath.georef.navigation.filter_types import Nodes, Path
+from swath.georef.navigation.inputs import Solution
+from swath.georef.navigation.level import attitude_rows, in_level, level_axes
+from swath.georef.navigation.strapdown import (
     ACCEL_BIAS,
     ACCEL_LEAN,
     ACCEL_SCALE,
@@ -60,7 +60,7 @@ from georef.navigation.strapdown import (
     put,
     three,
 )
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.gravity import EARTH_RATE_RADPS
-from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
-from georef.records import StructArray
-from georef.timescales import SECOND_NS
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
+from swath.georef.records import StructArray
+from swath.georef.timescales import SECOND_NS
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.error_model import MOVED, Layout
-from georef.navigation.filter_types import (
+from swath.georef.navigation.error_model import MOVED, Layout
+from swath.georef.navigation.filter_types import (
     CHI2,
     INFLATION,
     LOG_DET,
@@ -22,9 +22,9 @@ from georef.navigation.filter_types import (
     Rows,
     Told,
 )
-from georef.navigation.inputs import INNOVATION_DTYPE, OBSERVATION_DTYPE, Fate
-from georef.navigation.strapdown import STATE_SIZE
-from georef.records import Int64Array, StructArray
+from swath.georef.navigation.inputs import INNOVATION_DTYPE, OBSERVATION_DTYPE, Fate
+from swath.georef.navigation.strapdown import STATE_SIZE
+from swath.georef.records import Int64Array, StructArray
 
 PATH_ROWS = 4096
 BLOCK_NODES = 1024

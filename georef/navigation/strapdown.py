@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.compiled import kept, kernel
-from georef.kernels.rotations import cross, plus, rot_of, times
-from georef.kernels.types import Matrix, Three
-from georef.navigation.gravity import EARTH_RATE_RADPS, gravity_of
-from georef.navigation.inputs import Inertial
-from georef.records import Int64Array
+from swath.georef.compiled import kept, kernel
+from swath.georef.kernels.rotations import cross, plus, rot_of, times
+from swath.georef.kernels.types import Matrix, Three
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS, gravity_of
+from swath.georef.navigation.inputs import Inertial
+from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]
 

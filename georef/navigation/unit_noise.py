@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from georef.navigation.diagnosis_data import Finding
-from georef.navigation.inputs import ImuNoise, Setup
-from georef.navigation.noise import SIGNIFICANT, Judged, Run
+from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.inputs import ImuNoise, Setup
+from swath.georef.navigation.noise import SIGNIFICANT, Judged, Run
 
 LARGER = 5.0  # times as large errors of a sensor are tried
 LEAST = {"gyro_scale": 1e-3, "accel_scale": 1e-3, "misalignment": 1e-3}  # that is tried at least

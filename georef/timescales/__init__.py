@@ -1,11 +1,11 @@
 """Time: three clocks (host, device, GPS), one place. docs/time.md says how it works and what to wire.
 
-Imports nothing of the project but `georef.records`; knows no clock and no I/O.
+Imports nothing of the project but `swath.georef.records`; knows no clock and no I/O.
 """
 
-from georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
-from georef.timescales.device_clock import DeviceClock, DeviceClockStatus
-from georef.timescales.gps_time import (
+from swath.georef.timescales.clock_status import ClockEvent, ClockStatus, Severity, TimeState
+from swath.georef.timescales.device_clock import DeviceClock, DeviceClockStatus
+from swath.georef.timescales.gps_time import (
     DAY_NS,
     GPS_EPOCH,
     HOUR_NS,
@@ -29,10 +29,10 @@ from georef.timescales.gps_time import (
     week_from_gps,
     whole_gps_ns,
 )
-from georef.timescales.host_timeline import HostTimeline
-from georef.timescales.pps_clock import PpsClock
-from georef.timescales.stamp_scale import Stamps, StampScale, judge
-from georef.timescales.wall_check import WallComparison, ahead_s, distance_text
+from swath.georef.timescales.host_timeline import HostTimeline
+from swath.georef.timescales.pps_clock import PpsClock
+from swath.georef.timescales.stamp_scale import Stamps, StampScale, judge
+from swath.georef.timescales.wall_check import WallComparison, ahead_s, distance_text
 
 __all__ = [
     "DAY_NS",

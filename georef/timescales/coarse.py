@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.timescales.gps_time import SECOND_NS
 
 MEMORY_S = 60
 TYPICAL_DELAY_NS = 250_000_000  # prior: messages come 5 ms to 0.9 s after their second

@@ -15,10 +15,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array, StructArray
-from georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hour
-from georef.timescales.pps_clock import PpsClock
-from georef.timescales.stamp_scale import Stamps, StampScale, judge
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.timescales.gps_time import HOUR_NS, SECOND_NS, gps_ns_past_hour
+from swath.georef.timescales.pps_clock import PpsClock
+from swath.georef.timescales.stamp_scale import Stamps, StampScale, judge
 
 MAX_PAIRING_S = 0.3  # PROTOCOLS, SREP: further from the edge than this it is refused
 MAX_DRIFT = 200e-6

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.gps_time import SECOND_NS
-from georef.timescales.labelling import Labeller
-from georef.timescales.line_fit import SHRINK_HORIZON, LineBank, excess_variances
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.timescales.labelling import Labeller
+from swath.georef.timescales.line_fit import SHRINK_HORIZON, LineBank, excess_variances
 
 MAX_DRIFT = 200e-6
 FIRST_LOCK_EDGES = 5

@@ -11,7 +11,7 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array, TimeScale, TimeTag
+from swath.georef.records import Int64Array, TimeScale, TimeTag
 
 SECOND_NS = 1_000_000_000
 HOUR_NS = 3600 * SECOND_NS

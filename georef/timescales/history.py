@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.edge_train import EdgeTrain, KnotTable
-from georef.timescales.gps_time import SECOND_NS
+from swath.georef.records import Int64Array
+from swath.georef.timescales.edge_train import EdgeTrain, KnotTable
+from swath.georef.timescales.gps_time import SECOND_NS
 
 DOUBT_SIGMA_NS = 1e9
 BREAK_NS = SECOND_NS // 2  # two sides further apart than this are not blended

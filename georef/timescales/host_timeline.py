@@ -10,7 +10,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
+from swath.georef.records import Int64Array
 
 MAX_SLEW = 1e-3  # of MONOTONIC against RAW: adjtimex allows 500 ppm on each side
 READ_TOLERANCE_NS = 5_000  # the two clocks are not read at one instant

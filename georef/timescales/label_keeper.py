@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from georef.timescales.clock_status import EventLog, Severity
-from georef.timescales.coarse import WallClock
-from georef.timescales.edge_train import EdgeTrain
-from georef.timescales.gps_time import SECOND_NS, gps_ns_from_unix, utc_from_gps
-from georef.timescales.labelling import LeapTrust, Verdict
-from georef.timescales.leap_book import LeapBook, LeapChange
+from swath.georef.timescales.clock_status import EventLog, Severity
+from swath.georef.timescales.coarse import WallClock
+from swath.georef.timescales.edge_train import EdgeTrain
+from swath.georef.timescales.gps_time import SECOND_NS, gps_ns_from_unix, utc_from_gps
+from swath.georef.timescales.labelling import LeapTrust, Verdict
+from swath.georef.timescales.leap_book import LeapBook, LeapChange
 
 BASIS_RANK = {"": 0, "vote": 1, "wall_clock": 2, "bound": 3}
 WALL_FRACTION_S = 0.3  # a wall clock this far off the edges' whole second decides nothing

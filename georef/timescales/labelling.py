@@ -156,7 +156,7 @@ class Labeller:
     """The voters of one edge train and the label they gave it."""
 
     def __init__(self, *, keep_votes: bool = False) -> None:
-        """keep_votes: all votes are remembered, for `georef.timescales.settling`."""
+        """keep_votes: all votes are remembered, for `swath.georef.timescales.settling`."""
         self.voters: dict[VoterKey, Voter] = {}
         self.history: list[PastVote] = []
         self._keep_votes = keep_votes

@@ -6,15 +6,15 @@ import datetime as dt
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from georef.records import TimeScale, TimeTag
-from georef.timescales.gps_time import (
+from swath.georef.records import TimeScale, TimeTag
+from swath.georef.timescales.gps_time import (
     DAY_NS,
     LEAP_TABLE_VALID_UNTIL,
     gps_ns_from_week,
     table_leap_seconds,
     utc_from_gps,
 )
-from georef.timescales.labelling import LeapTrust
+from swath.georef.timescales.labelling import LeapTrust
 
 GUESS_SIGMA_S = 1.0  # of a count beyond the table, in its first years: leap seconds came every two years on average
 YEARS_A_LEAP_SECOND = 2

@@ -14,22 +14,28 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales.clock_status import ClockEvent, ClockStatus, EventLog, Severity, TimeState
-from georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
-from georef.timescales.edge_train import MAX_REFUSED_IN_A_ROW, NOISY_AFTER_EDGES, EdgeTrain, find_chain, forget_later
-from georef.timescales.gps_time import (
+from swath.georef.records import Int64Array, NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales.clock_status import ClockEvent, ClockStatus, EventLog, Severity, TimeState
+from swath.georef.timescales.coarse import AMBIGUOUS_SIGMA_NS, COARSE_SIGMA_NS, CoarseClock, WallClock
+from swath.georef.timescales.edge_train import (
+    MAX_REFUSED_IN_A_ROW,
+    NOISY_AFTER_EDGES,
+    EdgeTrain,
+    find_chain,
+    forget_later,
+)
+from swath.georef.timescales.gps_time import (
     SECOND_NS,
     gps_ns_from_unix,
     nearest_gps_ns,
     utc_from_gps,
     whole_gps_ns,
 )
-from georef.timescales.history import gps_of_trains
-from georef.timescales.label_keeper import LabelKeeper, outranks
-from georef.timescales.labelling import LeapTrust, Said, Verdict, Vote, VoterKey
-from georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds, is_stale
-from georef.timescales.settling import Settlement, settle
+from swath.georef.timescales.history import gps_of_trains
+from swath.georef.timescales.label_keeper import LabelKeeper, outranks
+from swath.georef.timescales.labelling import LeapTrust, Said, Verdict, Vote, VoterKey
+from swath.georef.timescales.leap_book import LeapBook, LeapChange, LeapSeconds, is_stale
+from swath.georef.timescales.settling import Settlement, settle
 
 WHOLE_SECOND_TOLERANCE_NS = 1_000_000  # NAV-PVT's nano of an epoch on the second is some 100 µs
 HOLDOVER_AFTER_NS = 5_500_000_000

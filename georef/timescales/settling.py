@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.edge_train import EdgeTrain
-from georef.timescales.gps_time import SECOND_NS
-from georef.timescales.labelling import LATE_AGE_S, MIN_VOTES, VOTES, LeapTrust, VoterKey
+from swath.georef.records import Int64Array
+from swath.georef.timescales.edge_train import EdgeTrain
+from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.timescales.labelling import LATE_AGE_S, MIN_VOTES, VOTES, LeapTrust, VoterKey
 
 JOINED_WITHIN = 0.25  # of a second: trains further from whole seconds of each other were pulses of another phase
 TAG_REACH_NS = 2 * SECOND_NS  # a tag belongs to the vote that arrived nearest to it, so near

@@ -15,8 +15,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import Int64Array
-from georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import GPS_EPOCH_UNIX_S, HOUR_NS, SECOND_NS
 
 TAI_MINUS_GPS_S = 19  # since 1980, by definition
 ABSOLUTE_FROM_NS = 1_000_000_000 * SECOND_NS  # from 2001-09-09 on: counted from 1970; a counter takes 30 years there

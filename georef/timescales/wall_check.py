@@ -10,8 +10,8 @@ from collections import deque
 
 import numpy as np
 
-from georef.records import TimeMessage, TimeTag
-from georef.timescales.gps_time import (
+from swath.georef.records import TimeMessage, TimeTag
+from swath.georef.timescales.gps_time import (
     DAY_NS,
     GPS_EPOCH,
     SECOND_NS,

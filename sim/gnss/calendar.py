@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from dataclasses import dataclass
 
-from georef.timescales import utc_from_gps, week_from_gps
+from swath.georef.timescales import utc_from_gps, week_from_gps
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from georef.records import FixType
+from swath.georef.records import FixType
 
 Axes = tuple[float, float, float]  # north, east, down; each axis has its own draws
 

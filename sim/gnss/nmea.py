@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from drivers.gnss.nmea_sentences import (
+from swath.drivers.gnss.nmea_sentences import (
     encode_gga,
     encode_gst,
     encode_hdt,
@@ -13,17 +13,17 @@ from drivers.gnss.nmea_sentences import (
     encode_vtg,
     encode_zda,
 )
-from georef.records import FixType
-from sim.gnss.calendar import Calendar, Stamp
-from sim.gnss.pulse import Pulse
-from sim.plan_tables import GnssTable
-from sim.satellites import Epochs, InsEpochs
+from swath.georef.records import FixType
+from swath.sim.gnss.calendar import Calendar, Stamp
+from swath.sim.gnss.pulse import Pulse
+from swath.sim.plan_tables import GnssTable
+from swath.sim.satellites import Epochs, InsEpochs
 
 QUALITY = {FixType.SINGLE: 1, FixType.RTK_FIXED: 4, FixType.RTK_FLOAT: 5}  # GGA field 6
 
 
 class NmeaMessages:
-    """Encodes the sentences of an epoch; arguments as `sim.gnss.novatel.NovatelMessages`."""
+    """Encodes the sentences of an epoch; arguments as `swath.sim.gnss.novatel.NovatelMessages`."""
 
     def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
         self._calendar = calendar

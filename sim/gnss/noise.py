@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
-from sim.clocks import FloatArray, generator
+from swath.sim.clocks import FloatArray, generator
 
 BLOCK_ROWS = 512
 

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss.novatel_encoder import encode_log
-from drivers.gnss.novatel_tables import CLOCK_VALID, POSITION_NONE, SOL_COMPUTED, UTC_VALID
-from georef.records import FixType
-from sim.gnss.calendar import Calendar
-from sim.gnss.pulse import Pulse
-from sim.plan_tables import GnssTable
-from sim.satellites import Epochs, InsEpochs
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss.novatel_encoder import encode_log
+from swath.drivers.gnss.novatel_tables import CLOCK_VALID, POSITION_NONE, SOL_COMPUTED, UTC_VALID
+from swath.georef.records import FixType
+from swath.sim.gnss.calendar import Calendar
+from swath.sim.gnss.pulse import Pulse
+from swath.sim.plan_tables import GnssTable
+from swath.sim.satellites import Epochs, InsEpochs
 
 INSUFFICIENT_OBSERVATIONS = 1  # solution status
 NONE, SINGLE, FLOAT, FIXED = int(FixType.NONE), int(FixType.SINGLE), int(FixType.RTK_FLOAT), int(FixType.RTK_FIXED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.clocks import PulsePerSecond
+from swath.sim.clocks import PulsePerSecond
 
 
 class Pulse:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from drivers.gnss import ubx_messages as ubx
-from georef.records import FixType
-from georef.timescales import week_from_gps
-from sim.gnss.calendar import NS_PER_MS, NS_PER_S, Calendar, Stamp
-from sim.gnss.pulse import Pulse
-from sim.plan_tables import GnssTable
-from sim.satellites import Epochs, InsEpochs
+from swath.drivers.gnss import ubx_messages as ubx
+from swath.georef.records import FixType
+from swath.georef.timescales import week_from_gps
+from swath.sim.gnss.calendar import NS_PER_MS, NS_PER_S, Calendar, Stamp
+from swath.sim.gnss.pulse import Pulse
+from swath.sim.plan_tables import GnssTable
+from swath.sim.satellites import Epochs, InsEpochs
 
 FIX_3D = 3
 CARRIER = {FixType.RTK_FLOAT: 1 << 6, FixType.RTK_FIXED: 2 << 6}  # flags of NAV-PVT
@@ -23,7 +23,7 @@ UNKNOWN_COURSE_1E5_DEG = 18_000_000
 
 
 class UbxMessages:
-    """Encodes the messages of an epoch; arguments as `sim.gnss.novatel.NovatelMessages`."""
+    """Encodes the messages of an epoch; arguments as `swath.sim.gnss.novatel.NovatelMessages`."""
 
     def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
         self._calendar, self._pulse = calendar, pulse

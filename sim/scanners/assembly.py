@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from sim.clocks import PulsePerSecond
-from sim.faults import windows
-from sim.flight import Trajectory
-from sim.plan import Plan
-from sim.scanners.line_heads import LineHead
-from sim.scanners.ouster_wire import OusterWire
-from sim.scanners.spinning_heads import Os1Head, Vlp16Head
-from sim.scanners.srep_wire import SrepWire
-from sim.scanners.velodyne_wire import VelodyneWire
-from sim.shots import Measured, Pulses, WireUnit
-from sim.truth import StructArray
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.faults import windows
+from swath.sim.flight import Trajectory
+from swath.sim.plan import Plan
+from swath.sim.scanners.line_heads import LineHead
+from swath.sim.scanners.ouster_wire import OusterWire
+from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
+from swath.sim.scanners.srep_wire import SrepWire
+from swath.sim.scanners.velodyne_wire import VelodyneWire
+from swath.sim.shots import Measured, Pulses, WireUnit
+from swath.sim.truth import StructArray
 
 
 class Head(Protocol):

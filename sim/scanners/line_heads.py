@@ -1,7 +1,7 @@
 """Line scanners: when pulses leave, where the light goes, and what the encoder says of it.
 
-The light follows the mirrors (`sim.scanners.mirrors`), the mirrors their motion (`sim.scanners.motions`). The encoder
-says what makes CONVENTIONS' equation true, with the plan's true parameters:
+The light follows the mirrors (`swath.sim.scanners.mirrors`), the mirrors their motion (`swath.sim.scanners.motions`).
+The encoder says what makes CONVENTIONS' equation true, with the plan's true parameters:
 
     θ = (1 + scan_angle_scale) · (θ_encoder − scan_angle_offset) + encoder_latency · dθ/dt + torsion · d²θ/dt²
 
@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.clocks import Oscillator
-from sim.errors import PlanError
-from sim.plan_tables import ScannerTable
-from sim.scanners import mirrors, motions
-from sim.scanners.motions import Motion, Swing
-from sim.shots import Pulses
+from swath.sim.clocks import Oscillator
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners import mirrors, motions
+from swath.sim.scanners.motions import Motion, Swing
+from swath.sim.shots import Pulses
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

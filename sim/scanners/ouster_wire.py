@@ -1,7 +1,7 @@
 """What an Ouster OS1 says: its metadata, and lidar packets, single (strongest) or dual return.
 
-Packets by `drivers.scanner.ouster_layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second a
-pulse since power-on (`sim.scanners.spinning_wire.HeadClock`).
+Packets by `swath.drivers.scanner.ouster_layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second
+a pulse since power-on (`swath.sim.scanners.spinning_wire.HeadClock`).
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from drivers.scanner.ouster_head import SYNC_PULSE, read_head
-from drivers.scanner.ouster_layout import LidarLayout
-from sim.clocks import PulsePerSecond
-from sim.errors import PlanError
-from sim.plan import Plan
-from sim.plan_tables import ScannerTable
-from sim.scanners.spinning_wire import (
+from swath.drivers.scanner.ouster_head import SYNC_PULSE, read_head
+from swath.drivers.scanner.ouster_layout import LidarLayout
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.errors import PlanError
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.spinning_wire import (
     Arrivals,
     HeadClock,
     PacketCutter,
@@ -27,8 +27,8 @@ from sim.scanners.spinning_wire import (
     head_config,
     in_slot,
 )
-from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 COLUMNS = 1024  # of a turn
 COLUMNS_OF_PACKET = 16

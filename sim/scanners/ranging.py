@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.atmosphere import Air
-from sim.clocks import generator
-from sim.errors import PlanError
-from sim.plan_tables import ScannerTable
-from sim.shots import Echoes, Measured, Pulses
-from sim.truth import StructArray
+from swath.sim.atmosphere import Air
+from swath.sim.clocks import generator
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.shots import Echoes, Measured, Pulses
+from swath.sim.truth import StructArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -132,7 +132,7 @@ def packed(measured: Measured, truth: StructArray) -> tuple[Measured, StructArra
 
     Args:
         measured: of n pulses.
-        truth: `sim.truth.RETURN_TRUTH_DTYPE`, same slots.
+        truth: `swath.sim.truth.RETURN_TRUTH_DTYPE`, same slots.
     """
     key = np.where(measured.range_m > 0.0, measured.range_m, np.inf)
     with np.errstate(invalid="ignore"):

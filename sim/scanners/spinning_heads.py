@@ -7,7 +7,7 @@ scan angle, in the sense its packets count it:
     θ = θ_encoder − scan_angle_offset + encoder_latency · dθ/dt
 
 `Pulses.origin_s` is the point on the beam's axis from which the head counts its ranges: for an Ouster as far behind the
-beam's start as that lies off the spin axis. What ``[[beam]]`` adds to ranges is for `sim.scanners.ranging`.
+beam's start as that lies off the spin axis. What ``[[beam]]`` adds to ranges is for `swath.sim.scanners.ranging`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import math
 
 import numpy as np
 
-from drivers.scanner.ouster_head import read_head
-from drivers.scanner.velodyne_heads import PLACES, VLP16
-from sim.clocks import Oscillator
-from sim.errors import PlanError
-from sim.plan_tables import ScannerTable
-from sim.scanners.ouster_wire import COLUMNS, os1_metadata
-from sim.shots import FloatArray, IntArray, Pulses
+from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.scanner.velodyne_heads import PLACES, VLP16
+from swath.sim.clocks import Oscillator
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.ouster_wire import COLUMNS, os1_metadata
+from swath.sim.shots import FloatArray, IntArray, Pulses
 
 HEAD_HZ = 1_000_000_000  # a head's firings are timed in nanoseconds of its own oscillator
 SEQUENCE_NS = 55_296  # from one firing of all sixteen lasers to the next, 9.4

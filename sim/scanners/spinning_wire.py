@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.clocks import Oscillator, PulsePerSecond, generator
-from sim.plan import Plan
-from sim.plan_tables import OscillatorTable, ScannerTable
-from sim.shots import FloatArray, IntArray, Measured
+from swath.sim.clocks import Oscillator, PulsePerSecond, generator
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import OscillatorTable, ScannerTable
+from swath.sim.shots import FloatArray, IntArray, Measured
 
 Windows = Sequence[tuple[float, float]]
 

@@ -8,12 +8,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.scanner.srep_layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
-from sim.plan_tables import ScannerTable
-from sim.scanners.line_heads import emission_ticks
-from sim.scanners.ranging import LIGHT_MPS, packed
-from sim.shots import Measured, Pulses
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.drivers.scanner.srep_layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.line_heads import emission_ticks
+from swath.sim.scanners.ranging import LIGHT_MPS, packed
+from swath.sim.shots import Measured, Pulses
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.scanner.srep_layout import (
+from swath.drivers.scanner.srep_layout import (
     FLAG_LASER_ON,
     FLAG_PPS_LOCKED,
     FLAG_RANGE_GATE,
@@ -19,15 +19,15 @@ from drivers.scanner.srep_layout import (
     encode_datagrams,
     pulse_dtype,
 )
-from sim.calibration_files import mirror_factor
-from sim.clocks import Oscillator, PulsePerSecond, generator
-from sim.errors import PlanError
-from sim.plan_tables import HostTable, ScannerTable
-from sim.scanners.line_heads import config_geometry
-from sim.scanners.ranging import LIGHT_MPS
-from sim.scanners.srep_records import ApparentRanges, RecordMaker, Records, WholeRanges, no_records
-from sim.shots import Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.calibration_files import mirror_factor
+from swath.sim.clocks import Oscillator, PulsePerSecond, generator
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import HostTable, ScannerTable
+from swath.sim.scanners.line_heads import config_geometry
+from swath.sim.scanners.ranging import LIGHT_MPS
+from swath.sim.scanners.srep_records import ApparentRanges, RecordMaker, Records, WholeRanges, no_records
+from swath.sim.shots import Measured, Pulses, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -1,7 +1,7 @@
 """What a VLP-16 says: data packets, single (strongest) or dual return, and position packets with PPS status and RMC.
 
 Wire format: VLP-16 User Manual 63-9243 rev. D, 9.3. Its clock shows microseconds past the UTC hour while PPS is locked
-(`sim.scanners.spinning_wire.HeadClock`).
+(`swath.sim.scanners.spinning_wire.HeadClock`).
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from drivers.gnss.nmea_sentences import encode_rmc
-from drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
-from drivers.scanner.velodyne_heads import BLOCKS, PLACES
-from drivers.scanner.velodyne_position import HOUR_US, encode_position_packet
-from georef.timescales import SECOND_NS, utc_from_gps
-from sim.clocks import PulsePerSecond
-from sim.plan import Plan
-from sim.plan_tables import ScannerTable
-from sim.scanners.spinning_wire import (
+from swath.drivers.gnss.nmea_sentences import encode_rmc
+from swath.drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from swath.drivers.scanner.velodyne_heads import BLOCKS, PLACES
+from swath.drivers.scanner.velodyne_position import HOUR_US, encode_position_packet
+from swath.georef.timescales import SECOND_NS, utc_from_gps
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.plan import Plan
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.spinning_wire import (
     Arrivals,
     HeadClock,
     PacketCutter,
@@ -29,8 +29,8 @@ from sim.scanners.spinning_wire import (
     head_config,
     in_slot,
 )
-from sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 MICROSECOND_HZ = 1_000_000
 RANGE_UNIT_M = 0.002
@@ -40,7 +40,7 @@ RMC_DELAY_S = 0.15  # from an edge to the sentence that names it, as a receiver 
 
 
 class Track(Protocol):
-    """Where the aircraft is, for the sentences its head is given; `sim.flight.Trajectory` is one."""
+    """Where the aircraft is, for the sentences its head is given; `swath.sim.flight.Trajectory` is one."""
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude, longitude, height of (n,) times."""

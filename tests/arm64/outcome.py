@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from daemon.processing.feed import LogFeed
-from daemon.processing.flights import Flight, Wish, read_flights
-from daemon.processing.setup import Options
-from daemon.replay import source_of_topic
-from georef.points import Points
-from georef.records import ChunkBatch
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.processing.feed import LogFeed
+from swath.daemon.processing.flights import Flight, Wish, read_flights
+from swath.daemon.processing.setup import Options
+from swath.daemon.replay import source_of_topic
+from swath.georef.points import Points
+from swath.georef.records import ChunkBatch
 
 CRS = "EPSG:32632"
 

@@ -74,7 +74,9 @@ def other_processor() -> None:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the log of a virtual flight and what lies beside it, made on the host."""
     folder = tmp_path_factory.mktemp("flight")
-    run(sys.executable, "daemon.cli.main", "sim", "fly", "small", "--seconds", FLOWN_S, "--no-truth", "-o", folder)
+    run(
+        sys.executable, "swath.daemon.cli.main", "sim", "fly", "small", "--seconds", FLOWN_S, "--no-truth", "-o", folder
+    )
     return folder
 
 
@@ -114,7 +116,7 @@ def test_points_in_the_map_differ_by_projs_last_places_only(
 @pytest.mark.parametrize("scale_m", [1e-3, FINE_SCALE_M])
 def test_files_of_points_are_within_a_unit_of_their_scale(flight: Path, tmp_path: Path, scale_m: float) -> None:
     words = (
-        "daemon.cli.main",
+        "swath.daemon.cli.main",
         "georef",
         flight,
         "--accept-verdict",
@@ -139,7 +141,7 @@ def test_files_of_points_are_within_a_unit_of_their_scale(flight: Path, tmp_path
 
 
 def test_exported_captures_are_the_same(flight: Path, tmp_path: Path) -> None:
-    both = on_both(tmp_path, "daemon.cli.main", "export", flight, "{}/exported")
+    both = on_both(tmp_path, "swath.daemon.cli.main", "export", flight, "{}/exported")
     host = contents(both.host)
     assert sum(map(len, host.values())) > 20_000_000
     assert host == contents(both.arm64)
@@ -153,7 +155,7 @@ def test_a_repaired_log_is_the_same(flight: Path, tmp_path: Path) -> None:
     for own in ("host", "arm64"):
         (tmp_path / own).mkdir()
         (tmp_path / own / log.name).write_bytes(damaged)
-    both = on_both(tmp_path, "daemon.cli.main", "recover", "{}", status=DATA_LOST)
+    both = on_both(tmp_path, "swath.daemon.cli.main", "recover", "{}", status=DATA_LOST)
     host = contents(both.host)
     assert len(host) == 2
     assert host == contents(both.arm64)
@@ -161,7 +163,7 @@ def test_a_repaired_log_is_the_same(flight: Path, tmp_path: Path) -> None:
 
 def test_navigated_trajectory_is_the_same_far_below_its_sigma(flight: Path, tmp_path: Path) -> None:
     """Sums of products in an order that BLAS chooses; columns of SBET and smrmsg as Applanix lists them."""
-    both = on_both(tmp_path, "daemon.cli.main", "trajectory", flight, "-o", "{}")
+    both = on_both(tmp_path, "swath.daemon.cli.main", "trajectory", flight, "-o", "{}")
     ((host, sigma), (arm64, _)) = (
         (np.fromfile(next(own.glob("*.sbet"))).reshape(-1, 17), np.fromfile(next(own.glob("*.smrmsg"))).reshape(-1, 10))
         for own in (both.host, both.arm64)

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.flight import Flight, Head, Swath, Tangent
-from georef.beams import LineGeometry
-from georef.calibration import Calibration, nominal
-from georef.earth import e_from_geodetic
-from georef.records import RETURN_DTYPE
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import Calibration, nominal
+from swath.georef.earth import e_from_geodetic
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 Surface = Callable[[FloatArray, FloatArray], FloatArray]

@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.flight import Flight, Head, Swath, Tangent
-from georef.beams import LineGeometry
-from georef.calibration import Calibration, nominal
-from georef.records import RETURN_DTYPE
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
-from sim.plan import parse_plan
-from sim.scene import Scene, build_scene
-from sim.shots import CAR, ROOF, WALL
-from sim.site import Site, geodetic_from_e, rot_e_from_ned
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import Calibration, nominal
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
+from swath.sim.plan import parse_plan
+from swath.sim.scene import Scene, build_scene
+from swath.sim.shots import CAR, ROOF, WALL
+from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
 
 FloatArray = NDArray[np.float64]
 Line = tuple[float, float, float, float, float]
@@ -56,7 +56,7 @@ class Cast:
         flight: with nominal calibration.
         truth: the true calibration.
         scene: what was there.
-        surface: by swath (n,) of `sim.shots`, a row a return.
+        surface: by swath (n,) of `swath.sim.shots`, a row a return.
         true_t: by swath (n, 3), without noise.
         planes: (p, 5) normal_t, its product with points of the plane in t, surface: all roofs, walls and cars' sides.
     """
@@ -97,7 +97,7 @@ def cast_flight(
         terrain: keys and tables of it.
         lines: to be flown.
         prf_hz: pulse rate.
-        true: what the scanner really is, names of `georef.calibration.PARAMETERS`; None: `TRUE`.
+        true: what the scanner really is, names of `swath.georef.calibration.PARAMETERS`; None: `TRUE`.
         seed: of noise and gusts.
         range_sigma_m, angle_sigma_rad: noise of a return.
         half_angle_rad: of the scan.

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration_file import Header
-from calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
-from calib.flight import Flight, Head, Swath, Tangent
-from calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
-from calib.report_input import DifferenceMap, PairDifference, Profile, ReportInput
-from georef.beams import LineGeometry
-from georef.calibration import INDEX, Calibration, nominal
-from georef.earth import e_from_geodetic, geodetic_from_e
-from georef.records import RETURN_DTYPE
-from georef.trajectory import Trajectory
+from swath.calib.calibration_file import Header
+from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
+from swath.calib.report_input import DifferenceMap, PairDifference, Profile, ReportInput
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import INDEX, Calibration, nominal
+from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

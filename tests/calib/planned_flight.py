@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.features import Features
-from calib.flight import Flight, Head, Tangent
-from calib.plan import MOST_MADE, Line, Scan, Surface, planned
-from georef.beams import LineGeometry
-from georef.calibration import Calibration, nominal
-from georef.earth import e_from_geodetic, geodetic_from_e
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.features import Features
+from swath.calib.flight import Flight, Head, Tangent
+from swath.calib.plan import MOST_MADE, Line, Scan, Surface, planned
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import Calibration, nominal
+from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 from tests.calib.roofs import exactly_known
 
 FloatArray = NDArray[np.float64]

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.features import Features, Patch, Plane
-from calib.flight import Flight, Head, Swath
-from georef.beams import LineGeometry
-from georef.calibration import nominal
-from georef.records import RETURN_DTYPE, Int64Array
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.features import Features, Patch, Plane
+from swath.calib.flight import Flight, Head, Swath
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import nominal
+from swath.georef.records import RETURN_DTYPE, Int64Array
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 from tests.calib.roofs import START_NS, exactly_known, frame
 
 FloatArray = NDArray[np.float64]

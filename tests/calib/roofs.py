@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.features import Features, Patch, Plane
-from calib.flight import Flight, Head, Swath, Tangent
-from georef.beams import LineGeometry
-from georef.calibration import PARAMETERS, Calibration, nominal
-from georef.earth import e_from_geodetic
-from georef.records import RETURN_DTYPE, Int64Array
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.features import Features, Patch, Plane
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.earth import e_from_geodetic
+from swath.georef.records import RETURN_DTYPE, Int64Array
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 START_NS = 1_479_297_618_000_000_000

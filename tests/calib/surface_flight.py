@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.flight import Flight, Swath, Tangent
-from georef.earth import e_from_geodetic
-from georef.records import RETURN_DTYPE
+from swath.calib.flight import Flight, Swath, Tangent
+from swath.georef.earth import e_from_geodetic
+from swath.georef.records import RETURN_DTYPE
 
 FloatArray = NDArray[np.float64]
 Height = Callable[[FloatArray, FloatArray], FloatArray]

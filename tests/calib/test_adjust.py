@@ -11,19 +11,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.adjust import adjust, predict
-from calib.features import ControlPoint, Features, Sighting, TiePoint
-from calib.flight import Flight
-from calib.intensity_curve import STEPS, at_knots, curve_by_knots
-from calib.normals import NormalError, TrajectoryWeight, moved, normals
-from calib.outcome import Adjusted
-from calib.parameters import MODELS, Wish, unknowns
-from calib.rows import Rows, State
-from calib.solve import Settings
-from calib.tie_rows import Ties
-from calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
-from georef.calibration import INDEX, PARAMETERS, Calibration, nominal
-from georef.trajectory import Trajectory
+from swath.calib.adjust import adjust, predict
+from swath.calib.features import ControlPoint, Features, Sighting, TiePoint
+from swath.calib.flight import Flight
+from swath.calib.intensity_curve import STEPS, at_knots, curve_by_knots
+from swath.calib.normals import NormalError, TrajectoryWeight, moved, normals
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import MODELS, Wish, unknowns
+from swath.calib.rows import Rows, State
+from swath.calib.solve import Settings
+from swath.calib.tie_rows import Ties
+from swath.calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration, nominal
+from swath.georef.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
 from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
 from tests.calib.test_rows import design

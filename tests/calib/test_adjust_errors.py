@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.adjust import adjust
-from calib.normals import TrajectoryWeight
-from calib.parameters import Wish, unknowns
-from calib.rows import Rows
-from calib.solve import Settings
-from calib.trajectory_errors import Taus, gauss_markov
+from swath.calib.adjust import adjust
+from swath.calib.normals import TrajectoryWeight
+from swath.calib.parameters import Wish, unknowns
+from swath.calib.rows import Rows
+from swath.calib.solve import Settings
+from swath.calib.trajectory_errors import Taus, gauss_markov
 from tests.calib.roofs import LINES, made, trajectory
 from tests.calib.test_rows import shifted
 

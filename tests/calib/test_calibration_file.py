@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.calibration_file import CalibrationFileError, Header, calibration_text
-from georef.calibration import (
+from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
+from swath.georef.calibration import (
     INDEX,
     PARAMETERS,
     BeamCorrection,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from benchmarks.calibration_designs import LIMIT, Case, flight_of, normalised, run
-from calib.adjust import adjust
-from calib.features import ControlPoint, Features
-from calib.parameters import Wish
-from calib.solve import Settings
-from calib.trajectory_errors import Taus, gauss_markov
+from swath.calib.adjust import adjust
+from swath.calib.features import ControlPoint, Features
+from swath.calib.parameters import Wish
+from swath.calib.solve import Settings
+from swath.calib.trajectory_errors import Taus, gauss_markov
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 

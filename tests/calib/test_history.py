@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.history import BORESIGHT, HistoryError, compare, history
-from calib.history_plots import history_png
-from georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
+from swath.calib.history import BORESIGHT, HistoryError, compare, history
+from swath.calib.history_plots import history_png
+from swath.georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 
 SIGMAS = np.radians([0.001, 0.001, 0.002])
 AT = [INDEX[name] for name in BORESIGHT]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from calib.intensity_curve import STEPS, at_knots, curve, curve_by_knots, nodes_of
+from swath.calib.intensity_curve import STEPS, at_knots, curve, curve_by_knots, nodes_of
 
 FloatArray = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from calib.flight import Flight
-from calib.markings import Image, MarkingSettings, Shift, find_markings, shifted
+from swath.calib.flight import Flight
+from swath.calib.markings import Image, MarkingSettings, Shift, find_markings, shifted
 from tests.calib.analytic_scene import Line, Scanner, fly, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.need import POINT, SHARE, Need, need_of
-from calib.outcome import TrajectoryFit
-from georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.calib.need import POINT, SHARE, Need, need_of
+from swath.calib.outcome import TrajectoryFit
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration
 from tests.calib.roofs import LINES, NOISE, Line, Made, made
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.observability import RULES, Rules, decide, kind_of, spectrum
-from calib.outcome import Held
-from georef.beams import LineGeometry
-from georef.calibration import INDEX, PARAMETERS, nominal
-from georef.earth import e_from_geodetic, rot_e_from_l
-from georef.jacobian import observation_columns_e, parameter_columns_e
-from georef.records import RETURN_DTYPE
-from georef.rotations import quaternion_from_rot, rot_l_from_b
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.calib.observability import RULES, Rules, decide, kind_of, spectrum
+from swath.calib.outcome import Held
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import INDEX, PARAMETERS, nominal
+from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

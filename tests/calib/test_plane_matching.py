@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
-from calib.flight import Flight
-from calib.plane_matching import LOST, rematch
-from calib.plane_returns import limited
-from calib.plane_search import find_planes
+from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
+from swath.calib.flight import Flight
+from swath.calib.plane_matching import LOST, rematch
+from swath.calib.plane_returns import limited
+from swath.calib.plane_search import find_planes
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

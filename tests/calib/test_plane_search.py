@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.features import Features, Plane
-from calib.flight import Flight
-from calib.plane_fit import fit_sight
-from calib.plane_kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
-from calib.plane_search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
-from sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight
+from swath.calib.plane_fit import fit_sight
+from swath.calib.plane_kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
+from swath.calib.plane_search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
+from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.flight import Flight
-from calib.height_grids import Lattice, surface
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneSettings
-from calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
-from calib.scale import scale_of
-from georef.calibration import Calibration
+from swath.calib.flight import Flight
+from swath.calib.height_grids import Lattice, surface
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneSettings
+from swath.calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
+from swath.calib.scale import scale_of
+from swath.georef.calibration import Calibration
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

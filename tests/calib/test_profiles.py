@@ -12,12 +12,12 @@ import pytest
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from calib.features import ControlPoint
-from calib.flight import Flight
-from calib.profile_check import Check
-from calib.profile_measure import Settings
-from calib.profile_plots import draw, svg
-from calib.profiles import (
+from swath.calib.features import ControlPoint
+from swath.calib.flight import Flight
+from swath.calib.profile_check import Check
+from swath.calib.profile_measure import Settings
+from swath.calib.profile_plots import draw, svg
+from swath.calib.profiles import (
     Given,
     Profile,
     formula,
@@ -29,7 +29,7 @@ from calib.profiles import (
     stepwise,
     survey,
 )
-from calib.report_profiles import pictures
+from swath.calib.report_profiles import pictures
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables, only, retold, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -9,15 +9,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.adjust import adjust
-from calib.features import Features
-from calib.normals import extras
-from calib.parameters import Wish, unknowns
-from calib.robust import HUBER, least_detectable, least_shift, w_critical
-from calib.rows import Rows, State
-from calib.solve import Block, Settings, solved
-from calib.trajectory_errors import Taus, gauss_markov
-from georef.records import Int64Array
+from swath.calib.adjust import adjust
+from swath.calib.features import Features
+from swath.calib.normals import extras
+from swath.calib.parameters import Wish, unknowns
+from swath.calib.robust import HUBER, least_detectable, least_shift, w_critical
+from swath.calib.rows import Rows, State
+from swath.calib.solve import Block, Settings, solved
+from swath.calib.trajectory_errors import Taus, gauss_markov
+from swath.georef.records import Int64Array
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made
 from tests.calib.test_adjust import controlled, in_planes

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.record import (
+from swath.calib.record import (
     NAMESPACE,
     RecordError,
     RecordInput,
@@ -25,11 +25,11 @@ from calib.record import (
     record_xml,
     with_told,
 )
-from calib.record_tables import BY_KEY, CLASSES, ROWS
-from calib.record_values import Matrix, Plain, utc_text
-from georef.beams import LineGeometry
-from georef.calibration import INDEX
-from georef.sensor_model import SensorModel
+from swath.calib.record_tables import BY_KEY, CLASSES, ROWS
+from swath.calib.record_values import Matrix, Plain, utc_text
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import INDEX
+from swath.georef.sensor_model import SensorModel
 from tests.calib.made_outcome import Outcome, made_outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")

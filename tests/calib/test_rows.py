@@ -9,17 +9,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.features import Patch, Plane
-from calib.flight import Flight, Head, Swath
-from calib.parameters import Unknowns, Wish, unknowns
-from calib.rows import Rows, State
-from calib.trajectory_errors import TrajectoryPrior
-from georef.beams import Geometry, OusterGeometry, SpinningGeometry
-from georef.calibration import INDEX, Calibration, nominal
-from georef.jacobian import observation_columns_e, parameter_columns_e
-from georef.records import RETURN_DTYPE
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise
+from swath.calib.features import Patch, Plane
+from swath.calib.flight import Flight, Head, Swath
+from swath.calib.parameters import Unknowns, Wish, unknowns
+from swath.calib.rows import Rows, State
+from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.georef.beams import Geometry, OusterGeometry, SpinningGeometry
+from swath.georef.calibration import INDEX, Calibration, nominal
+from swath.georef.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise
 from tests.calib.roofs import LINES, START_NS, frame, made, trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

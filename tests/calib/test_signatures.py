@@ -11,17 +11,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib.effects import NAMES, SeenFrom, effect_columns
-from calib.flight import Flight
-from calib.signatures import Signature, record_of, signatures
-from calib.strip_cells import StripRules
-from calib.strips import differences
-from calib.trajectory_errors import Taus, apply, draw, gauss_markov
-from georef.formats.trajectory_csv import csv_text
-from georef.formats.trajectory_file import read_trajectory
-from georef.jacobian import parameter_columns_e
-from georef.mount import Mount, Stage
-from georef.rotations import rot_x
+from swath.calib.effects import NAMES, SeenFrom, effect_columns
+from swath.calib.flight import Flight
+from swath.calib.signatures import Signature, record_of, signatures
+from swath.calib.strip_cells import StripRules
+from swath.calib.strips import differences
+from swath.calib.trajectory_errors import Taus, apply, draw, gauss_markov
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.jacobian import parameter_columns_e
+from swath.georef.mount import Mount, Stage
+from swath.georef.rotations import rot_x
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib import strip_functions
-from calib.features import ControlPoint, Features
-from calib.flight import Flight
-from calib.strip_functions import Settings, StripAdjusted, StripError, adjust_strips
-from calib.trajectory_errors import TrajectoryPrior, apply, knots_of
+from swath.calib import strip_functions
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight
+from swath.calib.strip_functions import Settings, StripAdjusted, StripError, adjust_strips
+from swath.calib.trajectory_errors import TrajectoryPrior, apply, knots_of
 from tests.calib.planned_flight import ONE_HEIGHT, flown, noised
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -10,19 +10,28 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from calib.flight import Flight, FlightError, Head, Swath, Tangent
-from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, from_smoother, gauss_markov, knots_of, positive
-from georef.beams import LineGeometry
-from georef.calibration import nominal
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.cross_covariance import ErrorChain, error_chain
-from georef.navigation.error_model import E_ATTITUDE, MOVED
-from georef.navigation.filter import FilterRun, run_filter
-from georef.navigation.inputs import GRADES
-from georef.navigation.smoother import smooth_nodes
-from georef.records import RETURN_DTYPE
-from georef.rotations import rot_from_quaternion
-from georef.trajectory import Trajectory
+from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
+from swath.calib.trajectory_errors import (
+    Taus,
+    TrajectoryPrior,
+    apply,
+    draw,
+    from_smoother,
+    gauss_markov,
+    knots_of,
+    positive,
+)
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import nominal
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
+from swath.georef.navigation.error_model import E_ATTITUDE, MOVED
+from swath.georef.navigation.filter import FilterRun, run_filter
+from swath.georef.navigation.inputs import GRADES
+from swath.georef.navigation.smoother import smooth_nodes
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.rotations import rot_from_quaternion
+from swath.georef.trajectory import Trajectory
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import ns
 

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from calib.effects import EFFECTS
-from calib.features import ControlPoint, Features, Patch, Plane
-from calib.local_plane import plane_through
-from calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, gauss_markov
-from calib.validation import (
+from swath.calib.effects import EFFECTS
+from swath.calib.features import ControlPoint, Features, Patch, Plane
+from swath.calib.local_plane import plane_through
+from swath.calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, gauss_markov
+from swath.calib.validation import (
     ALPHA,
     CODES,
     POWER,
@@ -25,9 +25,9 @@ from calib.validation import (
     smallest_errors,
     validate,
 )
-from calib.validation_rows import FLOOR_M, HALF, Rows, estimated_floor_m, plane_rows
-from georef.calibration import INDEX, Calibration
-from sim.shots import ROOF
+from swath.calib.validation_rows import FLOOR_M, HALF, Rows, estimated_floor_m, plane_rows
+from swath.georef.calibration import INDEX, Calibration
+from swath.sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.flight import Flight
-from daemon.processing.calibration_flight import read_flight
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
-from georef.calibration import Calibration, read_calibration
-from georef.formats.trajectory_csv import csv_text
-from georef.trajectory import Trajectory
+from swath.calib.flight import Flight
+from swath.daemon.processing.calibration_flight import read_flight
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
+from swath.georef.calibration import Calibration, read_calibration
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short
 
 HEADER = """

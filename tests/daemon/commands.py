@@ -17,25 +17,25 @@ import sys
 import tempfile
 from pathlib import Path
 
-from daemon.cli.main import COMMANDS, main
-from drivers.core.registry import KINDS, all_drivers
+from swath.daemon.cli.main import COMMANDS, main
+from swath.drivers.core.registry import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).parents[2]
 LOADED = (
     *(command.module for command in COMMANDS),
     "cantools.database",
-    "daemon.capture_files",
-    "daemon.check",
-    "daemon.control_client",
-    "daemon.device_setup",
-    "daemon.exporting",
-    "daemon.importing",
-    "daemon.log.recover",
-    "daemon.monitor",
-    "daemon.offload",
-    "daemon.run",
-    "daemon.statistics",
+    "swath.daemon.capture_files",
+    "swath.daemon.check",
+    "swath.daemon.control_client",
+    "swath.daemon.device_setup",
+    "swath.daemon.exporting",
+    "swath.daemon.importing",
+    "swath.daemon.log.recover",
+    "swath.daemon.monitor",
+    "swath.daemon.offload",
+    "swath.daemon.run",
+    "swath.daemon.statistics",
     "pynmea2",
     "rich.progress",
 )

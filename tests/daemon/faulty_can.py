@@ -12,8 +12,8 @@ from typing import Any
 
 import can
 
-from drivers.core.can_frames import CAN_FRAME_BYTES
-from drivers.transports.can_frame import unpack_frame
+from swath.drivers.core.can_frames import CAN_FRAME_BYTES
+from swath.drivers.transports.can_frame import unpack_frame
 
 ENTRY_POINT = "[can.interface]\nfaulty = tests.daemon.faulty_can:FaultyBus\n"
 

@@ -7,8 +7,8 @@ import signal
 import sys
 from pathlib import Path
 
-from daemon.config import load_config
-from daemon.run import record
+from swath.daemon.config import load_config
+from swath.daemon.run import record
 
 
 def main() -> None:

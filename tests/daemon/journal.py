@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from daemon.events import Severity
+from swath.daemon.events import Severity
 
 
 class Said(NamedTuple):

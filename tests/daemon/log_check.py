@@ -10,7 +10,7 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from daemon.log.reader import open_logs
+from swath.daemon.log.reader import open_logs
 
 
 @dataclass

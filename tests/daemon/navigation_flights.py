@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.processing.navigation_series import Flight
-from georef.earth import e_from_geodetic, rot_e_from_l
-from georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup, Solution
-from georef.records import FixType
-from georef.rotations import quaternion_from_rot, rot_l_from_b
-from georef.timescales.gps_time import SECOND_NS
+from swath.daemon.processing.navigation_series import Flight
+from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup, Solution
+from swath.georef.records import FixType
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.georef.navigation.vehicles import collected
 
 Array = NDArray[Any]

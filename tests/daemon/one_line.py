@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from daemon.cli.main import run_app
-from georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from georef.trajectory import Trajectory
+from swath.daemon.cli.main import run_app
+from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
+from swath.georef.trajectory import Trajectory
 
 PLAN = """
 [flight]

@@ -89,7 +89,7 @@ class Recorder:
         *,
         watchdog_s: float | None = None,
         prefix: list[str] | None = None,
-        module: tuple[str, ...] = ("daemon.cli.main", "run"),
+        module: tuple[str, ...] = ("swath.daemon.cli.main", "run"),
         says_to: int | None = None,
     ):
         folder.mkdir(parents=True, exist_ok=True)

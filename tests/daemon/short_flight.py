@@ -15,17 +15,17 @@ import numpy as np
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from daemon.config import Config, load_config
-from daemon.log.reader import Session, open_logs
-from daemon.sim_log import fly_into_log
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss.novatel_encoder import encode_log
-from drivers.gnss.novatel_tables import CLOCK_VALID
-from georef.trajectory import Trajectory
-from sim.companions import companion_files, config_text, default_wires
-from sim.fly import VirtualFlight, open_truth
-from sim.gnss.novatel import NovatelMessages
-from sim.plan import parse_plan
+from swath.daemon.config import Config, load_config
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.sim_log import fly_into_log
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss.novatel_encoder import encode_log
+from swath.drivers.gnss.novatel_tables import CLOCK_VALID
+from swath.georef.trajectory import Trajectory
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.fly import VirtualFlight, open_truth
+from swath.sim.gnss.novatel import NovatelMessages
+from swath.sim.plan import parse_plan
 
 MARK_AFTER_NS = 123_456_789  # of each whole second
 CLOCK_OFFSET_S = 2.5e-7  # of the receiver, in what its marks say

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.config import Config, load_config
-from daemon.errors import ExitCode, UserError
-from drivers.gnss.novatel_encoder import encode_log
-from drivers.gnss.novatel_layouts import Time
-from drivers.imu.dbc_encoder import encode_samples
-from drivers.imu.dbc_settings import map_signals
-from drivers.scanner.srep_layout import FLAG_LASER_ON, FLAG_PPS_LOCKED, SrepHeader, encode_datagram
+from swath.daemon.config import Config, load_config
+from swath.daemon.errors import ExitCode, UserError
+from swath.drivers.gnss.novatel_encoder import encode_log
+from swath.drivers.gnss.novatel_layouts import Time
+from swath.drivers.imu.dbc_encoder import encode_samples
+from swath.drivers.imu.dbc_settings import map_signals
+from swath.drivers.scanner.srep_layout import FLAG_LASER_ON, FLAG_PPS_LOCKED, SrepHeader, encode_datagram
 
 AIRCRAFT = Path(__file__).parents[2] / "fixtures/config/aircraft.toml"
 WEEK, MONDAY_S = 2423, 86_400 + 9 * 3600 + 18  # 2026-06-15T09:00:00Z in GPS time
@@ -130,7 +130,7 @@ def make_standin(*arguments: object) -> tuple[Standin, dict[str, bytes]]:
 
 
 def standin_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
-    """In the place of `daemon.sim_plans.make_flight_in_time`: a second."""
+    """In the place of `swath.daemon.sim_plans.make_flight_in_time`: a second."""
     return Standin(1.0), {}
 
 

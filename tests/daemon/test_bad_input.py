@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.transports.capture_file import read_pcap
+from swath.drivers.transports.capture_file import read_pcap
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table
@@ -25,7 +25,7 @@ SCANNER = '[scanner.{name}]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "sre
 def run_once(tmp_path: Path, tables: str) -> subprocess.CompletedProcess[str]:
     config = tmp_path / "swath.toml"
     config.write_text(session_table(tmp_path / "logs") + tables)
-    command = [sys.executable, "-m", "daemon.cli.main", "run", "--seconds", "1", str(config)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "run", "--seconds", "1", str(config)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
 
 
@@ -57,7 +57,7 @@ def test_dbc_without_the_named_signals(tmp_path: Path) -> None:
 
 
 def test_no_such_configuration(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "daemon.cli.main", "run", str(tmp_path / "nothing.toml")]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "run", str(tmp_path / "nothing.toml")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert "nothing.toml" in the_line(done, 2)
 

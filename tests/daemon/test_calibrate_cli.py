@@ -15,20 +15,20 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 from scipy.spatial import cKDTree
 
-from calib.features import Features, Plane
-from calib.flight import Flight
-from calib.plane_search import find_planes
-from calib.plane_settings import PlaneSettings
-from daemon.cli.main import run_app
-from daemon.errors import ExitCode, UserError
-from daemon.processing import calibrate_run
-from daemon.processing.calibrate_model import model_of
-from daemon.processing.calibrate_run import refuse_no_planes
-from daemon.processing.calibration_plan import PlanWish, plan_calibration
-from daemon.processing.warm_calibration import warm_calibration
-from georef.calibration import Calibration, read_calibration
-from georef.mapping import Mapping
-from sim.plan import parse_plan
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight
+from swath.calib.plane_search import find_planes
+from swath.calib.plane_settings import PlaneSettings
+from swath.daemon.cli.main import run_app
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing import calibrate_run
+from swath.daemon.processing.calibrate_model import model_of
+from swath.daemon.processing.calibrate_run import refuse_no_planes
+from swath.daemon.processing.calibration_plan import PlanWish, plan_calibration
+from swath.daemon.processing.warm_calibration import warm_calibration
+from swath.georef.calibration import Calibration, read_calibration
+from swath.georef.mapping import Mapping
+from swath.sim.plan import parse_plan
 from tests.calib.village import KNOWN, Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
@@ -127,7 +127,7 @@ def test_a_calibration_is_refused_under_other_settings_than_its_own(
 
 
 def list_of(name: str) -> int:
-    from georef.calibration import INDEX
+    from swath.georef.calibration import INDEX
 
     return INDEX[name]
 

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from calib.profile_check import Check, Comparison
-from daemon.processing.calibrate_model import model_of
-from daemon.processing.calibrate_products import strips_say, validation_says, write_products
-from daemon.processing.calibrate_run import Calibrated, CalibrateWish, calibrate
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
-from georef.calibration import INDEX, Calibration, read_calibration
-from georef.formats.trajectory_csv import csv_text
-from georef.trajectory import Trajectory
+from swath.calib.profile_check import Check, Comparison
+from swath.daemon.processing.calibrate_model import model_of
+from swath.daemon.processing.calibrate_products import strips_say, validation_says, write_products
+from swath.daemon.processing.calibrate_run import Calibrated, CalibrateWish, calibrate
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
+from swath.georef.calibration import INDEX, Calibration, read_calibration
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.trajectory import Trajectory
 from tests.calib.village import KNOWN, Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

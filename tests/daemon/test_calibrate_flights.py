@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.main import run_app
-from georef.calibration import INDEX, PARAMETERS, Calibration, read_calibration
+from swath.daemon.cli.main import run_app
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration, read_calibration
 from tests.calib.village import KNOWN, TRUE, Made, village
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(3000)]

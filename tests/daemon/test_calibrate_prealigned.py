@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjust import adjust
-from calib.calibration_file import Header, calibration_text
-from calib.features import Features
-from calib.flight import Flight
-from calib.outcome import Considered
-from calib.parameters import Wish
-from calib.plane_search import find_planes
-from calib.report_input import Finding
-from calib.trajectory_errors import Taus, gauss_markov
-from daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
-from georef.calibration import INDEX, Calibration, read_calibration
+from swath.calib.adjust import adjust
+from swath.calib.calibration_file import Header, calibration_text
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.outcome import Considered
+from swath.calib.parameters import Wish
+from swath.calib.plane_search import find_planes
+from swath.calib.report_input import Finding
+from swath.calib.trajectory_errors import Taus, gauss_markov
+from swath.daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
+from swath.georef.calibration import INDEX, Calibration, read_calibration
 from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -10,14 +10,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib.need import POINT, need_of
-from calib.report_verdict import Level as CalibrationLevel
-from calib.report_verdict import judge, wanted_of
-from daemon.config import parse_config
-from daemon.processing.calibrate_products import _header, _wanted, trajectory_says
-from daemon.processing.calibrate_run import Calibrated
-from daemon.processing.carried_verdict import Carried
-from daemon.processing.navigation_verdict import Level
+from swath.calib.need import POINT, need_of
+from swath.calib.report_verdict import Level as CalibrationLevel
+from swath.calib.report_verdict import judge, wanted_of
+from swath.daemon.config import parse_config
+from swath.daemon.processing.calibrate_products import _header, _wanted, trajectory_says
+from swath.daemon.processing.calibrate_run import Calibrated
+from swath.daemon.processing.carried_verdict import Carried
+from swath.daemon.processing.navigation_verdict import Level
 from tests.calib.made_outcome import made_outcome, made_report
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from calib.record import told_value
-from daemon.processing.calibrate_record import instruments_of
-from daemon.processing.calibration_flight import read_flight
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.setup import Options
+from swath.calib.record import told_value
+from swath.daemon.processing.calibrate_record import instruments_of
+from swath.daemon.processing.calibration_flight import read_flight
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.setup import Options
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.flight import Flight
-from daemon.cli.main import run_app
-from daemon.processing import calibration_flight, flights
-from daemon.processing.calibration_flight import read_flight
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish, offset_of
-from daemon.processing.jobs import JobResult
-from daemon.processing.setup import Options, Setup
-from daemon.processing.workers import run_jobs
+from swath.calib.flight import Flight
+from swath.daemon.cli.main import run_app
+from swath.daemon.processing import calibration_flight, flights
+from swath.daemon.processing.calibration_flight import read_flight
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish, offset_of
+from swath.daemon.processing.jobs import JobResult
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.workers import run_jobs
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from georef.formats.trajectory_file import read_trajectory
+from swath.daemon.cli.main import run_app
+from swath.georef.formats.trajectory_file import read_trajectory
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -11,9 +11,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib.prealign import PrealignError
-from daemon.errors import ExitCode, UserError
-from daemon.processing.carried_verdict import (
+from swath.calib.prealign import PrealignError
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
     file_verdicts,
@@ -24,9 +24,9 @@ from daemon.processing.carried_verdict import (
     trajectory_entry,
     verdict_entry,
 )
-from daemon.processing.navigation_verdict import Level
-from daemon.processing.setup import Setup
-from georef.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.daemon.processing.navigation_verdict import Level
+from swath.daemon.processing.setup import Setup
+from swath.georef.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.georef.flown import flown
 
 TEXT = """

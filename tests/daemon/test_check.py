@@ -21,16 +21,16 @@ import can
 import numpy as np
 import pytest
 
-from daemon.check import Report, bitrate_problems, check_everything
-from daemon.config import DeviceEntry, parse_config
-from daemon.identify import describe_tag, identify
-from drivers.core.can_frames import encode_can_frame
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
-from drivers.transports.capture_file import read_pcap
-from drivers.transports.uri import parse_transport
-from georef.records import ChunkBatch, TimeScale, TimeTag
+from swath.daemon.check import Report, bitrate_problems, check_everything
+from swath.daemon.config import DeviceEntry, parse_config
+from swath.daemon.identify import describe_tag, identify
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
+from swath.drivers.transports.capture_file import read_pcap
+from swath.drivers.transports.uri import parse_transport
+from swath.georef.records import ChunkBatch, TimeScale, TimeTag
 from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender
 
@@ -508,7 +508,7 @@ class TestComputer:
         )
         with udp_sender(port, srep_datagram):
             run = subprocess.run(
-                [sys.executable, "-m", "daemon.cli.main", "check", str(config), "--seconds", "0.5"],
+                [sys.executable, "-m", "swath.daemon.cli.main", "check", str(config), "--seconds", "0.5"],
                 cwd=ROOT,
                 env=os.environ | {"COLUMNS": "100"},
                 capture_output=True,
@@ -532,7 +532,7 @@ def _unprivileged(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command line without CAP_NET_ADMIN."""
     drop = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"] if os.getuid() == 0 else []
     return subprocess.run(
-        [*drop, sys.executable, "-m", "daemon.cli.main", *arguments],
+        [*drop, sys.executable, "-m", "swath.daemon.cli.main", *arguments],
         cwd=ROOT,
         capture_output=True,
         text=True,

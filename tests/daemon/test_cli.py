@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from daemon.cli.main import COMMANDS, make_app
-from daemon.errors import ExitCode
-from drivers.core.registry import KINDS, all_drivers
+from swath.daemon.cli.main import COMMANDS, make_app
+from swath.daemon.errors import ExitCode
+from swath.drivers.core.registry import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +27,7 @@ INTERRUPTED, PIPE_CLOSED = 130, 141
 def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command line as a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "daemon.cli.main", *arguments],
+        [sys.executable, "-m", "swath.daemon.cli.main", *arguments],
         cwd=ROOT,
         env=os.environ | {"COLUMNS": "100", "NO_COLOR": "1"} | environment,
         capture_output=True,
@@ -39,7 +39,7 @@ def swath(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command line with a command added to it."""
-    head = "import sys; import daemon.cli.main as cli\n"
+    head = "import sys; import swath.daemon.cli.main as cli\n"
     return subprocess.run(
         [sys.executable, "-c", head + code],
         cwd=ROOT,
@@ -158,7 +158,7 @@ class TestErrors:
     def test_output_that_cannot_be_written_is_an_io_error(self) -> None:
         with Path("/dev/full").open("w") as full:
             run = subprocess.run(
-                [sys.executable, "-m", "daemon.cli.main", "devices", "--json"],
+                [sys.executable, "-m", "swath.daemon.cli.main", "devices", "--json"],
                 cwd=ROOT,
                 stdout=full,
                 stderr=subprocess.PIPE,
@@ -172,7 +172,7 @@ class TestErrors:
 
     def test_a_closed_pipe_ends_it_quietly(self) -> None:
         process = subprocess.Popen(
-            [sys.executable, "-m", "daemon.cli.main", "devices"],
+            [sys.executable, "-m", "swath.daemon.cli.main", "devices"],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -189,7 +189,7 @@ class TestErrors:
         config.write_text(f'[session]\nname = "x"\ndirectory = "."\n[pps.main]\nsource = "fixed:{tmp_path}/edges"\n')
         os.mkfifo(tmp_path / "edges")
         process = subprocess.Popen(
-            [sys.executable, "-m", "daemon.cli.main", "check", str(config), "--seconds", "3000"],
+            [sys.executable, "-m", "swath.daemon.cli.main", "check", str(config), "--seconds", "3000"],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -15,14 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from daemon.config import Config, Tables, load_config, parse_config
-from daemon.config.checks import rotation_problem, same_wire
-from daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
-from daemon.errors import ConfigError, ExitCode, UserError
-from daemon.log_parsers import stored_parsers
-from daemon.processing.models import mount_of
-from drivers.core.registry import all_drivers
-from drivers.transports.uri import parse_transport
+from swath.daemon.config import Config, Tables, load_config, parse_config
+from swath.daemon.config.checks import rotation_problem, same_wire
+from swath.daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
+from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.processing.models import mount_of
+from swath.drivers.core.registry import all_drivers
+from swath.drivers.transports.uri import parse_transport
 
 ROOT = Path(__file__).parents[2]
 FIXTURES = ROOT / "fixtures/config"
@@ -115,7 +115,7 @@ class TestWholeFile:
     def test_loading_stays_light(self) -> None:
         """No DBC configured: no cantools; and never what georeferencing needs."""
         code = (
-            "import sys; from pathlib import Path; from daemon.config import parse_config; "
+            "import sys; from pathlib import Path; from swath.daemon.config import parse_config; "
             'parse_config(\'[session]\\nname="x"\\n[scanner.left]\\ntransport="udp:0.0.0.0:2368"\\n'
             "protocol=\"srep\"\\nmirror_factor=2\\n', Path('/tmp/a.toml')); "
             "print([m for m in ('cantools', 'scipy', 'numba', 'pyproj', 'serial', 'mcap', 'rich') if m in sys.modules])"

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE, Control
+from swath.daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE, Control
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table, wait_until
@@ -29,7 +29,7 @@ from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recorder_faults import Numbers, scanner
 
 if TYPE_CHECKING:
-    from daemon.run import Assembly
+    from swath.daemon.run import Assembly
 
 NOBODY = 65534
 CONNECT_AS = """
@@ -39,10 +39,11 @@ print(socket.socket(socket.AF_UNIX).connect_ex(sys.argv[1]))
 """
 RUN_AS = """
 import os, sys
-import daemon.cli.main, daemon.config, daemon.control_client, daemon.monitor, daemon.offload, rich.live, rich.progress
-daemon.cli.main.make_app(None)
+import swath.daemon.cli.main, swath.daemon.config, swath.daemon.control_client
+import swath.daemon.monitor, swath.daemon.offload, rich.live, rich.progress
+swath.daemon.cli.main.make_app(None)
 os.setgroups([]); os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))
-sys.exit(daemon.cli.main.run_app(sys.argv[2:]))
+sys.exit(swath.daemon.cli.main.run_app(sys.argv[2:]))
 """
 
 

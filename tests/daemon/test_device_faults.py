@@ -22,12 +22,12 @@ from typing import Any
 import can
 import pytest
 
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from drivers.core.can_frames import encode_can_frame
-from drivers.scanner.srep import SrepHeader, encode_datagram
-from georef.records import ChunkBatch, DeviceClockSamples, Record
-from georef.timescales import DeviceClock, PpsClock
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.scanner.srep import SrepHeader, encode_datagram
+from swath.georef.records import ChunkBatch, DeviceClockSamples, Record
+from swath.georef.timescales import DeviceClock, PpsClock
 from tests.daemon import faulty_can
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
@@ -42,7 +42,7 @@ def logs(tmp_path: Path) -> Path:
 
 def info(logs: Path) -> dict[str, Any]:
     """What ``swath info`` says of the one session in a directory; nothing unaccounted, nothing damaged."""
-    command = [sys.executable, "-m", "daemon.cli.main", "info", "--json", str(logs)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "info", "--json", str(logs)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=True)
     (session,) = json.loads(done.stdout)["sessions"]
     sources: dict[str, Any] = session["sources"]

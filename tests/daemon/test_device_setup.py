@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from pyubx2 import SET, UBXReader
 
-from daemon.cli import setup
-from daemon.config import parse_config
-from daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
-from daemon.errors import ExitCode, UserError
-from drivers.transports import uri
+from swath.daemon.cli import setup
+from swath.daemon.config import parse_config
+from swath.daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
+from swath.daemon.errors import ExitCode, UserError
+from swath.drivers.transports import uri
 from tests.daemon.commands import swath
 from tests.daemon.receivers import (
     novatel_replies,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.doctor.clock import chrony_steps
-from daemon.doctor.finding import Tree
+from swath.daemon.doctor.clock import chrony_steps
+from swath.daemon.doctor.finding import Tree
 from tests.test_systemd import SYSTEMD
 
 # what Debian's and Ubuntu's chrony.conf says beside sources of time: conf.d comes before its own makestep

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.processing.navigation_inputs import _missing
-from daemon.processing.navigation_times import ImuTimes, Stretch
-from georef.navigation.samples import Sampler
-from georef.records import IMU_DTYPE, Int64Array
+from swath.daemon.processing.navigation_inputs import _missing
+from swath.daemon.processing.navigation_times import ImuTimes, Stretch
+from swath.georef.navigation.samples import Sampler
+from swath.georef.records import IMU_DTYPE, Int64Array
 
 S = 1_000_000_000
 RATE_HZ = 100.0

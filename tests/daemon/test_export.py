@@ -21,12 +21,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.config import Config, load_config
-from daemon.exporting import MANIFEST, ExportReport, export_session
-from daemon.log.reader import open_logs
-from daemon.sidecar import SUFFIX
-from drivers.core.can_frames import encode_can_frame
-from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from swath.daemon.config import Config, load_config
+from swath.daemon.exporting import MANIFEST, ExportReport, export_session
+from swath.daemon.log.reader import open_logs
+from swath.daemon.sidecar import SUFFIX
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
 from tests.daemon.exchange import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
@@ -384,7 +384,7 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
 def peak_kib(*arguments: object) -> int:
     """What a command needed of memory at most."""
     code = (
-        "import resource, sys; from daemon.cli.main import run_app; assert run_app(sys.argv[1:]) == 0; "
+        "import resource, sys; from swath.daemon.cli.main import run_app; assert run_app(sys.argv[1:]) == 0; "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     words = [sys.executable, "-c", code, *map(str, arguments)]

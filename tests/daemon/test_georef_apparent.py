@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from daemon.cli.main import run_app
-from georef.formats.sbet import sbet_bytes
+from swath.daemon.cli.main import run_app
+from swath.georef.formats.sbet import sbet_bytes
 from tests.daemon.one_line import PLAN, Flown
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.log.reader import open_logs
-from daemon.processing.setup import Options, Setup
-from daemon.processing.unread import refused_by
-from daemon.processing.workers import _held_interrupts
-from georef.formats.sbet import sbet_bytes
-from georef.formats.trajectory_csv import csv_text
-from georef.records import ChunkBatch
-from georef.trajectory import Trajectory
+from swath.daemon.cli.main import run_app
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.unread import refused_by
+from swath.daemon.processing.workers import _held_interrupts
+from swath.georef.formats.sbet import sbet_bytes
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.records import ChunkBatch
+from swath.georef.trajectory import Trajectory
 from tests.daemon.one_line import PLAN, Flown
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from daemon.cli.main import run_app
-from georef.formats.trajectory_csv import csv_text
+from swath.daemon.cli.main import run_app
+from swath.georef.formats.trajectory_csv import csv_text
 from tests.daemon.one_line import Flown, fly
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

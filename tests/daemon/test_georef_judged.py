@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.errors import ExitCode
-from georef.formats.trajectory_csv import csv_text
-from georef.trajectory import Trajectory
-from sim.fly import VirtualFlight, open_truth
-from sim.plan import parse_plan
+from swath.daemon.cli.main import run_app
+from swath.daemon.errors import ExitCode
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.trajectory import Trajectory
+from swath.sim.fly import VirtualFlight, open_truth
+from swath.sim.plan import parse_plan
 from tests.calib.village import judge_unusable
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from daemon.config import Config
-from daemon.config.tables import GnssConfig
-from daemon.processing.feed import LogClocks, read_clocks
-from daemon.processing.given_trajectory import Belonging, Given, _nearest, judge_given, points_of
-from daemon.processing.setup import Options, Setup
-from georef.agreement import Apart
-from georef.earth import geodetic_from_e
-from georef.trajectory import Trajectory
+from swath.daemon.config import Config
+from swath.daemon.config.tables import GnssConfig
+from swath.daemon.processing.feed import LogClocks, read_clocks
+from swath.daemon.processing.given_trajectory import Belonging, Given, _nearest, judge_given, points_of
+from swath.daemon.processing.setup import Options, Setup
+from swath.georef.agreement import Apart
+from swath.georef.earth import geodetic_from_e
+from swath.georef.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 
 UNDULATION_M = 48.0  # of the virtual receiver

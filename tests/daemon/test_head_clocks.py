@@ -12,24 +12,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.capture_routes import Routes
-from daemon.captures import ImportUnit
-from daemon.config import Config, parse_config
-from daemon.errors import UserError
-from daemon.importing import ImportLog
-from daemon.log.reader import open_logs
-from daemon.processing.feed import read_clocks
-from daemon.processing.head_clocks import find_stamps, stamp_lines
-from daemon.processing.log_index import index_log
-from daemon.processing.refusals import refuse_no_time, time_trouble
-from daemon.processing.setup import Setup
-from drivers.scanner.hesai import encode_point_packet
-from drivers.scanner.hesai_gps import encode_gps_packet
-from drivers.scanner.velodyne import encode_data_packet
-from drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
-from georef.records import DEVICE_CLOCK_DTYPE
-from georef.stream_clocks import FrozenClocks
-from georef.timescales import StampScale
+from swath.daemon.capture_routes import Routes
+from swath.daemon.captures import ImportUnit
+from swath.daemon.config import Config, parse_config
+from swath.daemon.errors import UserError
+from swath.daemon.importing import ImportLog
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing.feed import read_clocks
+from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
+from swath.daemon.processing.log_index import index_log
+from swath.daemon.processing.refusals import refuse_no_time, time_trouble
+from swath.daemon.processing.setup import Setup
+from swath.drivers.scanner.hesai import encode_point_packet
+from swath.drivers.scanner.hesai_gps import encode_gps_packet
+from swath.drivers.scanner.velodyne import encode_data_packet
+from swath.drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
+from swath.georef.records import DEVICE_CLOCK_DTYPE
+from swath.georef.stream_clocks import FrozenClocks
+from swath.georef.timescales import StampScale
 
 NS = 1_000_000_000
 START = dt.datetime(2026, 6, 15, 9, 59, 50, tzinfo=dt.UTC)  # the hour turns ten seconds later

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.capture_files import Told
-from daemon.errors import UserError
-from daemon.exporting import export_session
-from daemon.log.reader import open_logs
-from daemon.places import take_directory
-from daemon.replay import timed_units
-from daemon.sidecar import read_sidecar, sidecar_of
-from drivers.core.can_frames import encode_can_frame
-from drivers.transports.capture_base import CaptureDamageError
-from drivers.transports.capture_file import read_candump, read_pcap, read_serial
-from drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from swath.daemon.capture_files import Told
+from swath.daemon.errors import UserError
+from swath.daemon.exporting import export_session
+from swath.daemon.log.reader import open_logs
+from swath.daemon.places import take_directory
+from swath.daemon.replay import timed_units
+from swath.daemon.sidecar import read_sidecar, sidecar_of
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.transports.capture_base import CaptureDamageError
+from swath.drivers.transports.capture_file import read_candump, read_pcap, read_serial
+from swath.drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
 from tests.daemon.exchange import CONFIG, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log

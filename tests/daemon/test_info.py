@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from georef.records import ChunkBatch
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.georef.records import ChunkBatch
 from tests.daemon.commands import swath
 from tests.daemon.rig import Recorder, session_table
 from tests.daemon.test_cli import ROOT
@@ -107,7 +107,7 @@ def test_a_long_name_and_a_wide_sigma_fit_and_what_is_not_known_is_not_told(
 
     from rich.console import Console
 
-    from daemon.cli.info import _print_session
+    from swath.daemon.cli.info import _print_session
 
     lost = {"lost_kernel": 0, "lost_queue": 0, "lost_write": 0}
     source: dict[str, object] = {"units": 1_234_567, "bytes": 1, "rate_hz": 20000.0, "gaps": 0, "longest_gap_s": 0.0}

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.log.claim import is_being_written
-from daemon.log.reader import open_logs
-from daemon.log.recover import recover
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import recover
 from tests.daemon.log_check import official_counts
 from tests.daemon.rig import HANGS_S, free_udp_port, session_table, wait_until
 

@@ -19,29 +19,29 @@ import pytest
 from numpy.typing import NDArray
 from rich.text import Text
 
-from daemon.cli.live import page
-from daemon.cli.main import run_app
-from daemon.config import Config, load_config
-from daemon.config.tables import LiveConfig
-from daemon.errors import UserError
-from daemon.log.chunks import LogBatch
-from daemon.log.reader import Session, open_logs
-from daemon.parts import RECORDING_SIGN
-from daemon.processing import live as live_module
-from daemon.processing import live_follow
-from daemon.processing.feed import TICK_BYTES, TICK_NS
-from daemon.processing.live import Live, LiveSession, Told, replay
-from daemon.processing.live_points import POINT_DTYPE
-from daemon.processing.live_status import LiveStatus, sentence
-from daemon.processing.setup import Options, Setup
-from daemon.processing.warm_up import WarmUp
-from daemon.sim_log import fly_into_log
-from georef.points import Fate
-from georef.stream_clocks import DevicePlan
-from georef.timescales import ClockStatus, TimeState
-from sim.companions import companion_files, config_text, default_wires
-from sim.fly import VirtualFlight
-from sim.plan import parse_plan
+from swath.daemon.cli.live import page
+from swath.daemon.cli.main import run_app
+from swath.daemon.config import Config, load_config
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.errors import UserError
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.parts import RECORDING_SIGN
+from swath.daemon.processing import live as live_module
+from swath.daemon.processing import live_follow
+from swath.daemon.processing.feed import TICK_BYTES, TICK_NS
+from swath.daemon.processing.live import Live, LiveSession, Told, replay
+from swath.daemon.processing.live_points import POINT_DTYPE
+from swath.daemon.processing.live_status import LiveStatus, sentence
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.warm_up import WarmUp
+from swath.daemon.sim_log import fly_into_log
+from swath.georef.points import Fate
+from swath.georef.stream_clocks import DevicePlan
+from swath.georef.timescales import ClockStatus, TimeState
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.fly import VirtualFlight
+from swath.sim.plan import parse_plan
 from tests.daemon.commands import ROOT
 from tests.daemon.test_cli import swath
 
@@ -419,9 +419,9 @@ class TestCommand:
             def run(self, stopped: object) -> Told:
                 return {"state": "ended (stopped)"}
 
-        monkeypatch.setattr("daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
-        monkeypatch.setattr("daemon.processing.live.be_humble", lambda: None)
-        monkeypatch.setattr("daemon.processing.live.Live", Nothing)
+        monkeypatch.setattr("swath.daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
+        monkeypatch.setattr("swath.daemon.processing.live.be_humble", lambda: None)
+        monkeypatch.setattr("swath.daemon.processing.live.Live", Nothing)
         assert run_app(["live", str(tmp_path)]) == 0
         told = capfd.readouterr()
         assert told.out == ""

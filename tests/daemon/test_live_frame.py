@@ -10,11 +10,11 @@ import pytest
 from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
-from daemon.config.tables import LiveConfig
-from daemon.processing.live_frame import LocalFrame
-from daemon.processing.live_mcap import NAME
-from daemon.processing.live_points import PointsFile
-from daemon.processing.live_products import LiveProducts, Room
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.processing.live_frame import LocalFrame
+from swath.daemon.processing.live_mcap import NAME
+from swath.daemon.processing.live_points import PointsFile
+from swath.daemon.processing.live_products import LiveProducts, Room
 from tests.daemon.test_live_products import SECOND_NS, Utm, flight, points_at, read_back
 
 pytestmark = pytest.mark.xdist_group("kernels")

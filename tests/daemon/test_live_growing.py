@@ -14,11 +14,11 @@ from typing import IO
 import numpy as np
 import pytest
 
-from daemon.config.tables import LiveConfig
-from daemon.log.reader import open_logs
-from daemon.processing.live import Told, replay
-from daemon.processing.setup import Options, Setup
-from daemon.processing.warm_up import warm_up
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing.live import Told, replay
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.warm_up import warm_up
 from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_live import PLAN
@@ -32,7 +32,7 @@ PART_MINUTES = 0.035  # two seconds
 @contextmanager
 def running(*words: str | Path, output: IO[str] | int = subprocess.DEVNULL) -> Iterator[subprocess.Popen[str]]:
     """A command of ours; gone at the end, whatever happens."""
-    command = [sys.executable, "-m", "daemon.cli.main", *map(str, words)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", *map(str, words)]
     with subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process

@@ -13,12 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from daemon.cli.main import run_app
-from daemon.log.reader import Session, open_logs
-from daemon.processing.feed import LogFeed
-from daemon.processing.setup import Options, Setup
-from daemon.processing.warm_up import warm_up
-from georef.points import Points
+from swath.daemon.cli.main import run_app
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.feed import LogFeed
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.warm_up import warm_up
+from swath.georef.points import Points
 from tests.daemon.rig import HANGS_S, Recorder, wait_until
 from tests.daemon.test_live_growing import config_of, running
 

@@ -17,12 +17,12 @@ from PIL import Image
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from daemon.config.tables import LiveConfig
-from daemon.processing.live_grid import TILE, CountGrid
-from daemon.processing.live_mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
-from daemon.processing.live_products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
-from georef.points import Points
-from georef.trajectory import Trajectory
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.processing.live_grid import TILE, CountGrid
+from swath.daemon.processing.live_mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
+from swath.daemon.processing.live_products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
+from swath.georef.points import Points
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

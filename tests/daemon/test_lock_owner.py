@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.errors import UserError
-from daemon.places import LOCK, take_directory
+from swath.daemon.errors import UserError
+from swath.daemon.places import LOCK, take_directory
 from tests.daemon.rig import HANGS_S
 from tests.daemon.test_cli import ROOT
 
@@ -18,8 +18,8 @@ NOBODY = 65534
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from daemon.errors import UserError
-from daemon.places import take_directory
+from swath.daemon.errors import UserError
+from swath.daemon.places import take_directory
 
 os.chdir(sys.argv[1])  # what lies above may be closed to others
 os.setgroups([]); os.setgid(65534); os.setuid(65534)

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from small_mcap import get_summary, read_message
 
-from daemon.log.encode import encode_block, encode_json
-from daemon.log.format import ChannelSpec, LogError
-from daemon.log.reader import open_logs
-from daemon.log.recover import examine, recover
-from daemon.log.scan import Damage, Record, scan, unpack_chunk
-from daemon.log.writer import LogWriteError, PartWriter
+from swath.daemon.log.encode import encode_block, encode_json
+from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import examine, recover
+from swath.daemon.log.scan import Damage, Record, scan, unpack_chunk
+from swath.daemon.log.writer import LogWriteError, PartWriter
 from tests.daemon.commands import swath
 from tests.daemon.rig import session_table
 from tests.daemon.test_cli import ROOT
@@ -402,8 +402,8 @@ def test_units_without_bytes_and_blocks_without_units(tmp_path: Path) -> None:
 PEAK = """
 import resource, sys
 from pathlib import Path
-from daemon.log.reader import open_logs
-from daemon.log.recover import recover
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import recover
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 path = Path(sys.argv[1])
 count = sum(len(batch.units) for session in open_logs([path]) for batch in session.batches_by_time())

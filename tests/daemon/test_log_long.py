@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.log.recover import recover
+from swath.daemon.log.recover import recover
 from tests.daemon.test_log import write_part
 
 SCRIPT = Path(__file__).with_name("read_with_official_typescript.mjs")

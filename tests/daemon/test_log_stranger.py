@@ -20,9 +20,9 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from daemon.log.format import LogError
-from daemon.log.reader import open_logs
-from daemon.log.recover import examine, recover
+from swath.daemon.log.format import LogError
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import examine, recover
 from tests.daemon.rig import HANGS_S, free_udp_port, session_table
 from tests.daemon.test_log import INFO, START_NS, official
 from tests.fuzz import mcap_parts as mcap
@@ -35,7 +35,7 @@ SECONDS = 60.0
 YEAR_2200_NS = 7_258_118_400_000_000_000
 RUN = """
 import contextlib, io, json, sys, time
-from daemon.cli.main import run_app
+from swath.daemon.cli.main import run_app
 
 def peak():
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]) * 1024

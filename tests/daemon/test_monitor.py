@@ -24,17 +24,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daemon.cli.monitor import page, time_text
-from daemon.log.encode import encode_block
-from daemon.log.follow import LogFollower, PartFollower
-from daemon.log.reader import open_logs
-from daemon.log.writer import PartWriter
-from daemon.monitor import Monitor
-from daemon.monitor_source import Decoding
-from daemon.run import read_boot_id
-from drivers.core.parser import PacketParser
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from georef.records import ByteRows, Int64Array, Record
+from swath.daemon.cli.monitor import page, time_text
+from swath.daemon.log.encode import encode_block
+from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.monitor import Monitor
+from swath.daemon.monitor_source import Decoding
+from swath.daemon.run import read_boot_id
+from swath.drivers.core.parser import PacketParser
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.georef.records import ByteRows, Int64Array, Record
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_table, wait_until
@@ -482,7 +482,7 @@ def test_memory_is_bounded_and_processor_little(tmp_path: Path, logs: Path) -> N
     port = free_udp_port()
     with Recorder(tmp_path, session_table(logs, split_size_mb=16) + scanner(port)) as recorder:
         recorder.wait_said("device_opened")
-        command = [sys.executable, "-m", "daemon.cli.main", "monitor", str(logs), "--json"]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "monitor", str(logs), "--json"]
         numbers = Numbers(port)
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as monitor:
             resident_kb, began_s = [], time.monotonic()
@@ -522,7 +522,7 @@ def test_on_a_terminal_it_is_a_page_until_ctrl_c(tmp_path: Path, logs: Path) -> 
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 100.0):
         recorder.wait_said("device_opened")
         time.sleep(2.5)
-        command = [sys.executable, "-m", "daemon.cli.main", "monitor", str(logs)]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "monitor", str(logs)]
         process = subprocess.Popen(command, cwd=ROOT, stdout=secondary, stderr=subprocess.PIPE, env=environment)
         os.close(secondary)
         wanted = (b"GB free", b"scanner/left", b"receiving", b"session_started", b"h left at this rate")

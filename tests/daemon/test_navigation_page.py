@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from daemon.processing.navigation_page import PICTURES, write_page
-from daemon.processing.navigation_plots import FATE_LOOK, FIX_LOOK, draw_innovations, draw_map
-from daemon.processing.navigation_series import (
+from swath.daemon.processing.navigation_page import PICTURES, write_page
+from swath.daemon.processing.navigation_plots import FATE_LOOK, FIX_LOOK, draw_innovations, draw_map
+from swath.daemon.processing.navigation_series import (
     COLUMNS,
     Flight,
     Pixels,
@@ -27,10 +27,10 @@ from daemon.processing.navigation_series import (
     outages_of,
     separation_of,
 )
-from daemon.processing.navigation_sheet import NARROW, WIDE, Drawn
-from georef.navigation.inputs import Fate, Kind, Solution
-from georef.records import FixType
-from georef.timescales.gps_time import SECOND_NS
+from swath.daemon.processing.navigation_sheet import NARROW, WIDE, Drawn
+from swath.georef.navigation.inputs import Fate, Kind, Solution
+from swath.georef.records import FixType
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.navigation_flights import reference_truth, sound_flight, with_rows
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

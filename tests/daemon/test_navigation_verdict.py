@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from daemon.processing.navigation_figures import CHI2_MEDIAN, Figures, figures_of
-from daemon.processing.navigation_page import summary_of
-from daemon.processing.navigation_series import Flight, separation_of
-from daemon.processing.navigation_verdict import RULES, Level, judge
-from georef.navigation.diagnosis import Finding
-from georef.navigation.inputs import Fate, Kind
-from georef.timescales.gps_time import SECOND_NS
+from swath.daemon.processing.navigation_figures import CHI2_MEDIAN, Figures, figures_of
+from swath.daemon.processing.navigation_page import summary_of
+from swath.daemon.processing.navigation_series import Flight, separation_of
+from swath.daemon.processing.navigation_verdict import RULES, Level, judge
+from swath.georef.navigation.diagnosis import Finding
+from swath.georef.navigation.inputs import Fate, Kind
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.navigation_flights import SMOOTHER_SIGMA, sound_flight, with_rows
 
 pytestmark = pytest.mark.xdist_group("kernels")

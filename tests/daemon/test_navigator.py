@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.log.chunks import LogBatch
-from daemon.processing.feed import LogFeed
-from daemon.processing.setup import Options, Setup
-from georef.navigation.inputs import OBSERVATION_DTYPE
-from georef.points import Fate, Points
-from georef.timescales import SECOND_NS
-from georef.trajectory import Trajectory
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.processing.feed import LogFeed
+from swath.daemon.processing.setup import Options, Setup
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE
+from swath.georef.points import Fate, Points
+from swath.georef.timescales import SECOND_NS
+from swath.georef.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short
 
 pytestmark = pytest.mark.xdist_group("kernels")

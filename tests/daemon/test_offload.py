@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from daemon.checksum_list import ChecksumList
-from daemon.cli.offload import _print as show
-from daemon.offload import BLOCK_BYTES, OffloadReport, offload
+from swath.daemon.checksum_list import ChecksumList
+from swath.daemon.cli.offload import _print as show
+from swath.daemon.offload import BLOCK_BYTES, OffloadReport, offload
 from tests.daemon.commands import swath
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, session_table, wait_until
 from tests.daemon.test_cli import ROOT
@@ -114,7 +114,7 @@ def test_finished_parts_are_copied_and_the_growing_one_is_not(tmp_path: Path, lo
 def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
-    command = [sys.executable, "-m", "daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.kill()
@@ -131,7 +131,7 @@ def test_a_killed_run_is_resumed(logs: Path, disk: Path) -> None:
 def test_ctrl_c_ends_it_quietly_and_leaves_the_partial_copy(logs: Path, disk: Path) -> None:
     path = big_log(logs)
     partial = disk / (path.name + ".partial")
-    command = [sys.executable, "-m", "daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "offload", "--same-disk", str(logs), str(disk)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: partial.exists() and partial.stat().st_size > BLOCK_BYTES, "a part of the copy")
     process.send_signal(signal.SIGINT)

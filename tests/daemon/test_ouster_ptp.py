@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from daemon.cli.main import run_app
-from drivers.scanner.ouster_head import read_head
-from sim.scanners import ouster_wire
-from sim.scanners.spinning_wire import HeadClock
+from swath.daemon.cli.main import run_app
+from swath.drivers.scanner.ouster_head import read_head
+from swath.sim.scanners import ouster_wire
+from swath.sim.scanners.spinning_wire import HeadClock
 from tests.daemon import one_line
 from tests.daemon.one_line import PLAN, Flown, fly
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.cli.plan_calibration import command
-from daemon.errors import ExitCode, UserError
+from swath.daemon.cli.plan_calibration import command
+from swath.daemon.errors import ExitCode, UserError
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.processing.point_times import PointClock, PointTimes, TimeKind, point_times_of, time_notes
-from daemon.processing.quicklook import look_at
-from georef.timescales.gps_time import WEEK_NS
+from swath.daemon.processing.point_times import PointClock, PointTimes, TimeKind, point_times_of, time_notes
+from swath.daemon.processing.quicklook import look_at
+from swath.georef.timescales.gps_time import WEEK_NS
 from tests.daemon.test_quicklook import lattice, write
 
 WEEK = 2423

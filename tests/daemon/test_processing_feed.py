@@ -16,26 +16,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.config import Config, load_config
-from daemon.log import scan as scan_module
-from daemon.log.chunks import LogBatch
-from daemon.log.follow import PartFollower
-from daemon.log.format import ChannelSpec, LogError
-from daemon.log.reader import Session, open_logs
-from daemon.processing import feed as feed_module
-from daemon.processing.feed import LogClocks, LogFeed, Placed, read_clocks
-from daemon.processing.models import TerrainRanges
-from daemon.processing.setup import Options, Setup
-from daemon.sim_log import fly_into_log
-from georef.coarse_terrain import CoarseTerrain
-from georef.points import Fate
-from georef.records import ChunkBatch, Int64Array, Record, StructArray
-from georef.stream import Stream, StreamSettings
-from georef.trajectory import Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
-from sim.companions import companion_files, config_text, default_wires
-from sim.fly import VirtualFlight
-from sim.plan import parse_plan
+from swath.daemon.config import Config, load_config
+from swath.daemon.log import scan as scan_module
+from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.follow import PartFollower
+from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing import feed as feed_module
+from swath.daemon.processing.feed import LogClocks, LogFeed, Placed, read_clocks
+from swath.daemon.processing.models import TerrainRanges
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.sim_log import fly_into_log
+from swath.georef.coarse_terrain import CoarseTerrain
+from swath.georef.points import Fate
+from swath.georef.records import ChunkBatch, Int64Array, Record, StructArray
+from swath.georef.stream import Stream, StreamSettings
+from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.fly import VirtualFlight
+from swath.sim.plan import parse_plan
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daemon.config import Config
-from daemon.config.tables import GimbalConfig, ScannerConfig
-from daemon.errors import ConfigError
-from daemon.processing.models import (
+from swath.daemon.config import Config
+from swath.daemon.config.tables import GimbalConfig, ScannerConfig
+from swath.daemon.errors import ConfigError
+from swath.daemon.processing.models import (
     connect,
     geometry_of,
     gimbal_sources,
@@ -22,17 +22,17 @@ from daemon.processing.models import (
     mount_of,
     refuse_logged_gimbals,
 )
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.scanner.srep import SrepParser
-from georef.beams import LineGeometry
-from georef.calibration import RangeOffset, nominal
-from georef.georeference import Georeferencer
-from georef.mount import AngleSeries
-from georef.points import Fate
-from georef.ranging import ZoneResolver
-from georef.sensor_model import SensorModel
-from georef.stream import ScannerChain
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.srep import SrepParser
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import RangeOffset, nominal
+from swath.georef.georeference import Georeferencer
+from swath.georef.mount import AngleSeries
+from swath.georef.points import Fate
+from swath.georef.ranging import ZoneResolver
+from swath.georef.sensor_model import SensorModel
+from swath.georef.stream import ScannerChain
 from tests.daemon.standin import aircraft_config
 from tests.georef.scanner_cases import rows_of, still_trajectory
 

@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from daemon.config.tables import ScannerConfig
-from daemon.processing.models import TerrainRanges, connect, make_resolver
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.srep import SrepParser
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from georef.beams import LineGeometry
-from georef.calibration import RangeOffset, nominal
-from georef.coarse_terrain import CoarseTerrain
-from georef.georeference import Georeferencer
-from georef.points import Fate, Points
-from georef.ranging import PulseRates
-from georef.records import ChunkBatch, Int64Array, ScannerReturns, StructArray
-from georef.sensor_model import SensorModel
-from georef.stream import CompletePath, ScannerChain, Stream, StreamSettings
-from georef.trajectory import Trajectory
+from swath.daemon.config.tables import ScannerConfig
+from swath.daemon.processing.models import TerrainRanges, connect, make_resolver
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import RangeOffset, nominal
+from swath.georef.coarse_terrain import CoarseTerrain
+from swath.georef.georeference import Georeferencer
+from swath.georef.points import Fate, Points
+from swath.georef.ranging import PulseRates
+from swath.georef.records import ChunkBatch, Int64Array, ScannerReturns, StructArray
+from swath.georef.sensor_model import SensorModel
+from swath.georef.stream import CompletePath, ScannerChain, Stream, StreamSettings
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.config import parse_config
-from daemon.processing.models import make_motion
-from daemon.processing.setup import Options, Setup
-from georef.points import Points
-from georef.rotations import quaternion_from_rot
-from georef.trajectory import Trajectory
-from sim.companions import config_text, default_wires
+from swath.daemon.config import parse_config
+from swath.daemon.processing.models import make_motion
+from swath.daemon.processing.setup import Options, Setup
+from swath.georef.points import Points
+from swath.georef.rotations import quaternion_from_rot
+from swath.georef.trajectory import Trajectory
+from swath.sim.companions import config_text, default_wires
 from tests.sim.test_proof import (
     EVERY_ERROR,
     LOW_AND_SLOW,

@@ -16,17 +16,17 @@ from pyproj import Transformer
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from daemon.config.tables import ScannerConfig
-from daemon.processing.models import geometry_of
-from drivers.core.parser import DeviceSettings, PacketParser
-from drivers.core.registry import find_driver
-from drivers.scanner.hesai_heads import XT32
-from drivers.scanner.velodyne_heads import VLP16, VLP32C, SpinningHead
-from georef.beams import OusterGeometry, SpinningGeometry
-from georef.calibration import nominal
-from georef.records import StructArray
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.daemon.config.tables import ScannerConfig
+from swath.daemon.processing.models import geometry_of
+from swath.drivers.core.parser import DeviceSettings, PacketParser
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.hesai_heads import XT32
+from swath.drivers.scanner.velodyne_heads import VLP16, VLP32C, SpinningHead
+from swath.georef.beams import OusterGeometry, SpinningGeometry
+from swath.georef.calibration import nominal
+from swath.georef.records import StructArray
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 from tests.drivers import ouster_cases
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.spinning import are_near, feed, payloads, read_pcd, returns_of, xyz

@@ -10,19 +10,19 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daemon.config.config import Config
-from daemon.config.loading import parse_config
-from daemon.errors import UserError
-from daemon.processing import refusals
-from daemon.processing.feed import LogClocks
-from daemon.processing.setup import Options
-from daemon.processing.sidecar import unit_doubts
-from daemon.processing.unread import Unread, unread_lines
-from drivers.core.parser import Parser, ParserCounters
-from georef.mapping import Mapping
-from georef.records import INS_DTYPE
-from georef.timescales import ClockStatus, TimeState
-from georef.trajectory import Trajectory
+from swath.daemon.config.config import Config
+from swath.daemon.config.loading import parse_config
+from swath.daemon.errors import UserError
+from swath.daemon.processing import refusals
+from swath.daemon.processing.feed import LogClocks
+from swath.daemon.processing.setup import Options
+from swath.daemon.processing.sidecar import unit_doubts
+from swath.daemon.processing.unread import Unread, unread_lines
+from swath.drivers.core.parser import Parser, ParserCounters
+from swath.georef.mapping import Mapping
+from swath.georef.records import INS_DTYPE
+from swath.georef.timescales import ClockStatus, TimeState
+from swath.georef.trajectory import Trajectory
 
 S = 1_000_000_000
 A, B = Path("a.mcap"), Path("b.mcap")

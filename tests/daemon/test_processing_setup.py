@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daemon.config import Config
-from daemon.errors import ConfigError, UserError
-from daemon.log.format import SessionInfo
-from daemon.processing.setup import Options, Setup
-from georef.beams import LineGeometry, SpinningGeometry
-from georef.records import INS_DTYPE, NamesEdge
-from georef.stream_clocks import DevicePlan, GnssPlan, PpsPlan
-from georef.timescales import StampScale
+from swath.daemon.config import Config
+from swath.daemon.errors import ConfigError, UserError
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.processing.setup import Options, Setup
+from swath.georef.beams import LineGeometry, SpinningGeometry
+from swath.georef.records import INS_DTYPE, NamesEdge
+from swath.georef.stream_clocks import DevicePlan, GnssPlan, PpsPlan
+from swath.georef.timescales import StampScale
 from tests.daemon.standin import AIRCRAFT, aircraft_config
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -15,14 +15,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.config import ScannerConfig
-from daemon.processing.models import make_motion
-from georef.beams import LineGeometry
-from georef.calibration import PARAMETERS, read_calibration
-from georef.earth import rot_e_from_l
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise, Uncertainty
+from swath.daemon.config import ScannerConfig
+from swath.daemon.processing.models import make_motion
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import PARAMETERS, read_calibration
+from swath.georef.earth import rot_e_from_l
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise, Uncertainty
 from tests.daemon.test_processing_proof import IBRC, true_trajectory
 from tests.sim.test_proof import EVERY_ERROR, TURNED, Flown, fly_and_decode
 

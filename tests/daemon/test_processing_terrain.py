@@ -12,9 +12,9 @@ import rasterio
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from daemon.errors import ConfigError
-from daemon.processing.terrain import read_terrain
-from georef.earth import e_from_geodetic, rot_e_from_l
+from swath.daemon.errors import ConfigError
+from swath.daemon.processing.terrain import read_terrain
+from swath.georef.earth import e_from_geodetic, rot_e_from_l
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

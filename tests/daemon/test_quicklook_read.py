@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from daemon.processing.quicklook import Look, look_at
-from daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, has_varying_chunks
-from daemon.processing.quicklook_read import Units, density_near, open_source
-from georef.formats.copc import CopcWriter
-from georef.formats.las import LasSettings
-from georef.points import Points
+from swath.daemon.processing.quicklook import Look, look_at
+from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, has_varying_chunks
+from swath.daemon.processing.quicklook_read import Units, density_near, open_source
+from swath.georef.formats.copc import CopcWriter
+from swath.georef.formats.las import LasSettings
+from swath.georef.points import Points
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, two_strips, write
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -47,7 +47,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Look, Path]:
     laz, copc = tmp_path_factory.mktemp("laz"), tmp_path_factory.mktemp("copc")
     look = two_strips(laz, 0.07)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("georef.formats.copc.NODE_POINTS", 10_000)
+        patch.setattr("swath.georef.formats.copc.NODE_POINTS", 10_000)
         for source in look.sources:
             made = as_copc(source.path, copc / f"{source.path.stem}.copc.laz")
             with laspy.open(made) as reader:
@@ -77,7 +77,7 @@ def test_copc_looks_like_the_laz_of_its_points(both: tuple[Look, Path]) -> None:
 
 def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """At the far end, where only some of the blocks are wanted."""
-    monkeypatch.setattr("daemon.processing.quicklook_read.BLOCK_POINTS", 5_000)
+    monkeypatch.setattr("swath.daemon.processing.quicklook_read.BLOCK_POINTS", 5_000)
     ends = (EAST_M + 290.0, NORTH_M + 5.0, EAST_M + 290.0, NORTH_M + 155.0)
     heights = []
     for folder in (both[0].sources[0].path.parent, both[1]):
@@ -91,7 +91,7 @@ def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], m
 @pytest.mark.parametrize("size", [5_000, 100_000])
 def test_density_is_found_in_any_order(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     """COPC's is that of a tree: a piece of it is less dense than the whole."""
-    monkeypatch.setattr("daemon.processing.quicklook_read.SAMPLE_POINTS", size)
+    monkeypatch.setattr("swath.daemon.processing.quicklook_read.SAMPLE_POINTS", size)
     assert density_near(open_source(both[1] / "s1.copc.laz"), Units()) == pytest.approx(4.0, rel=0.3)
 
 

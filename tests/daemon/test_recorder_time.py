@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.config import load_config
-from daemon.host_clock import ClockDiscipline
-from daemon.run import Assembly, assemble
-from daemon.wire_player import TimedUnit
 from demo.captures import gnss_units, pps_units
-from drivers.transports.base import UnitBlock
-from georef.timescales import SECOND_NS, PpsClock
+from swath.daemon.config import load_config
+from swath.daemon.host_clock import ClockDiscipline
+from swath.daemon.run import Assembly, assemble
+from swath.daemon.wire_player import TimedUnit
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.timescales import SECOND_NS, PpsClock
 from tests.daemon.journal import journal_of
 from tests.daemon.rig import session_table
 

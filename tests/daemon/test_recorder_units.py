@@ -16,22 +16,22 @@ from typing import cast
 import numpy as np
 import pytest
 
-from daemon.acquire import Receiver, Shared
-from daemon.acquire_pps import PpsReceiver
-from daemon.block_queue import BlockQueue, QueueItem, SourceCount
-from daemon.channels import ChannelTable
-from daemon.events import Events, Severity
-from daemon.health import a_restart_helps_nobody, sentence, stuck_threads
-from daemon.host_clock import HostClock
-from daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
-from daemon.log.format import ChannelSpec, SessionInfo
-from daemon.log.writer import PartWriter
-from daemon.parts import Attachment, Parts
-from daemon.recorder import Recorder, RecorderSettings, WriterHealth, Writing
-from daemon.sd_notify import ServiceManager
-from daemon.wire_trouble import WireTrouble
-from drivers.session import Session
-from drivers.transports.base import PpsSource, RawEdge, TransportCounters
+from swath.daemon.acquire import Receiver, Shared
+from swath.daemon.acquire_pps import PpsReceiver
+from swath.daemon.block_queue import BlockQueue, QueueItem, SourceCount
+from swath.daemon.channels import ChannelTable
+from swath.daemon.events import Events, Severity
+from swath.daemon.health import a_restart_helps_nobody, sentence, stuck_threads
+from swath.daemon.host_clock import HostClock
+from swath.daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
+from swath.daemon.log.format import ChannelSpec, SessionInfo
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.parts import Attachment, Parts
+from swath.daemon.recorder import Recorder, RecorderSettings, WriterHealth, Writing
+from swath.daemon.sd_notify import ServiceManager
+from swath.daemon.wire_trouble import WireTrouble
+from swath.drivers.session import Session
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters
 from tests.daemon.journal import journal_of
 from tests.daemon.log_check import official_counts, read_log
 

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from daemon import repair
-from daemon.events import Event, Events, Severity
-from daemon.log.claim import claim
-from daemon.log.format import LogError
-from daemon.log.recover import recover
+from swath.daemon import repair
+from swath.daemon.events import Event, Events, Severity
+from swath.daemon.log.claim import claim
+from swath.daemon.log.format import LogError
+from swath.daemon.log.recover import recover
 from tests.daemon.commands import ROOT, swath
 from tests.daemon.log_check import official_counts
 from tests.daemon.rig import HANGS_S, wait_until
@@ -118,7 +118,7 @@ LARGE = f"{INFO.session_id}_2.mcap"
 def recovering(logs: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that stands still in the middle of a recovery."""
     write_part(logs / LARGE, part=2, blocks=1200, finish=False)
-    command = [sys.executable, "-m", "daemon.cli.main", "recover", str(logs / LARGE)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "recover", str(logs / LARGE)]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     temporary = unfinished_copy(logs)
     wait_until(lambda: temporary.exists() and temporary.stat().st_size > 1 << 20, "a part of the copy")

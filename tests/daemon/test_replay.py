@@ -18,8 +18,8 @@ from statistics import median
 import can
 import pytest
 
-from daemon.wire_player import Output, PtyOutput, TimedUnit, play
-from drivers.transports.base import TransportError
+from swath.daemon.wire_player import Output, PtyOutput, TimedUnit, play
+from swath.drivers.transports.base import TransportError
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 from tests.daemon.test_cli import ROOT
@@ -87,7 +87,16 @@ def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogCont
     with Recorder(folder, config) as recorder:
         recorder.wait_said("scanner/left device_opened")
         recorder.wait_said("imu/main device_opened")
-        command = [sys.executable, "-m", "daemon.cli.main", "replay", "--pace", pace, "--wire", str(recorder.config)]
+        command = [
+            sys.executable,
+            "-m",
+            "swath.daemon.cli.main",
+            "replay",
+            "--pace",
+            pace,
+            "--wire",
+            str(recorder.config),
+        ]
         played = subprocess.run(
             [*command, "--wait", "30", str(logs)],
             cwd=ROOT,
@@ -155,7 +164,7 @@ def test_info_of_a_session_whose_first_part_is_missing_names_it_and_blames_no_co
 ) -> None:
     second = sorted(first[0].glob("*.mcap"))[1]
     shutil.copy(second, tmp_path / second.name)
-    command = [sys.executable, "-m", "daemon.cli.main", "info", "--json", str(tmp_path)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "info", "--json", str(tmp_path)]
     told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=HANGS_S, check=False)
     assert told.returncode == 1, told.stderr
     (session,) = json.loads(told.stdout)["sessions"]

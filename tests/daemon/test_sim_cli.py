@@ -14,17 +14,17 @@ from pathlib import Path
 
 import pytest
 
-import daemon.cli.main as cli
-from daemon.cli.sim import PRESETS
-from daemon.config import load_config
-from daemon.errors import ExitCode, UserError
-from daemon.log.reader import open_logs
-from daemon.sim_ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
-from daemon.sim_folder import FlightFolder
-from daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
-from daemon.wire_player import Output, TimedUnit
-from drivers.core.extras import how_to_install
-from sim.plan import PRESETS as REAL_PRESETS
+import swath.daemon.cli.main as cli
+from swath.daemon.cli.sim import PRESETS
+from swath.daemon.config import load_config
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import open_logs
+from swath.daemon.sim_ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
+from swath.daemon.sim_folder import FlightFolder
+from swath.daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
+from swath.daemon.wire_player import Output, TimedUnit
+from swath.drivers.core.extras import how_to_install
+from swath.sim.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until
 from tests.daemon.standin import (
@@ -162,7 +162,7 @@ class TestIntoALog:
     @pytest.mark.slow
     def test_interrupted_it_leaves_nothing(self, tmp_path: Path) -> None:
         folder = tmp_path / "flight"
-        command = [sys.executable, "-m", "daemon.cli.main", "sim", "fly", "small", "-o", str(folder)]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "sim", "fly", "small", "-o", str(folder)]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as flying:
             wait_until(lambda: list(folder.rglob("*.mcap")), "a log that grows")
             flying.send_signal(signal.SIGINT)
@@ -179,7 +179,7 @@ class TestIntoALog:
         def refuse_chunk(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr("daemon.log.writer.PartWriter.flush", refuse_chunk)
+        monkeypatch.setattr("swath.daemon.log.writer.PartWriter.flush", refuse_chunk)
         words = ("fly", plan, "-o", str(tmp_path / "flight"), "--seconds", "2", "--no-truth")
         line = f"swath: {tmp_path / 'flight'}: No space left on device; nothing is left of this flight\n"
         assert in_process(capsys, *words) == (ExitCode.IO, line)
@@ -374,7 +374,7 @@ class TestWires:
         def makers(*_: object, **__: object) -> dict[str, Callable[[], Output]]:
             return {source: functools.partial(Noted, notes, source) for source in SOURCES}
 
-        monkeypatch.setattr("daemon.sim_wire.output_makers", makers)
+        monkeypatch.setattr("swath.daemon.sim_wire.output_makers", makers)
         monkeypatch.setattr(time, "clock_settime_ns", lambda _, now_ns: steps.append(now_ns - time.time_ns()))
         flight = Standin(2.0, ((0.75, 3600.0),), (("gnss/rover", 0.05, 0.105),))
         facts = FlightFacts(2.0, SOURCES, tuple(flight.wall_steps), tuple(flight.unplugged))
@@ -409,7 +409,7 @@ class TestWires:
         self, plan: str, flown: tuple[Path, str], tmp_path: Path
     ) -> None:
         folder = tmp_path / "wires"
-        command = [sys.executable, "-m", "daemon.cli.main", "sim", "fly", plan, "--wire", "-o", str(folder)]
+        command = [sys.executable, "-m", "swath.daemon.cli.main", "sim", "fly", plan, "--wire", "-o", str(folder)]
         with subprocess.Popen([*command, "--seconds", SECONDS], cwd=ROOT, stderr=subprocess.PIPE, text=True) as flying:
             wait_until((folder / "swath.toml").exists, "a configuration")
             wait_until((folder / "pps-main").exists, "the last of the wires")
@@ -436,7 +436,7 @@ class TestWires:
     def test_a_folder_of_wires_is_not_made_twice(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("daemon.sim_plans.make_flight_in_time", standin_for)
+        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", standin_for)
         path = tmp_path / "swath.toml"
         path.write_text("")
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path))
@@ -451,7 +451,7 @@ class TestWires:
         config = session_table(tmp_path / "logs")
         config += f'[pps.main]\nsource = "fixed:{tmp_path}/pps"\n[pps.other]\nsource = "fixed:{tmp_path}/other"\n'
         path.write_text(config)
-        monkeypatch.setattr("daemon.sim_plans.make_flight_in_time", standin_for)
+        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", standin_for)
         with one_processor():
             code, said = in_process(capsys, "fly", plan, "--wire", "--config", str(path), "--wait", "0")
         assert code == 0
@@ -465,7 +465,7 @@ class TestWires:
     def test_stepping_the_clock_is_refused_before_anything_is_made(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("daemon.sim_plans.make_flight_in_time", stepping_for)
+        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", stepping_for)
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path / "wires"))
         assert (code, said.count("\n")) == (ExitCode.USAGE, 1)
         assert said.startswith(

@@ -13,11 +13,11 @@ import typer
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from calib.strips import single_return_sigma_m
-from daemon.cli import strips, view
-from daemon.errors import ExitCode, UserError
-from daemon.processing.quicklook import Look, look_at
-from daemon.processing.quicklook_strips import TILE, Overlap
+from swath.calib.strips import single_return_sigma_m
+from swath.daemon.cli import strips, view
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.quicklook import Look, look_at
+from swath.daemon.processing.quicklook_strips import TILE, Overlap
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, plane, write
 
 pytestmark = pytest.mark.xdist_group("kernels")

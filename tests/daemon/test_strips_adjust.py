@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.errors import ExitCode, UserError
-from daemon.processing import strip_adjust_products
-from daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
-from daemon.processing.flights import Wish
-from daemon.processing.flown import TrajectoryWish
-from daemon.processing.navigation_verdict import Level
-from daemon.processing.setup import Options
-from daemon.processing.strip_adjust_products import write_adjustment
-from daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, correct_strips
-from georef.earth import rot_e_from_l
-from georef.formats.trajectory_csv import csv_text
-from georef.formats.trajectory_file import read_trajectory
-from georef.trajectory import Trajectory
+from swath.daemon.cli.main import run_app
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing import strip_adjust_products
+from swath.daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
+from swath.daemon.processing.flights import Wish
+from swath.daemon.processing.flown import TrajectoryWish
+from swath.daemon.processing.navigation_verdict import Level
+from swath.daemon.processing.setup import Options
+from swath.daemon.processing.strip_adjust_products import write_adjustment
+from swath.daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, correct_strips
+from swath.georef.earth import rot_e_from_l
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.trajectory import Trajectory
 from tests.calib.village import Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -14,20 +14,20 @@ import pytest
 import typer
 from pyproj import CRS
 
-from calib.flight import Flight
-from calib.report_verdict import overall_rms_m
-from calib.strip_cells import StripRules
-from daemon.cli import strips
-from daemon.errors import ExitCode, UserError
-from daemon.processing.calibrate_products import level_words, strips_entry
-from daemon.processing.quicklook import look_at, numbers_of
-from daemon.processing.setup import Options, Setup
-from daemon.processing.strip_agreement import before_and_after, difference_map
-from daemon.processing.strips_inputs import strips_of_files, strips_of_flight
-from daemon.processing.strips_run import refuse_installations
-from georef.formats.trajectory_csv import csv_text
-from georef.mapping import Mapping
-from georef.timescales.gps_time import WEEK_NS
+from swath.calib.flight import Flight
+from swath.calib.report_verdict import overall_rms_m
+from swath.calib.strip_cells import StripRules
+from swath.daemon.cli import strips
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibrate_products import level_words, strips_entry
+from swath.daemon.processing.quicklook import look_at, numbers_of
+from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.strip_agreement import before_and_after, difference_map
+from swath.daemon.processing.strips_inputs import strips_of_files, strips_of_flight
+from swath.daemon.processing.strips_run import refuse_installations
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.mapping import Mapping
+from swath.georef.timescales.gps_time import WEEK_NS
 from tests.calib.cast_flight import Cast, cast_flight
 from tests.daemon.standin import aircraft_config
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, write

@@ -9,9 +9,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 LOCK = """
 import sys
-import daemon.run
-from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales import PpsClock
+import swath.daemon.run
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import PpsClock
 S = 1_000_000_000
 clock = PpsClock()
 loaded = set(sys.modules)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.log.reader import open_logs
-from daemon.processing.event_marks import PLACED
-from daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
-from georef.formats.trajectory_file import read_trajectory
-from georef.trajectory import Trajectory
-from sim.plan import Plan, parse_plan
+from swath.daemon.cli.main import run_app
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing.event_marks import PLACED
+from swath.daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.trajectory import Trajectory
+from swath.sim.plan import Plan, parse_plan
 from tests.daemon import short_flight
 from tests.daemon.short_flight import MARK_AFTER_NS, Flown, errors, fly_short, post_processed, two_lines
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.processing.event_marks import HEADER, PLACED, event_table
-from daemon.processing.navigation_inputs import Mark
-from georef.records import EventMark, TimeScale, TimeTag
-from georef.trajectory import Trajectory
+from swath.daemon.processing.event_marks import HEADER, PLACED, event_table
+from swath.daemon.processing.navigation_inputs import Mark
+from swath.georef.records import EventMark, TimeScale, TimeTag
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

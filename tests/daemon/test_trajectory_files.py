@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.errors import UserError
-from daemon.processing import trajectory_files
-from daemon.processing.trajectory_files import (
+from swath.daemon.errors import UserError
+from swath.daemon.processing import trajectory_files
+from swath.daemon.processing.trajectory_files import (
     PARTIAL,
     TrajectoryFiles,
     put_in_place,
     smrmsg_beside,
     write_trajectory,
 )
-from georef.formats.sbet import sbet_bytes
-from georef.formats.trajectory_csv import csv_text
-from georef.formats.trajectory_file import read_trajectory
-from georef.trajectory import Trajectory
+from swath.georef.formats.sbet import sbet_bytes
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -143,7 +143,7 @@ def test_a_disk_that_refuses_leaves_nothing(
         if (tmp_path / f"a.smrmsg{PARTIAL}").exists():
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("daemon.processing.trajectory_files.os.fsync", full)
+    monkeypatch.setattr("swath.daemon.processing.trajectory_files.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_trajectory(files, trajectory, None)
     assert not list(tmp_path.iterdir())

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from daemon.config import Config
-from daemon.config.tables import NoiseConfig
-from daemon.errors import ConfigError, UserError
-from daemon.log_parsers import stored_config
-from daemon.processing import navigation_doubts
-from daemon.processing.navigation_doubts import height_findings
-from daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
-from daemon.processing.navigation_observations import (
+from swath.daemon.config import Config
+from swath.daemon.config.tables import NoiseConfig
+from swath.daemon.errors import ConfigError, UserError
+from swath.daemon.log_parsers import stored_config
+from swath.daemon.processing import navigation_doubts
+from swath.daemon.processing.navigation_doubts import height_findings
+from swath.daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
+from swath.daemon.processing.navigation_observations import (
     DEFAULT_SIGMAS,
     Observed,
     fix_observations,
@@ -30,17 +30,17 @@ from daemon.processing.navigation_observations import (
     heading_times,
     ins_observations,
 )
-from daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
-from daemon.processing.navigation_times import counted_arrivals, imu_times
-from daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
-from drivers.core.parser import DeviceSettings
-from drivers.gnss.nmea import NmeaParser
-from drivers.gnss.nmea_sentences import encode_gga
-from georef.formats.antenna_positions import read_antenna_positions
-from georef.navigation.alignment_noise import white_factor
-from georef.navigation.diagnosis_data import Finding
-from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Kind
-from georef.records import (
+from swath.daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
+from swath.daemon.processing.navigation_times import counted_arrivals, imu_times
+from swath.daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.gnss.nmea import NmeaParser
+from swath.drivers.gnss.nmea_sentences import encode_gga
+from swath.georef.formats.antenna_positions import read_antenna_positions
+from swath.georef.navigation.alignment_noise import white_factor
+from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Kind
+from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,
     FixType,
@@ -53,8 +53,8 @@ from georef.records import (
     TimeScale,
     TimeTag,
 )
-from georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
-from georef.trajectory import Poses
+from swath.georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
+from swath.georef.trajectory import Poses
 from tests.daemon.short_flight import CLOCK_SIGMA_S, MARK_AFTER_NS, Flown, fly_short
 from tests.drivers.harness import feed_pieces
 

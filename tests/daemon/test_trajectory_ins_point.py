@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.processing.flown import _from_device
-from daemon.processing.ins_point import offset_in_b, point_doubts
-from georef.records import INS_DTYPE
-from georef.trajectory import Trajectory
+from swath.daemon.processing.flown import _from_device
+from swath.daemon.processing.ins_point import offset_in_b, point_doubts
+from swath.georef.records import INS_DTYPE
+from swath.georef.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.calibration_file import Header, calibration_text
-from daemon.cli.main import run_app
-from georef.calibration import INDEX
+from swath.calib.calibration_file import Header, calibration_text
+from swath.daemon.cli.main import run_app
+from swath.georef.calibration import INDEX
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

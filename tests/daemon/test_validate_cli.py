@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 import typer
 
-from calib.calibration_file import Header, calibration_text
-from calib.record import NAMESPACE, Record, record_json
-from calib.record_values import Value
-from daemon.cli import validate
-from daemon.errors import ExitCode, UserError
-from daemon.processing import validate_run
-from daemon.processing.calibration_flight import KeptFlight
-from daemon.processing.carried_verdict import Carried
-from daemon.processing.navigation_verdict import Level
-from georef.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.calib.calibration_file import Header, calibration_text
+from swath.calib.record import NAMESPACE, Record, record_json
+from swath.calib.record_values import Value
+from swath.daemon.cli import validate
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing import validate_run
+from swath.daemon.processing.calibration_flight import KeptFlight
+from swath.daemon.processing.carried_verdict import Carried
+from swath.daemon.processing.navigation_verdict import Level
+from swath.georef.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -169,7 +169,7 @@ def test_a_wrong_calibration_does_not(log: Path, tmp_path: Path) -> None:
 def test_the_calibrations_own_log_is_no_independent_proof(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from daemon.processing.sidecar import sha256_of
+    from swath.daemon.processing.sidecar import sha256_of
 
     path = file_of(tmp_path / "own.toml", boresight(0.0))
     text = path.read_text()
@@ -262,7 +262,7 @@ def test_a_record_that_cannot_be_told_is_one_line(
 
 def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
     """Points on the true surface, or below it; how many."""
-    from georef.earth import geodetic_from_e
+    from swath.georef.earth import geodetic_from_e
 
     places = made.true_t[0][20_000:180_000:8_000]
     rows = ["name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from daemon.cli.main import run_app
+from swath.daemon.cli.main import run_app
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, lattice, plane, write
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -13,8 +13,8 @@ from typing import Any
 import numba
 import pytest
 
-from daemon.cli.main import INTERRUPTED
-from daemon.processing.warm_up import WarmUp, before_compiling, cache_folder, compilations
+from swath.daemon.cli.main import INTERRUPTED
+from swath.daemon.processing.warm_up import WarmUp, before_compiling, cache_folder, compilations
 from tests.daemon.rig import HANGS_S
 from tests.daemon.test_cli import ROOT, swath
 
@@ -33,9 +33,9 @@ def signatures():
 FLY = (
     ALL_SIGNATURES
     + """
-from daemon.config.tables import LiveConfig
-from daemon.processing.live import replay
-from daemon.processing.warm_up import compilations, get_ready, warm_up
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.processing.live import replay
+from swath.daemon.processing.warm_up import compilations, get_ready, warm_up
 from tests.daemon.test_live import Flown
 
 folder = Path(sys.argv[1])
@@ -55,10 +55,10 @@ print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "know
 
 NO_CACHE = """
 import numpy as np
-from daemon.processing.live_grid import CountGrid
-from daemon.processing.warm_up import WarmUp, cache_folder
+from swath.daemon.processing.live_grid import CountGrid
+from swath.daemon.processing.warm_up import WarmUp, cache_folder
 from tests.drivers.test_compiled import random_slots, returns_table
-from drivers.compiled.rows import fill
+from swath.drivers.compiled.rows import fill
 
 grid = CountGrid(1.0)
 grid.add(np.zeros((3, 3)))
@@ -116,7 +116,7 @@ def test_compiling_is_told_once_and_before_it_begins() -> None:
 )
 def test_live_says_that_it_compiles_and_can_be_ended_then(tmp_path: Path, signum: int, code: int) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "daemon.cli.main", "live", str(tmp_path)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "live", str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True) as live:
         assert live.stderr is not None
         try:

@@ -9,12 +9,12 @@ from typing import IO
 
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.exporting import export_session
-from daemon.log.reader import open_logs
-from daemon.processing import calibrate_products, trajectory_files
-from daemon.processing.sidecar import write_sidecar
-from daemon.processing.trajectory_files import put_in_place, write_aside, write_whole
+from swath.daemon.cli.main import run_app
+from swath.daemon.exporting import export_session
+from swath.daemon.log.reader import open_logs
+from swath.daemon.processing import calibrate_products, trajectory_files
+from swath.daemon.processing.sidecar import write_sidecar
+from swath.daemon.processing.trajectory_files import put_in_place, write_aside, write_whole
 from tests.daemon.one_line import fly
 from tests.daemon.test_log import INFO, write_part
 

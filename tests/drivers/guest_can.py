@@ -15,11 +15,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.core.can_frames import encode_can_frame
-from drivers.transports.base import Transport, TransportError
-from drivers.transports.can_link import interface_bitrate
-from drivers.transports.can_socket import SocketCanTransport
-from drivers.transports.uri import parse_transport
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.transports.base import Transport, TransportError
+from swath.drivers.transports.can_link import interface_bitrate
+from swath.drivers.transports.can_socket import SocketCanTransport
+from swath.drivers.transports.uri import parse_transport
 
 
 def ip(*arguments: str) -> None:

@@ -8,10 +8,10 @@ from __future__ import annotations
 import threading
 import time
 
-from drivers.transports.base import RawEdge
-from drivers.transports.pps_dcd import SerialDcdPps
-from drivers.transports.serial_port import SerialTransport
-from drivers.transports.uri import parse_transport
+from swath.drivers.transports.base import RawEdge
+from swath.drivers.transports.pps_dcd import SerialDcdPps
+from swath.drivers.transports.serial_port import SerialTransport
+from swath.drivers.transports.uri import parse_transport
 
 PORT = "/dev/ttyS1"
 

@@ -26,9 +26,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.core.framing import FrameKind
-from drivers.core.parser import Parser, ParserCounters
-from georef.records import (
+from swath.drivers.core.framing import FrameKind
+from swath.drivers.core.parser import Parser, ParserCounters
+from swath.georef.records import (
     Chunk,
     ChunkBatch,
     DeviceClockSamples,

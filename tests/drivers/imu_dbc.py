@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.core.can_frames import encode_can_frame
-from drivers.core.parser import DeviceSettings, Parser
-from georef.records import (
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.core.parser import DeviceSettings, Parser
+from swath.georef.records import (
     IMU_DTYPE,
     ByteRows,
     ChunkBatch,

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.ouster import OusterParser
-from drivers.scanner.ouster_layout import PROFILES, LidarLayout
-from drivers.transports.capture_file import read_pcap
-from georef.records import ImuSamples, Record, ScannerReturns, StructArray
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.ouster import OusterParser
+from swath.drivers.scanner.ouster_layout import PROFILES, LidarLayout
+from swath.drivers.transports.capture_file import read_pcap
+from swath.georef.records import ImuSamples, Record, ScannerReturns, StructArray
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "ouster"
 EXPECTED: dict[str, dict[str, Any]] = json.loads((FIXTURES / "expected.json").read_text())

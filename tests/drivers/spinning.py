@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import PacketParser
-from drivers.scanner.beams import BeamTable, beam_points
-from drivers.transports.capture_file import read_pcap
-from georef.records import DeviceClockSamples, Record, ScannerReturns, StructArray
+from swath.drivers.core.parser import PacketParser
+from swath.drivers.scanner.beams import BeamTable, beam_points
+from swath.drivers.transports.capture_file import read_pcap
+from swath.georef.records import DeviceClockSamples, Record, ScannerReturns, StructArray
 from tests.drivers.recordings import FIXTURES
 
 Points = NDArray[np.float64]

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from drivers.transports.base import Transport, TransportError, UnitBlock
+from swath.drivers.transports.base import Transport, TransportError, UnitBlock
 
 
 class SwitchTransport(Transport):

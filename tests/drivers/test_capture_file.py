@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.core.can_frames import decode_can_frames
-from drivers.transports.base import TransportError
-from drivers.transports.capture_file import (
+from swath.drivers.core.can_frames import decode_can_frames
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_file import (
     BareTime,
     CapturedUnit,
     CaptureTally,
@@ -28,7 +28,7 @@ from drivers.transports.capture_file import (
     read_pcap,
     read_serial,
 )
-from drivers.transports.ip_packets import IpPackets, ip_packet
+from swath.drivers.transports.ip_packets import IpPackets, ip_packet
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"

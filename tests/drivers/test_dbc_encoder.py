@@ -9,13 +9,13 @@ import cantools.database
 import numpy as np
 import pytest
 
-from drivers.core.can_frames import CAN_EFF_MASK, CAN_FRAME_DTYPE
-from drivers.core.parser import DeviceSettings
-from drivers.imu import sbg_ellipse, xsens_mti
-from drivers.imu.dbc import DbcParser
-from drivers.imu.dbc_encoder import encode_latch, encode_samples
-from drivers.imu.dbc_settings import SignalMap, map_signals
-from georef.records import ChunkBatch
+from swath.drivers.core.can_frames import CAN_EFF_MASK, CAN_FRAME_DTYPE
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.imu import sbg_ellipse, xsens_mti
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.imu.dbc_encoder import encode_latch, encode_samples
+from swath.drivers.imu.dbc_settings import SignalMap, map_signals
+from swath.georef.records import ChunkBatch
 from tests.drivers.imu_dbc import IMU_DBC, clock_rows, imu_rows, settings, without
 
 N = 200

@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 import yaml
 
-from drivers.core.parser import DeviceKind, DeviceSettings, Parser
-from drivers.core.registry import find_driver
-from drivers.gnss.novatel import message_name
-from drivers.imu.nmea2000 import pgn_and_source
-from drivers.scanner.ouster_head import read_head
-from drivers.transports.capture_file import read_candump, read_pcap
-from georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
+from swath.drivers.core.parser import DeviceKind, DeviceSettings, Parser
+from swath.drivers.core.registry import find_driver
+from swath.drivers.gnss.novatel import message_name
+from swath.drivers.imu.nmea2000 import pgn_and_source
+from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.transports.capture_file import read_candump, read_pcap
+from swath.georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
 from tests.drivers.harness import packet_batches
 from tests.drivers.imu_dbc import imu_rows
 from tests.drivers.ouster_cases import metadata_of
@@ -318,7 +318,7 @@ def test_every_file_of_the_collection_has_a_copy_or_says_why_not() -> None:
 MF4_FRAMES = """
 import json, sys
 from can.io.mf4 import MF4Reader
-from drivers.transports.can_frame import pack_frame
+from swath.drivers.transports.can_frame import pack_frame
 
 with MF4Reader(sys.argv[1]) as messages:
     frames = [(round(one.timestamp * 1e6) * 1000, f"can{one.channel}", pack_frame(one).hex()) for one in messages]

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import find_driver
-from drivers.scanner.beams import beam_points
-from drivers.scanner.hesai import (
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.beams import beam_points
+from swath.drivers.scanner.hesai import (
     DUAL_NAMES,
     MODE_FIRST,
     MODE_FIRST_STRONGEST,
@@ -26,9 +26,9 @@ from drivers.scanner.hesai import (
     HesaiParser,
     encode_point_packet,
 )
-from drivers.scanner.hesai_gps import encode_gps_packet
-from drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
-from georef.records import (
+from swath.drivers.scanner.hesai_gps import encode_gps_packet
+from swath.drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
+from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
     RETURN_FLAG_STRONGEST,
@@ -41,7 +41,7 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.timescales import DeviceClock
+from swath.georef.timescales import DeviceClock
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.spinning import are_near, clock_of, feed, payloads, read_pcd, returns_of

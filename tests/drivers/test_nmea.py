@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.gnss import nmea_sentences as nmea
-from drivers.gnss.nmea import DRIVERS, NmeaParser
-from georef.records import Chunk, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage, TimeScale
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.gnss import nmea_sentences as nmea
+from swath.drivers.gnss.nmea import DRIVERS, NmeaParser
+from swath.georef.records import Chunk, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage, TimeScale
 from tests.drivers.harness import (
     canonical,
     check_bytewise,

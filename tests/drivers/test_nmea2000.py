@@ -16,11 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.core.can_frames import encode_can_frame
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import find_driver
-from drivers.imu.nmea2000 import Nmea2000Parser, make_time_parser, pgn_and_source
-from georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.registry import find_driver
+from swath.drivers.imu.nmea2000 import Nmea2000Parser, make_time_parser, pgn_and_source
+from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
 from tests.drivers.harness import STREAM_HOST_NS, check_packet_damage, check_packets, packet_batches, run_packets
 
 FIXTURES = Path(__file__).parents[2] / "fixtures/nmea2000"

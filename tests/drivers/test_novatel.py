@@ -9,11 +9,11 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.gnss.novatel import NovatelParser, make_time_parser
-from drivers.gnss.novatel_tables import FIX_TYPES
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.gnss.novatel import NovatelParser, make_time_parser
+from swath.drivers.gnss.novatel_tables import FIX_TYPES
+from swath.georef.records import (
     Chunk,
     DeviceStatus,
     FixType,

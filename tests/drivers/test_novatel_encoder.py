@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import find_driver
-from drivers.gnss import novatel_layouts as nov
-from drivers.gnss.novatel import NovatelParser, make_time_parser
-from drivers.gnss.novatel_encoder import encode_frame, encode_log
-from drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.registry import find_driver
+from swath.drivers.gnss import novatel_layouts as nov
+from swath.drivers.gnss.novatel import NovatelParser, make_time_parser
+from swath.drivers.gnss.novatel_encoder import encode_frame, encode_log
+from swath.drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE
+from swath.georef.records import (
     Chunk,
     EventMark,
     FixType,

@@ -14,9 +14,9 @@ import dpkt
 import numpy as np
 import pytest
 
-from drivers.core.checksums import crc32_novatel
-from drivers.transports.capture_file import CaptureTally, read_pcap
-from georef.records import DeviceStatus, GnssFix, GnssHeading, InsSolution, TimeMessage
+from swath.drivers.core.checksums import crc32_novatel
+from swath.drivers.transports.capture_file import CaptureTally, read_pcap
+from swath.georef.records import DeviceStatus, GnssFix, GnssHeading, InsSolution, TimeMessage
 from tests.drivers.novatel_ascii import FIXTURES, WEEK_NS, recording
 from tests.drivers.ros_bag import Message, read_bag
 from tests.drivers.test_novatel import COUNTS, make, of_type, parse, rows_of

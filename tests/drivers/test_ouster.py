@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.scanner.ouster import OusterParser
-from drivers.scanner.ouster_head import beam_points, read_head
-from drivers.scanner.ouster_imu import SAMPLE_DTYPE, encode_imu_packet
-from drivers.scanner.ouster_layout import PROFILES, LidarLayout, with_crc
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.ouster import OusterParser
+from swath.drivers.scanner.ouster_head import beam_points, read_head
+from swath.drivers.scanner.ouster_imu import SAMPLE_DTYPE, encode_imu_packet
+from swath.drivers.scanner.ouster_layout import PROFILES, LidarLayout, with_crc
+from swath.georef.records import (
     RETURN_DTYPE,
     RETURN_FLAG_LAST,
     RETURN_FLAG_STRONGEST,

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.scanner.ouster_head import beam_points, read_head
-from drivers.scanner.ouster_layout import LidarLayout
-from drivers.transports.capture_file import read_pcap
-from georef.records import Chunk, StructArray
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.ouster_head import beam_points, read_head
+from swath.drivers.scanner.ouster_layout import LidarLayout
+from swath.drivers.transports.capture_file import read_pcap
+from swath.georef.records import Chunk, StructArray
 from tests.drivers.ouster_cases import EXPECTED, FIXTURES, feed, metadata_of, payloads, recorded, returns_of
 
 DIGESTED = ("OS-0-32-U1_v2.2.0_1024x10", "OS-1-32-G_v2.1.1_1024x10")

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pysbf2 import ERR_RAISE, SBF_MSGIDS, SBF_PROTOCOL, SBFReader
 
-from drivers.core.parser import DeviceSettings
-from drivers.gnss import sbf_blocks as sbf
-from drivers.gnss.sbf import SbfParser, make_time_parser
-from drivers.gnss.sbf_frame import NAMES, Layout, number_of, read_header
-from georef.records import FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.gnss import sbf_blocks as sbf
+from swath.drivers.gnss.sbf import SbfParser, make_time_parser
+from swath.drivers.gnss.sbf_frame import NAMES, Layout, number_of, read_header
+from swath.georef.records import FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
 from tests.drivers.harness import canonical, check_damage, check_garbage, check_stream, feed_pieces
 from tests.drivers.recordings import expected, recording
 

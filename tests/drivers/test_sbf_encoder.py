@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from pysbf2 import ERR_RAISE, SBF_PROTOCOL, SBFReader
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import find_driver
-from drivers.gnss import sbf_blocks as sbf
-from drivers.gnss.nmea_sentences import encode_sentence
-from drivers.gnss.sbf import SbfParser
-from drivers.gnss.sbf_frame import encode_frame
-from georef.records import (
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.registry import find_driver
+from swath.drivers.gnss import sbf_blocks as sbf
+from swath.drivers.gnss.nmea_sentences import encode_sentence
+from swath.drivers.gnss.sbf import SbfParser
+from swath.drivers.gnss.sbf_frame import encode_frame
+from swath.georef.records import (
     Chunk,
     EventMark,
     FixType,
@@ -31,8 +31,8 @@ from georef.records import (
     StructArray,
     TimeMessage,
 )
-from georef.timescales import PpsClock, TimeState
-from georef.timescales.leap_book import LeapSeconds
+from swath.georef.timescales import PpsClock, TimeState
+from swath.georef.timescales.leap_book import LeapSeconds
 from tests.drivers.harness import check_damage, check_stream, feed_pieces
 from tests.drivers.recordings import recording
 

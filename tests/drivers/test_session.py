@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.session import FIRST_WAIT_S, LONGEST_WAIT_S, Session, SessionState
-from drivers.transports.base import UnitBlock
+from swath.drivers.session import FIRST_WAIT_S, LONGEST_WAIT_S, Session, SessionState
+from swath.drivers.transports.base import UnitBlock
 from tests.drivers.switch_transport import SwitchTransport
 
 

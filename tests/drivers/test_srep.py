@@ -13,11 +13,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.registry import find_driver
-from drivers.scanner.srep import SrepParser
-from drivers.scanner.srep_layout import SrepHeader, datagram_bytes, encode_datagram
-from georef.records import Chunk, ChunkBatch, DeviceClockSamples, DeviceStatus, Record, ScannerReturns, StructArray
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.srep_layout import SrepHeader, datagram_bytes, encode_datagram
+from swath.georef.records import (
+    Chunk,
+    ChunkBatch,
+    DeviceClockSamples,
+    DeviceStatus,
+    Record,
+    ScannerReturns,
+    StructArray,
+)
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.srep_cases import TEST_VECTOR, reference_decode, scan_lines, split_datagrams
 

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.srep import FLAG_NO_POINT, SrepParser
-from drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from georef.records import ChunkBatch, ScannerReturns, StructArray
-from georef.stream import CONTEXT_FLAG
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.srep import FLAG_NO_POINT, SrepParser
+from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.georef.records import ChunkBatch, ScannerReturns, StructArray
+from swath.georef.stream import CONTEXT_FLAG
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

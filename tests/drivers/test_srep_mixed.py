@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from fastcrc.crc32 import iso_hdlc as crc32
 
-from drivers.core.parser import DeviceSettings
-from drivers.scanner import srep
-from drivers.scanner.sequence import LATE_DATAGRAMS
-from drivers.scanner.slots import ReturnSlots
-from drivers.scanner.srep import SrepParser
-from drivers.scanner.srep_layout import CRC, SrepHeader, encode_datagram
-from georef.records import Chunk, ChunkBatch, Record, StructArray
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner import srep
+from swath.drivers.scanner.sequence import LATE_DATAGRAMS
+from swath.drivers.scanner.slots import ReturnSlots
+from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.srep_layout import CRC, SrepHeader, encode_datagram
+from swath.georef.records import Chunk, ChunkBatch, Record, StructArray
 from tests.drivers.harness import Outcome, outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -8,11 +8,11 @@ import re
 import pytest
 from pyubx2 import SET, UBX_CONFIG_DATABASE, UBXMessage, UBXReader
 
-from drivers.core.frame_kinds import UBX_NAMES
-from drivers.core.parser import DeviceSettings, DriverSettingsError
-from drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish
-from drivers.gnss import novatel_layouts, novatel_startup, sbf_frame, sbf_startup, ubx_startup
-from drivers.gnss.ubx_startup import AckListener
+from swath.drivers.core.frame_kinds import UBX_NAMES
+from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish
+from swath.drivers.gnss import novatel_layouts, novatel_startup, sbf_frame, sbf_startup, ubx_startup
+from swath.drivers.gnss.ubx_startup import AckListener
 from tests.drivers.recordings import FIXTURES
 
 ACK = UBXMessage("ACK", "ACK-ACK", 0, clsID=0x06, msgID=0x8A).serialize()

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.session import Session
-from drivers.transports.base import PpsSource, RawEdge, TransportError
-from drivers.transports.pps_dcd import SerialDcdPps, edge_at_wake_up
-from drivers.transports.pps_device import (
+from swath.drivers.session import Session
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportError
+from swath.drivers.transports.pps_dcd import SerialDcdPps, edge_at_wake_up
+from swath.drivers.transports.pps_device import (
     FETCH_DATA,
     PARAMETERS,
     PPS_FETCH,
@@ -25,7 +25,7 @@ from drivers.transports.pps_device import (
     KernelPps,
     edge_of,
 )
-from drivers.transports.pps_fixed import FixedPps
+from swath.drivers.transports.pps_fixed import FixedPps
 
 START_NS = 1_700_000_000_000_000_000
 

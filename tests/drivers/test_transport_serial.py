@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.session import Session, SessionState
-from drivers.transports.base import TransportError, UnitBlock
-from drivers.transports.serial_port import SerialTransport
-from drivers.transports.uri import TransportSpec, parse_transport
+from swath.drivers.session import Session, SessionState
+from swath.drivers.transports.base import TransportError, UnitBlock
+from swath.drivers.transports.serial_port import SerialTransport
+from swath.drivers.transports.uri import TransportSpec, parse_transport
 
 
 class Device:
@@ -100,7 +100,7 @@ def test_send(device: Device) -> None:
 
 
 def test_send_to_a_line_that_takes_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.transports.serial_port.SEND_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("swath.drivers.transports.serial_port.SEND_TIMEOUT_S", 0.1)
     serial = port(device.path)
     serial.open()
     with pytest.raises(TransportError, match="takes no data"):
@@ -165,8 +165,8 @@ def test_second_source_of_this_program(device: Device) -> None:
 def test_another_process_holds_the_port(device: Device) -> None:
     code = (
         "import sys\n"
-        "from drivers.transports.serial_port import SerialTransport\n"
-        "from drivers.transports.uri import parse_transport\n"
+        "from swath.drivers.transports.serial_port import SerialTransport\n"
+        "from swath.drivers.transports.uri import parse_transport\n"
         "t = SerialTransport(parse_transport('serial:' + sys.argv[1])); t.open()\n"
         "sys.stdout.write('open\\n'); sys.stdout.flush(); sys.stdin.read()\n"
     )

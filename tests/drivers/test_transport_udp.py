@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.transports import holders
-from drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
-from drivers.transports.udp_socket import UdpTransport
-from drivers.transports.uri import parse_transport
+from swath.drivers.transports import holders
+from swath.drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
+from swath.drivers.transports.udp_socket import UdpTransport
+from swath.drivers.transports.uri import parse_transport
 
 GROUP = "239.74.163.77"
 

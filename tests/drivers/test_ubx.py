@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pyubx2 import ERR_IGNORE, GET, UBX_PROTOCOL, UBXMessage, UBXReader
 
-from drivers.core.parser import DeviceSettings
-from drivers.gnss import ubx_messages as ubx
-from drivers.gnss.ubx import DRIVERS, UbxParser
-from georef.records import Chunk, EventMark, FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
-from georef.timescales import gps_ns_from_week, whole_gps_ns
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.gnss import ubx_messages as ubx
+from swath.drivers.gnss.ubx import DRIVERS, UbxParser
+from swath.georef.records import Chunk, EventMark, FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
+from swath.georef.timescales import gps_ns_from_week, whole_gps_ns
 from tests.drivers.harness import (
     canonical,
     check_bytewise,

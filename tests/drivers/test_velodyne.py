@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.scanner.beams import beam_points
-from drivers.scanner.velodyne import (
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.beams import beam_points
+from swath.drivers.scanner.velodyne import (
     MODE_DUAL,
     MODE_LAST,
     MODE_STRONGEST,
     VelodyneParser,
     encode_data_packet,
 )
-from drivers.scanner.velodyne_heads import VLP16
-from drivers.scanner.velodyne_position import encode_position_packet, rmc_time
-from georef.records import (
+from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.drivers.scanner.velodyne_position import encode_position_packet, rmc_time
+from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
     RETURN_FLAG_STRONGEST,

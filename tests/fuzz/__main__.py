@@ -54,7 +54,7 @@ def _targets(*, guided: bool) -> dict[str, Callable[[], Target]]:
     if guided:
         import atheris  # type: ignore[import-untyped,import-not-found,unused-ignore]
 
-        with atheris.instrument_imports(include=["drivers", "daemon", "georef"]):
+        with atheris.instrument_imports(include=["swath"]):
             from tests.fuzz.targets import all_targets
 
             return all_targets()  # imports the drivers

@@ -16,22 +16,22 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-from daemon import control, control_client
-from daemon.block_queue import BlockQueue
-from daemon.channels import ChannelTable
-from daemon.cli import mark, split
-from daemon.control import LINE_BYTES, Control
-from daemon.errors import one_line
-from daemon.events import Event, Events, Severity
-from daemon.recorder import WriterHealth
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import KINDS, all_drivers
-from drivers.core.startup import MAX_REPLY_BYTES, StartupWish
-from drivers.transports import ntrip_client
-from drivers.transports.base import TransportError
-from drivers.transports.descriptor import Gate
-from drivers.transports.ntrip_client import NtripTransport
-from drivers.transports.uri import parse_transport
+from swath.daemon import control, control_client
+from swath.daemon.block_queue import BlockQueue
+from swath.daemon.channels import ChannelTable
+from swath.daemon.cli import mark, split
+from swath.daemon.control import LINE_BYTES, Control
+from swath.daemon.errors import one_line
+from swath.daemon.events import Event, Events, Severity
+from swath.daemon.recorder import WriterHealth
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import KINDS, all_drivers
+from swath.drivers.core.startup import MAX_REPLY_BYTES, StartupWish
+from swath.drivers.transports import ntrip_client
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.descriptor import Gate
+from swath.drivers.transports.ntrip_client import NtripTransport
+from swath.drivers.transports.uri import parse_transport
 from tests.drivers.harness import random_pieces
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.frames import FramePool, mutate_stream

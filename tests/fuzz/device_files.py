@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError
-from drivers.core.registry import find_driver
+from swath.drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError
+from swath.drivers.core.registry import find_driver
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import Target
 from tests.fuzz.recordings import settings_of

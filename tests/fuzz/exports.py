@@ -14,19 +14,19 @@ from unittest.mock import patch
 
 import numpy as np
 
-from daemon.capture_files import Told, find_captures
-from daemon.capture_routes import Routes
-from daemon.checksum_list import NAME, ChecksumList
-from daemon.config import load_config
-from daemon.exporting import MANIFEST, export_session
-from daemon.importing import merge
-from daemon.log.encode import encode_block, encode_json
-from daemon.log.format import ChannelSpec, LogError
-from daemon.log.reader import open_logs
-from daemon.log.writer import PartWriter
-from daemon.sidecar import SUFFIX
-from drivers.core.can_frames import encode_can_frame
-from drivers.transports.base import TransportError
+from swath.daemon.capture_files import Told, find_captures
+from swath.daemon.capture_routes import Routes
+from swath.daemon.checksum_list import NAME, ChecksumList
+from swath.daemon.config import load_config
+from swath.daemon.exporting import MANIFEST, export_session
+from swath.daemon.importing import merge
+from swath.daemon.log.encode import encode_block, encode_json
+from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.sidecar import SUFFIX
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.transports.base import TransportError
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.logs import INFO, START_NS, log_seeds, mutate_log

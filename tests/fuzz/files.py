@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
-from daemon.config import load_config
-from daemon.errors import UserError
-from drivers.transports.base import TransportError
-from drivers.transports.capture_file import CaptureTally, read_candump, read_pcap, read_serial
+from swath.daemon.config import load_config
+from swath.daemon.errors import UserError
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_file import CaptureTally, read_candump, read_pcap, read_serial
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import damage

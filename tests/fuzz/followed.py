@@ -13,15 +13,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from daemon.cli.monitor import page
-from daemon.log.follow import LogFollower
-from daemon.log.format import LogError
-from daemon.log.reader import open_logs
-from daemon.monitor import Monitor
-from daemon.offload import is_growing
-from daemon.parts import RECORDING_SIGN, read_sign
-from daemon.processing.live_follow import LiveFollower
-from daemon.processing.log_index import Listening, index_log, read_chunks
+from swath.daemon.cli.monitor import page
+from swath.daemon.log.follow import LogFollower
+from swath.daemon.log.format import LogError
+from swath.daemon.log.reader import open_logs
+from swath.daemon.monitor import Monitor
+from swath.daemon.offload import is_growing
+from swath.daemon.parts import RECORDING_SIGN, read_sign
+from swath.daemon.processing.live_follow import LiveFollower
+from swath.daemon.processing.log_index import Listening, index_log, read_chunks
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.logs import BATCHES, INFO, VALUES, log_seeds, mutate_log
 from tests.fuzz.mcap_parts import MESSAGE, take_apart

@@ -7,10 +7,10 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from drivers.core import frame_kinds
-from drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
-from drivers.core.framing import FrameKind, Framer
-from drivers.core.parser import ParserCounters
+from swath.drivers.core import frame_kinds
+from swath.drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from swath.drivers.core.framing import FrameKind, Framer
+from swath.drivers.core.parser import ParserCounters
 from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {kind.name: kind for kind in vars(frame_kinds).values() if isinstance(kind, FrameKind)}

@@ -18,16 +18,16 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
 from rich.console import Console
 
-from daemon.cli.info import _print_session
-from daemon.log.encode import encode_block, encode_json
-from daemon.log.format import ChannelSpec, LogError, SessionInfo
-from daemon.log.reader import open_logs
-from daemon.log.recover import recover
-from daemon.log.scan import Damage, scan
-from daemon.log.writer import PartWriter
-from daemon.replay import timed_units
-from daemon.statistics import session_statistics
-from drivers.core.can_frames import encode_can_frame
+from swath.daemon.cli.info import _print_session
+from swath.daemon.log.encode import encode_block, encode_json
+from swath.daemon.log.format import ChannelSpec, LogError, SessionInfo
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import recover
+from swath.daemon.log.scan import Damage, scan
+from swath.daemon.log.writer import PartWriter
+from swath.daemon.replay import timed_units
+from swath.daemon.statistics import session_statistics
+from swath.drivers.core.can_frames import encode_can_frame
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import scan_lines
 from tests.fuzz import mcap_parts as mcap

@@ -13,25 +13,25 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibration_file import CalibrationFileError, Header, calibration_text
-from calib.control import HEADER, ControlError, in_t, read_control
-from calib.flight import Tangent
-from calib.history import HistoryError, history
-from calib.picked_points import PickedError, read_picked
-from calib.record import Record, RecordError, document_json, document_xml, read_document, record_json, with_told
-from calib.record_values import Matrix, Value
-from daemon.processing.calibrate_inputs import PolygonError, read_polygons
-from daemon.processing.calibrate_record import facts_of
-from daemon.processing.flights import _given_strips
-from daemon.processing.model_file import read_model
-from daemon.processing.validate_run import _entry, read_file
-from daemon.sim_plans import Wish
-from daemon.text_files import text_of
-from georef.beams import GeometryError, read_fibres
-from georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
-from georef.earth import e_from_geodetic
-from georef.strips import CSV_COLUMNS, StripError
-from sim.plan import PRESETS
+from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
+from swath.calib.control import HEADER, ControlError, in_t, read_control
+from swath.calib.flight import Tangent
+from swath.calib.history import HistoryError, history
+from swath.calib.picked_points import PickedError, read_picked
+from swath.calib.record import Record, RecordError, document_json, document_xml, read_document, record_json, with_told
+from swath.calib.record_values import Matrix, Value
+from swath.daemon.processing.calibrate_inputs import PolygonError, read_polygons
+from swath.daemon.processing.calibrate_record import facts_of
+from swath.daemon.processing.flights import _given_strips
+from swath.daemon.processing.model_file import read_model
+from swath.daemon.processing.validate_run import _entry, read_file
+from swath.daemon.sim_plans import Wish
+from swath.daemon.text_files import text_of
+from swath.georef.beams import GeometryError, read_fibres
+from swath.georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
+from swath.georef.earth import e_from_geodetic
+from swath.georef.strips import CSV_COLUMNS, StripError
+from swath.sim.plan import PRESETS
 from tests.fuzz.engine import Target
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, OF_TOML, text_target
 

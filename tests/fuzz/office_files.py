@@ -13,15 +13,15 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from calib.strip_cells import StripRules
-from daemon.processing.outside_positions import outside_observations
-from daemon.processing.quicklook_sidecar import rows_of, warnings_in
-from daemon.processing.strips_inputs import strips_of_files
-from georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from georef.formats.trajectory_csv import csv_text
-from georef.formats.trajectory_file import read_trajectory
-from georef.mapping import Mapping
-from georef.trajectory import Trajectory, TrajectoryError
+from swath.calib.strip_cells import StripRules
+from swath.daemon.processing.outside_positions import outside_observations
+from swath.daemon.processing.quicklook_sidecar import rows_of, warnings_in
+from swath.daemon.processing.strips_inputs import strips_of_files
+from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
+from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.mapping import Mapping
+from swath.georef.trajectory import Trajectory, TrajectoryError
 from tests.fuzz.engine import Target
 from tests.fuzz.mutation import damage
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, changed_text, told

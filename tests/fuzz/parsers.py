@@ -13,9 +13,9 @@ from copy import deepcopy
 
 import numpy as np
 
-from drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser, StreamParser
-from drivers.core.registry import KINDS, all_drivers
-from georef.records import Chunk, ChunkBatch, Record
+from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser, StreamParser
+from swath.drivers.core.registry import KINDS, all_drivers
+from swath.georef.records import Chunk, ChunkBatch, Record
 from tests.drivers.harness import Outcome, assert_bytes_accounted, outcome, random_pieces
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.frames import FramePool, changed_datagram, mutate_stream, tail_of

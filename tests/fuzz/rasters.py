@@ -14,12 +14,12 @@ import numpy as np
 import rasterio
 from rasterio.transform import Affine
 
-from daemon.processing.terrain import read_terrain
-from georef.earth import e_from_geodetic, rot_e_from_l
-from sim.errors import PlanError
-from sim.plan import Plan, load_plan
-from sim.site import Site
-from sim.terrain import build_ground
+from swath.daemon.processing.terrain import read_terrain
+from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.sim.errors import PlanError
+from swath.sim.plan import Plan, load_plan
+from swath.sim.site import Site
+from swath.sim.terrain import build_ground
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import bounds, damage
 from tests.fuzz.texts import told

@@ -12,13 +12,13 @@ import tomllib
 from itertools import accumulate
 from pathlib import Path
 
-from daemon.config.config import Config, plain_table
-from daemon.config.tables import Tables
-from drivers.core.can_frames import encode_can_frame
-from drivers.core.parser import DeviceSettings, Driver, Parser
-from drivers.imu.dbc import DbcParser
-from drivers.transports.base import TransportError
-from drivers.transports.capture_file import read_candump, read_pcap
+from swath.daemon.config.config import Config, plain_table
+from swath.daemon.config.tables import Tables
+from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.core.parser import DeviceSettings, Driver, Parser
+from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.capture_file import read_candump, read_pcap
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import split_datagrams
 

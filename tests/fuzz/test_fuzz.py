@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.core import framing
-from drivers.core.framing import Framer
-from drivers.core.parser import DeviceSettings, ParserCounters
-from drivers.gnss.ubx import UbxParser
-from georef.records import Chunk
+from swath.drivers.core import framing
+from swath.drivers.core.framing import Framer
+from swath.drivers.core.parser import DeviceSettings, ParserCounters
+from swath.drivers.gnss.ubx import UbxParser
+from swath.georef.records import Chunk
 from tests.fuzz.engine import Target, check, fuzz
 from tests.fuzz.frames import KINDS, SEALS, FramePool, mutate_stream, split_frames
 from tests.fuzz.mcap_parts import take_apart

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from daemon.errors import UserError
+from swath.daemon.errors import UserError
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import damage
 

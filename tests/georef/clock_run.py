@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from georef.timescales import PpsClock, TimeState
+from swath.georef.timescales import PpsClock, TimeState
 from tests.georef.clock_simulation import HOST_START_NS, NS, Simulation
 
 SURE = (TimeState.LOCKED, TimeState.HOLDOVER)

@@ -1,7 +1,7 @@
 """A simulated oscillator, receiver and wire: what a host sees of PPS edges and time messages, and the truth beside it.
 
-Shares no code with georef.timescales: it counts seconds itself, from calendar arithmetic of the standard library, and
-keeps the host's clock as an integral of its frequency. Everything random comes from one seed.
+Shares no code with swath.georef.timescales: it counts seconds itself, from calendar arithmetic of the standard
+library, and keeps the host's clock as an integral of its frequency. Everything random comes from one seed.
 
 Oscillator: a constant 23 ppm, a random walk of the frequency (2e-9 per √s unless said), and where asked temperature
 ramps of ± 0.5 ppm/min lasting 1 to 5 min, with 1 to 7 min between them.
@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 
 NS = 1_000_000_000
 HOST_START_NS = 7_123_456_789_012

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.scanner.beams import BeamTable, beam_table
-from drivers.scanner.beams import beam_points as velodyne_points
-from georef.beams import (
+from swath.drivers.scanner.beams import BeamTable, beam_table
+from swath.drivers.scanner.beams import beam_points as velodyne_points
+from swath.georef.beams import (
     FibreGeometry,
     Geometry,
     LineGeometry,
@@ -20,9 +20,9 @@ from georef.beams import (
     RisleyGeometry,
     SpinningGeometry,
 )
-from georef.calibration import BeamCorrection, Calibration, RangeOffset, nominal
-from georef.records import RETURN_DTYPE, StructArray
-from georef.trajectory import Trajectory
+from swath.georef.calibration import BeamCorrection, Calibration, RangeOffset, nominal
+from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 PointsS = Callable[[Calibration, StructArray, FloatArray, FloatArray], FloatArray]  # rows, θ, ρ → (n, 3) in s

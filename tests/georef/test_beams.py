@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.scanner.beams import beam_points
-from drivers.scanner.velodyne_heads import VLP16
-from georef.beams import (
+from swath.drivers.scanner.beams import beam_points
+from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.georef.beams import (
     FibreGeometry,
     Geometry,
     GeometryError,
@@ -22,8 +22,8 @@ from georef.beams import (
     line_scanner,
     read_fibres,
 )
-from georef.calibration import BeamCorrection, Calibration, nominal
-from georef.sensor_model import SensorModel
+from swath.georef.calibration import BeamCorrection, Calibration, nominal
+from swath.georef.sensor_model import SensorModel
 from tests.georef.scanner_cases import rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

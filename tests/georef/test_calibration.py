@@ -8,7 +8,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from georef.calibration import (
+from swath.georef.calibration import (
     INDEX,
     PARAMETERS,
     BeamCorrection,
@@ -17,8 +17,8 @@ from georef.calibration import (
     nominal,
     read_calibration,
 )
-from sim.calibration_files import calibration_text
-from sim.plan import parse_plan
+from swath.sim.calibration_files import calibration_text
+from swath.sim.plan import parse_plan
 
 WHOLE = """
 [calibration]

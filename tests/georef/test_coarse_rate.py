@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from georef.timescales.coarse import CoarseClock
+from swath.georef.timescales.coarse import CoarseClock
 
 SECOND_NS = 1_000_000_000
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.interpolate import RegularGridInterpolator
 
-from georef.coarse_terrain import CoarseTerrain, TerrainError
+from swath.georef.coarse_terrain import CoarseTerrain, TerrainError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -8,11 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import georef
+import swath.georef
 
-INNER = "from georef.compiled import kernel\n\n\n@kernel\ndef inner(x: float) -> float:\n    return {factor} * x\n"
-OUTER = """from georef.compiled import kept
-from georef.inner import inner
+INNER = (
+    "from swath.georef.compiled import kernel\n\n\n@kernel\ndef inner(x: float) -> float:\n    return {factor} * x\n"
+)
+OUTER = """from swath.georef.compiled import kept
+from swath.georef.inner import inner
 
 
 @kept
@@ -25,9 +27,10 @@ print(outer(1.0), sum(outer.stats.cache_hits.values()))
 
 
 def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> None:
-    package = tmp_path / "georef"
-    package.mkdir()
-    shutil.copy(Path(str(georef.__file__)).parent / "compiled.py", package)
+    package = tmp_path / "swath/georef"
+    package.mkdir(parents=True)
+    (tmp_path / "swath/__init__.py").touch()
+    shutil.copy(Path(str(swath.georef.__file__)).parent / "compiled.py", package)
     (package / "__init__.py").touch()
     (package / "outer.py").write_text(OUTER)
 
@@ -38,7 +41,7 @@ def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> No
             "PYTHONDONTWRITEBYTECODE": "1",  # Python takes a file as long as before and of the same second for the same
             "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
         }
-        command = [sys.executable, "-c", "import georef.outer"]
+        command = [sys.executable, "-c", "import swath.georef.outer"]
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
@@ -48,14 +51,19 @@ def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> No
 
 
 def test_without_a_folder_to_write_to_it_is_compiled_all_the_same(tmp_path: Path) -> None:
-    package = tmp_path / "georef"
-    package.mkdir()
-    shutil.copy(Path(str(georef.__file__)).parent / "compiled.py", package)
+    package = tmp_path / "swath/georef"
+    package.mkdir(parents=True)
+    (tmp_path / "swath/__init__.py").touch()
+    shutil.copy(Path(str(swath.georef.__file__)).parent / "compiled.py", package)
     (package / "__init__.py").touch()
     (package / "inner.py").write_text(INNER.format(factor=4.0))
     (package / "outer.py").write_text(OUTER.replace(", sum(outer.stats.cache_hits.values())", ""))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": "/proc/nowhere"}
     done = subprocess.run(
-        [sys.executable, "-c", "import georef.outer"], env=environment, cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "-c", "import swath.georef.outer"],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert done.stdout.strip() == "4.0", done.stderr

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.encoder_motion import EncoderMotion
-from georef.records import RETURN_DTYPE, Int64Array, StructArray
-from sim.scanners.motions import polygon, sine, triangle, turning
+from swath.georef.encoder_motion import EncoderMotion
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.sim.scanners.motions import polygon, sine, triangle, turning
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from georef.formats.copc import NODE_POINTS, CopcWriter
-from georef.formats.las import BLOCK, Clipped, LasError, LasSettings, LasWriter
-from georef.points import Points
+from swath.georef.formats.copc import NODE_POINTS, CopcWriter
+from swath.georef.formats.las import BLOCK, Clipped, LasError, LasSettings, LasWriter
+from swath.georef.points import Points
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

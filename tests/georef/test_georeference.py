@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from georef import georeference
-from georef.atmosphere import Air
-from georef.beams import Geometry, LineGeometry, SpinningGeometry
-from georef.calibration import nominal
-from georef.georeference import Georeferencer
-from georef.kernels.rotations import angle_of
-from georef.mapping import Mapping, MappingError
-from georef.points import Fate, Points
-from georef.records import Int64Array, StructArray
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise, Uncertainty
+from swath.georef import georeference
+from swath.georef.atmosphere import Air
+from swath.georef.beams import Geometry, LineGeometry, SpinningGeometry
+from swath.georef.calibration import nominal
+from swath.georef.georeference import Georeferencer
+from swath.georef.kernels.rotations import angle_of
+from swath.georef.mapping import Mapping, MappingError
+from swath.georef.points import Fate, Points
+from swath.georef.records import Int64Array, StructArray
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise, Uncertainty
 from tests.georef.scanner_cases import rows_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

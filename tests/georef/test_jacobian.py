@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from georef.beams import LineGeometry
-from georef.calibration import INDEX, PARAMETERS, Calibration, nominal
-from georef.jacobian import OBSERVATIONS, columns_l, observation_columns_e, parameter_columns_e
-from georef.mount import Mount, Stage
-from georef.points import Rays
-from georef.records import StructArray
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import INDEX, PARAMETERS, Calibration, nominal
+from swath.georef.jacobian import OBSERVATIONS, columns_l, observation_columns_e, parameter_columns_e
+from swath.georef.mount import Mount, Stage
+from swath.georef.points import Rays
+from swath.georef.records import StructArray
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 from tests.georef.scanner_cases import CASES, TURNED, Case, rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from georef.refraction import (
+from swath.georef.refraction import (
     SPHERE_M,
     ardc_k,
     layer_air,

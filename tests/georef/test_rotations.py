@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from georef.rotations import (
+from swath.georef.rotations import (
     attitude_of,
     boresight,
     quaternion_from_rot,

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
-from georef.beams import LineGeometry
-from georef.calibration import Calibration, RangeOffset, nominal
-from georef.mount import Mount, Stage
-from georef.points import Fate, Rays
-from georef.records import StructArray
-from georef.rotations import boresight, rot_x
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import Calibration, RangeOffset, nominal
+from swath.georef.mount import Mount, Stage
+from swath.georef.points import Fate, Rays
+from swath.georef.records import StructArray
+from swath.georef.rotations import boresight, rot_x
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
 from tests.georef.scanner_cases import CASES, IBRC, TURNED, Case, rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
-from georef.timescales import DeviceClock, Stamps, StampScale
-from georef.timescales.stamp_scale import judge
+from swath.georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
+from swath.georef.timescales import DeviceClock, Stamps, StampScale
+from swath.georef.timescales.stamp_scale import judge
 from tests.georef.test_timescales_device import NS, START_S, host_clock, host_ns
 
 UNIX_MINUS_GPS_S = 315_964_800  # of UTC, but for the leap seconds

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from georef.encoder_motion import EncoderMotion
-from georef.points import ByteArray, Fate, Points
-from georef.records import (
+from swath.georef.encoder_motion import EncoderMotion
+from swath.georef.points import ByteArray, Fate, Points
+from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,
     RETURN_DTYPE,
@@ -23,7 +23,7 @@ from georef.records import (
     TimeScale,
     TimeTag,
 )
-from georef.stream import (
+from swath.georef.stream import (
     CONTEXT_FLAG,
     CompletePath,
     GivenMotion,
@@ -32,9 +32,9 @@ from georef.stream import (
     Stream,
     StreamSettings,
 )
-from georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, HostClocks, PpsPlan, StreamClocks
-from georef.timescales import SECOND_NS, WEEK_NS
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, HostClocks, PpsPlan, StreamClocks
+from swath.georef.timescales import SECOND_NS, WEEK_NS
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

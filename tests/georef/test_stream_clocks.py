@@ -7,9 +7,9 @@ import math
 
 import pytest
 
-from georef.records import NamesEdge, PpsEdge, TimeMessage, TimeScale, TimeTag
-from georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
-from georef.timescales import HOUR_NS, SECOND_NS, TimeState, gps_ns_from_utc, unix_ns_from_gps
+from swath.georef.records import NamesEdge, PpsEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
+from swath.georef.timescales import HOUR_NS, SECOND_NS, TimeState, gps_ns_from_utc, unix_ns_from_gps
 
 DATE = dt.date(2026, 5, 10)
 START_NS = gps_ns_from_utc(DATE, 12 * HOUR_NS, 18)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.strips import (
+from swath.georef.strips import (
     Segment,
     StripError,
     StripRules,

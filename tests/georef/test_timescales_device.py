@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, StructArray, TimeMessage, TimeScale, TimeTag
-from georef.timescales import DeviceClock, PpsClock, TimeState
+from swath.georef.records import DEVICE_CLOCK_DTYPE, NamesEdge, StructArray, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import DeviceClock, PpsClock, TimeState
 from tests.georef.clock_run import rms
 
 NS = 1_000_000_000

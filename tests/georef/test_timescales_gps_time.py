@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from georef.records import TimeScale, TimeTag
-from georef.timescales import (
+from swath.georef.records import TimeScale, TimeTag
+from swath.georef.timescales import (
     DAY_NS,
     HOUR_NS,
     LEAP_SECOND_TABLE,

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales import HostTimeline, PpsClock, TimeState
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import HostTimeline, PpsClock, TimeState
 from tests.georef.clock_run import SURE, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, utc_tag, week_tag
 

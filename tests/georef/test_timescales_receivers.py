@@ -13,10 +13,18 @@ from pathlib import Path
 
 import pytest
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from georef.records import Chunk, NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales import HOUR_NS, SECOND_NS, PpsClock, TimeState, gps_ns_from_utc, week_from_gps, whole_gps_ns
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.georef.records import Chunk, NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import (
+    HOUR_NS,
+    SECOND_NS,
+    PpsClock,
+    TimeState,
+    gps_ns_from_utc,
+    week_from_gps,
+    whole_gps_ns,
+)
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"
 HOST_0 = 10**13

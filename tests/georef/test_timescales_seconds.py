@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales import PpsClock, TimeState
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import PpsClock, TimeState
 from tests.georef.clock_run import Outcome, run
 from tests.georef.clock_simulation import (
     HOST_START_NS,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from georef.timescales import PpsClock, TimeState
+from swath.georef.timescales import PpsClock, TimeState
 from tests.georef.clock_run import Outcome, run
 from tests.georef.clock_simulation import NS, Edges, Oscillator, Sender, Simulation, utc_tag, week_tag
 from tests.georef.test_timescales_seconds import START, nmea, tim_tp

@@ -13,8 +13,8 @@ import functools
 import numpy as np
 import pytest
 
-from georef.timescales import PpsClock, TimeState
-from georef.timescales.edge_train import _chain_noise_ns
+from swath.georef.timescales import PpsClock, TimeState
+from swath.georef.timescales.edge_train import _chain_noise_ns
 from tests.georef.clock_run import rms, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, week_tag
 

@@ -6,7 +6,7 @@ import datetime as dt
 
 import pytest
 
-from georef.toml_tables import DEEPEST, LEAST, MOST, TomlError, key_text, toml_tables
+from swath.georef.toml_tables import DEEPEST, LEAST, MOST, TomlError, key_text, toml_tables
 
 
 def refused(text: str) -> str:

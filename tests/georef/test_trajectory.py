@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
-from georef.points import Fate
-from georef.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
+from swath.georef.points import Fate
+from swath.georef.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

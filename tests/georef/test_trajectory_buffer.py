@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from georef.records import INS_DTYPE, StructArray
-from georef.trajectory import Trajectory
-from georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.records import INS_DTYPE, StructArray
+from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory_buffer import TrajectoryBuffer
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

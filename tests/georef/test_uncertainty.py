@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from georef.beams import LineGeometry
-from georef.calibration import PARAMETERS, Calibration, nominal
-from georef.jacobian import observation_columns_e, parameter_columns_e
-from georef.mount import Mount, Stage
-from georef.points import Fate
-from georef.records import RETURN_DTYPE
-from georef.sensor_model import SensorModel
-from georef.trajectory import Trajectory
-from georef.uncertainty import Noise, Uncertainty, UncertaintyError
+from swath.georef.beams import LineGeometry
+from swath.georef.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.mount import Mount, Stage
+from swath.georef.points import Fate
+from swath.georef.records import RETURN_DTYPE
+from swath.georef.sensor_model import SensorModel
+from swath.georef.trajectory import Trajectory
+from swath.georef.uncertainty import Noise, Uncertainty, UncertaintyError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -6,8 +6,8 @@ import datetime as dt
 
 import pytest
 
-from georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
-from georef.timescales import SECOND_NS, WallComparison, ahead_s, distance_text
+from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
+from swath.georef.timescales import SECOND_NS, WallComparison, ahead_s, distance_text
 
 CLOCK = "this computer's clock"
 NOON_NS = int(dt.datetime(2026, 5, 10, 12, tzinfo=dt.UTC).timestamp()) * SECOND_NS

@@ -28,7 +28,7 @@ SCHEMAS = {
 
 def swath(*arguments: str | Path) -> str:
     """Run a command that must succeed; what it printed."""
-    command = [sys.executable, "-m", "daemon.cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "swath.daemon.cli.main", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=HERE.parents[1])
     assert done.returncode == 0, done.stderr
     return done.stdout

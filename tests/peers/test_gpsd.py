@@ -23,10 +23,10 @@ from typing import Any
 
 import pytest
 
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from daemon.replay import source_of_topic
-from georef.records import ChunkBatch, FixType, GnssFix, TimeScale
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.replay import source_of_topic
+from swath.georef.records import ChunkBatch, FixType, GnssFix, TimeScale
 
 pytestmark = pytest.mark.peers
 
@@ -64,7 +64,7 @@ CASES = [
 
 
 def swath(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "daemon.cli.main", *map(str, arguments)]
+    return [sys.executable, "-m", "swath.daemon.cli.main", *map(str, arguments)]
 
 
 def recorded(folder: Path, case: Case) -> Path:

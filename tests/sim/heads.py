@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import PacketParser
-from georef.records import DeviceClockSamples, Record, ScannerReturns
-from sim.clocks import PulsePerSecond
-from sim.plan import Plan, parse_plan
-from sim.shots import Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.drivers.core.parser import PacketParser
+from swath.georef.records import DeviceClockSamples, Record, ScannerReturns
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.shots import Measured, Pulses, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 FloatArray = NDArray[np.float64]
 TEXT = """

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.plan import Plan, parse_plan
-from sim.scene import Scene, build_scene
-from sim.shots import Echoes
-from sim.site import Site
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.scene import Scene, build_scene
+from swath.sim.shots import Echoes
+from swath.sim.site import Site
 
 FloatArray = NDArray[np.float64]
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.srep import SrepParser
-from drivers.scanner.srep_layout import HEADER_DTYPE
-from georef.records import Chunk, DeviceClockSamples, ScannerReturns
-from sim.clocks import PulsePerSecond
-from sim.plan_tables import HostTable, PpsTable, ScannerTable
-from sim.scanners.line_heads import LineHead
-from sim.scanners.srep_wire import SrepWire, config_table
-from sim.shots import Measured, Pulses, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE, StructArray
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.srep_layout import HEADER_DTYPE
+from swath.georef.records import Chunk, DeviceClockSamples, ScannerReturns
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable
+from swath.sim.scanners.line_heads import LineHead
+from swath.sim.scanners.srep_wire import SrepWire, config_table
+from swath.sim.shots import Measured, Pulses, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 FloatArray = NDArray[np.float64]
 C_MPS = 299_792_458.0

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
-from sim.atmosphere import (
+from swath.sim.atmosphere import (
     Air,
     bending_by_layers,
     group_refractivity_ppm,
     phase_refractivity_ppm,
     vapour_fraction,
 )
-from sim.plan_tables import AtmosphereTable
+from swath.sim.plan_tables import AtmosphereTable
 
 FloatArray = NDArray[np.float64]
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.clocks import Oscillator, PulsePerSecond, generator
-from sim.plan_tables import OscillatorTable, PpsTable
+from swath.sim.clocks import Oscillator, PulsePerSecond, generator
+from swath.sim.plan_tables import OscillatorTable, PpsTable
 
 
 def test_an_oscillator_runs_fast_by_its_offset_and_drift() -> None:

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from sim.errors import PlanError
-from sim.faults import check_faults, windows, with_faults
-from sim.plan import Plan, parse_plan
-from sim.shots import WireUnit
+from swath.sim.errors import PlanError
+from swath.sim.faults import check_faults, windows, with_faults
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.shots import WireUnit
 
 PLAN = """
 [flight]

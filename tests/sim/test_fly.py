@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from georef.records import Chunk, GnssFix, ScannerReturns
-from sim.calibration_files import calibration_text
-from sim.companions import companion_files, config_text, default_wires
-from sim.errors import PlanError
-from sim.fly import VirtualFlight, open_truth
-from sim.plan import Plan, parse_plan
-from sim.shots import WireUnit
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.georef.records import Chunk, GnssFix, ScannerReturns
+from swath.sim.calibration_files import calibration_text
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.errors import PlanError
+from swath.sim.fly import VirtualFlight, open_truth
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.shots import WireUnit
 from tests.sim.direct import TO_ECEF
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker

@@ -14,12 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.flight import Poses
-from sim.mounting import Mounting
-from sim.plan_tables import ParameterTable, ScannerTable
-from sim.scanners.mirrors import swung_mirror
-from sim.shots import Pulses
-from sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
+from swath.sim.flight import Poses
+from swath.sim.mounting import Mounting
+from swath.sim.plan_tables import ParameterTable, ScannerTable
+from swath.sim.scanners.mirrors import swung_mirror
+from swath.sim.shots import Pulses
+from swath.sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 

@@ -16,10 +16,10 @@ import pynmea2
 import pytest
 from pyubx2 import UBXReader
 
-from daemon.config.tables import GnssConfig
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from georef.records import (
+from swath.daemon.config.tables import GnssConfig
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.georef.records import (
     Chunk,
     FixType,
     GnssFix,
@@ -29,14 +29,14 @@ from georef.records import (
     Record,
     TimeMessage,
 )
-from georef.timescales import whole_gps_ns
-from sim.clocks import PulsePerSecond
-from sim.errors import PlanError
-from sim.gnss_wire import GnssWire, config_table
-from sim.plan import Plan, parse_plan
-from sim.plan_tables import PpsTable
-from sim.satellites import Receiver
-from sim.shots import WireUnit
+from swath.georef.timescales import whole_gps_ns
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.errors import PlanError
+from swath.sim.gnss_wire import GnssWire, config_table
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan_tables import PpsTable
+from swath.sim.satellites import Receiver
+from swath.sim.shots import WireUnit
 from tests.sim.circling import Circling, FloatArray, geodetic
 
 PLAN = """

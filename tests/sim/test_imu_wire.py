@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.config.tables import ImuConfig
-from drivers.core.can_frames import CAN_FRAME_DTYPE
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
-from sim.clocks import PulsePerSecond
-from sim.errors import PlanError
-from sim.imu_wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text
-from sim.inertial import InertialUnit
-from sim.plan_tables import ImuTable, OscillatorTable, PpsTable
-from sim.shots import WireUnit
-from sim.toml_text import toml_text
+from swath.daemon.config.tables import ImuConfig
+from swath.drivers.core.can_frames import CAN_FRAME_DTYPE
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
+from swath.sim.clocks import PulsePerSecond
+from swath.sim.errors import PlanError
+from swath.sim.imu_wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text
+from swath.sim.inertial import InertialUnit
+from swath.sim.plan_tables import ImuTable, OscillatorTable, PpsTable
+from swath.sim.shots import WireUnit
+from swath.sim.toml_text import toml_text
 from tests.sim.inertial_motion import circling_the_pole, standing
 
 FloatArray = NDArray[np.float64]

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from daemon.config.tables import GeometryConfig
-from sim.clocks import Oscillator
-from sim.errors import PlanError
-from sim.plan_tables import ScannerTable
-from sim.scanners import mirrors, motions
-from sim.scanners.line_heads import LineHead, config_geometry
-from sim.shots import Pulses
+from swath.daemon.config.tables import GeometryConfig
+from swath.sim.clocks import Oscillator
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners import mirrors, motions
+from swath.sim.scanners.line_heads import LineHead, config_geometry
+from swath.sim.shots import Pulses
 
 FloatArray = NDArray[np.float64]
 KINDS = ("oscillating", "triangle", "polygon", "monogon", "nutating", "risley")

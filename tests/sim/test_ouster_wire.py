@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.config.tables import ScannerConfig
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.ouster import OusterParser
-from drivers.scanner.ouster_head import beam_points, read_head
-from georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, DeviceClockSamples, ScannerReturns
-from sim.errors import PlanError
-from sim.plan import Plan
-from sim.scanners.ouster_wire import OusterWire, config_table, os1_metadata
-from sim.scanners.spinning_heads import Os1Head
-from sim.shots import WireUnit
-from sim.truth import StructArray
+from swath.daemon.config.tables import ScannerConfig
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.ouster import OusterParser
+from swath.drivers.scanner.ouster_head import beam_points, read_head
+from swath.georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, DeviceClockSamples, ScannerReturns
+from swath.sim.errors import PlanError
+from swath.sim.plan import Plan
+from swath.sim.scanners.ouster_wire import OusterWire, config_table, os1_metadata
+from swath.sim.scanners.spinning_heads import Os1Head
+from swath.sim.shots import WireUnit
+from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, feed, measured_of, plan_of, pulse, rows_of
 
 FloatArray = NDArray[np.float64]

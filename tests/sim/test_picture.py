@@ -11,13 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.coverage import FloatArray, Strip, Survey, corners, fan_of, grid_of, plan_summary, pulse_rate_hz, strip_of
-from sim.errors import PlanError
-from sim.picture import _framed, draw_plan
-from sim.plan import Plan, parse_plan
-from sim.plan_tables import ScannerTable
-from sim.scanners.line_heads import LineHead
-from sim.scanners.spinning_heads import Os1Head, Vlp16Head
+from swath.sim.coverage import (
+    FloatArray,
+    Strip,
+    Survey,
+    corners,
+    fan_of,
+    grid_of,
+    plan_summary,
+    pulse_rate_hz,
+    strip_of,
+)
+from swath.sim.errors import PlanError
+from swath.sim.picture import _framed, draw_plan
+from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.line_heads import LineHead
+from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 
 ACROSS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # a head whose axis points forward
 FLAT = """

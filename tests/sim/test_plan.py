@@ -16,11 +16,11 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from sim.errors import PlanError
-from sim.plan import PRESETS, Plan, load_plan, parse_plan
-from sim.plan_tables import Tables
-from sim.shots import SURFACES
-from sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE
+from swath.sim.errors import PlanError
+from swath.sim.plan import PRESETS, Plan, load_plan, parse_plan
+from swath.sim.plan_tables import Tables
+from swath.sim.shots import SURFACES
+from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE
 
 PAGE = (Path(__file__).parents[2] / "docs/simulation.md").read_text()
 SHORT = """

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from drivers.core.parser import DeviceSettings
-from drivers.core.registry import find_driver
-from drivers.scanner.beams import beam_points as velodyne_points
-from drivers.scanner.ouster_head import beam_points as ouster_points
-from drivers.scanner.ouster_head import read_head
-from drivers.scanner.velodyne_heads import VLP16
-from georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
-from sim.companions import companion_files, config_text, default_wires
-from sim.fly import VirtualFlight, open_truth
-from sim.plan import Plan, parse_plan
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.core.registry import find_driver
+from swath.drivers.scanner.beams import beam_points as velodyne_points
+from swath.drivers.scanner.ouster_head import beam_points as ouster_points
+from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
+from swath.sim.companions import companion_files, config_text, default_wires
+from swath.sim.fly import VirtualFlight, open_truth
+from swath.sim.plan import Plan, parse_plan
 from tests.sim.direct import (
     TO_GEODETIC,
     Bending,

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from sim.atmosphere import Air
-from sim.errors import PlanError
-from sim.plan_tables import AtmosphereTable, ScannerTable
-from sim.scanners.ranging import IntensityScale, Ranging, packed
-from sim.shots import Echoes, Measured, Pulses
-from sim.truth import RETURN_TRUTH_DTYPE
+from swath.sim.atmosphere import Air
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import AtmosphereTable, ScannerTable
+from swath.sim.scanners.ranging import IntensityScale, Ranging, packed
+from swath.sim.shots import Echoes, Measured, Pulses
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 
 FloatArray = NDArray[np.float64]
 CLEAR = AtmosphereTable(visibility_km=1e9)

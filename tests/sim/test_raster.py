@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from sim.errors import PlanError
-from sim.scene import Scene, build_scene
-from sim.site import Site, geodetic_from_e
+from swath.sim.errors import PlanError
+from swath.sim.scene import Scene, build_scene
+from swath.sim.site import Site, geodetic_from_e
 from tests.sim.scenes import plan_of
 
 FloatArray = NDArray[np.float64]

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from georef.records import FixType
-from sim.errors import PlanError
-from sim.gnss.noise import Noise
-from sim.plan_tables import GnssTable
-from sim.satellites import Epochs, InsEpochs, Receiver
+from swath.georef.records import FixType
+from swath.sim.errors import PlanError
+from swath.sim.gnss.noise import Noise
+from swath.sim.plan_tables import GnssTable
+from swath.sim.satellites import Epochs, InsEpochs, Receiver
 from tests.sim.circling import TO_E, Circling, FloatArray, Standing, geodetic, ned_from_e
 
 LEVER_ARM = [0.8, -0.6, -1.9]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
+from swath.sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 LAT, LON = 47.1234567, 8.7
 

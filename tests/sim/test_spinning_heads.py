@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.scanner.beams import beam_points as velodyne_points
-from drivers.scanner.ouster_head import beam_points as ouster_points
-from drivers.scanner.ouster_head import read_head
-from drivers.scanner.velodyne_heads import VLP16
-from georef.records import RETURN_DTYPE
-from sim.errors import PlanError
-from sim.plan_tables import ScannerTable
-from sim.scanners.ouster_wire import os1_metadata
-from sim.scanners.spinning_heads import Os1Head, Vlp16Head
-from sim.shots import Pulses
+from swath.drivers.scanner.beams import beam_points as velodyne_points
+from swath.drivers.scanner.ouster_head import beam_points as ouster_points
+from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.georef.records import RETURN_DTYPE
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import ScannerTable
+from swath.sim.scanners.ouster_wire import os1_metadata
+from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
+from swath.sim.shots import Pulses
 from tests.sim.heads import joined, plan_of
 
 FloatArray = NDArray[np.float64]

@@ -7,11 +7,11 @@ import struct
 import numpy as np
 import pytest
 
-from sim.plan_tables import HostTable
-from sim.scanners.line_heads import LineHead
-from sim.scanners.srep_wire import SrepWire
-from sim.shots import Measured, WireUnit
-from sim.truth import RETURN_TRUTH_DTYPE
+from swath.sim.plan_tables import HostTable
+from swath.sim.scanners.line_heads import LineHead
+from swath.sim.scanners.srep_wire import SrepWire
+from swath.sim.shots import Measured, WireUnit
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 from tests.sim.srep_spoken import C_MPS, Spoken, joined, measured_count, scanner, speak
 
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.config.tables import ScannerConfig
-from drivers.scanner.srep_layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
-from sim.clocks import Oscillator, PulsePerSecond
-from sim.errors import PlanError
-from sim.plan_tables import HostTable, PpsTable, ScannerTable
-from sim.scanners.line_heads import LineHead
-from sim.scanners.srep_wire import PROCESSING_S, SrepWire, config_table
-from sim.shots import Measured, Pulses
-from sim.truth import RETURN_TRUTH_DTYPE
+from swath.daemon.config.tables import ScannerConfig
+from swath.drivers.scanner.srep_layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
+from swath.sim.clocks import Oscillator, PulsePerSecond
+from swath.sim.errors import PlanError
+from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable
+from swath.sim.scanners.line_heads import LineHead
+from swath.sim.scanners.srep_wire import PROCESSING_S, SrepWire, config_table
+from swath.sim.shots import Measured, Pulses
+from swath.sim.truth import RETURN_TRUTH_DTYPE
 from tests.sim.srep_spoken import (
     C_MPS,
     TRANSPORT,

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.flight import Trajectory
-from sim.gravity import EARTH_RATE_RADPS
-from sim.inertial import Increments, true_increments
-from sim.strapdown import States, navigate
+from swath.sim.flight import Trajectory
+from swath.sim.gravity import EARTH_RATE_RADPS
+from swath.sim.inertial import Increments, true_increments
+from swath.sim.strapdown import States, navigate
 from tests.sim.inertial_motion import rough_flight
 
 FloatArray = NDArray[np.float64]

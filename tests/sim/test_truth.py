@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.toml_text import toml_text
-from sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
+from swath.sim.toml_text import toml_text
+from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
 
 
 def test_pieces_come_back_as_whole_columns(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.config.tables import ScannerConfig
-from drivers.core.parser import DeviceSettings
-from drivers.scanner.beams import beam_points
-from drivers.scanner.velodyne import VelodyneParser
-from drivers.scanner.velodyne_heads import VLP16
-from georef.records import (
+from swath.daemon.config.tables import ScannerConfig
+from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.scanner.beams import beam_points
+from swath.drivers.scanner.velodyne import VelodyneParser
+from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
     RETURN_FLAG_STRONGEST,
@@ -24,13 +24,13 @@ from georef.records import (
     ScannerReturns,
     TimeMessage,
 )
-from georef.timescales import HOUR_NS, gps_ns_from_utc, gps_ns_past_hour
-from sim.plan import Plan
-from sim.scanners.spinning_heads import Vlp16Head
-from sim.scanners.spinning_wire import PPS_LOCKED, HeadClock
-from sim.scanners.velodyne_wire import VelodyneWire, config_table
-from sim.shots import WireUnit
-from sim.truth import StructArray
+from swath.georef.timescales import HOUR_NS, gps_ns_from_utc, gps_ns_past_hour
+from swath.sim.plan import Plan
+from swath.sim.scanners.spinning_heads import Vlp16Head
+from swath.sim.scanners.spinning_wire import PPS_LOCKED, HeadClock
+from swath.sim.scanners.velodyne_wire import VelodyneWire, config_table
+from swath.sim.shots import WireUnit
+from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, Still, feed, measured_of, plan_of, pulse, rows_of
 
 FloatArray = NDArray[np.float64]

@@ -15,7 +15,7 @@ from tests.vm.machine import CACHE, TREE, UDEV, with_sbin
 INSTALLED = CACHE / "installed"
 IMAGE = CACHE / "installed.ext4"
 MB = 1 << 20
-_SOURCES = ("pyproject.toml", "calib", "daemon", "drivers", "georef", "sim", "systemd")
+_SOURCES = ("pyproject.toml", "swath", "calib", "daemon", "drivers", "georef", "sim", "systemd")
 _ACCOUNTS = ("passwd", "group", "shadow", "gshadow")
 
 

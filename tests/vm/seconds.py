@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.events import Event, Events, Severity
-from daemon.host_clock import ClockDiscipline
-from daemon.log.chunks import json_objects
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from daemon.timekeeper import TimeKeeper
-from drivers.transports.base import UnitBlock
+from swath.daemon.events import Event, Events, Severity
+from swath.daemon.host_clock import ClockDiscipline
+from swath.daemon.log.chunks import json_objects
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.daemon.timekeeper import TimeKeeper
+from swath.drivers.transports.base import UnitBlock
 
 LEAP_S = 18
 GPS_EPOCH_S = 315_964_800

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.log.reader import open_logs
-from daemon.log_parsers import stored_parsers
-from georef.records import ChunkBatch, ImuSamples
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log_parsers import stored_parsers
+from swath.georef.records import ChunkBatch, ImuSamples
 from tests.daemon.log_check import LogContent, read_log
 from tests.vm.aboard_can import BUS_OFF, CONTROLLER, ERROR, RESTARTED, sample_frames
 from tests.vm.crew import aboard, facts

@@ -23,14 +23,14 @@ import laspy
 import numpy as np
 import pytest
 
-from daemon.cli.main import run_app
-from daemon.config import load_config
-from daemon.processing.live_points import POINT_DTYPE
-from daemon.sim_wire import CAN_GROUP, free_ports
-from drivers.transports.uri import parse_transport
-from sim.companions import companion_files, config_text
-from sim.fly import VirtualFlight
-from sim.plan import parse_plan
+from swath.daemon.cli.main import run_app
+from swath.daemon.config import load_config
+from swath.daemon.processing.live_points import POINT_DTYPE
+from swath.daemon.sim_wire import CAN_GROUP, free_ports
+from swath.drivers.transports.uri import parse_transport
+from swath.sim.companions import companion_files, config_text
+from swath.sim.fly import VirtualFlight
+from swath.sim.plan import parse_plan
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, wait_until
 from tests.daemon.test_live_growing import running

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.log.reader import open_logs
-from daemon.log.recover import recover
+from swath.daemon.log.reader import open_logs
+from swath.daemon.log.recover import recover
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev
 

@@ -10,12 +10,12 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
-from georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
-from georef.records import FixType, StructArray
-from georef.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
-from sim.flight import Trajectory
-from sim.inertial import error_matrix, true_increments
+from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
+from swath.georef.records import FixType, StructArray
+from swath.georef.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
+from swath.sim.flight import Trajectory
+from swath.sim.inertial import error_matrix, true_increments
 from tests.georef.navigation.vehicles import Motion, ns, observed
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from georef.navigation.inputs import Solution
+from swath.georef.navigation.inputs import Solution
 from tests.georef.navigation.flights import Truth, errors
 from tests.georef.navigation.vehicles import BEGIN_NS
 

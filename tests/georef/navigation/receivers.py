@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from georef.navigation.filter import run_filter
-from georef.navigation.inputs import GRADES, Kind, Setup, Solution
-from georef.navigation.smoother import smooth
-from georef.navigation.solve import Solved, solve
-from georef.records import StructArray
+from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.inputs import GRADES, Kind, Setup, Solution
+from swath.georef.navigation.smoother import smooth
+from swath.georef.navigation.solve import Solved, solve
+from swath.georef.records import StructArray
 from tests.georef.navigation.flights import BASELINE_B, Fixes, Truth, drawn_start, errors, noised
 from tests.georef.navigation.vehicles import ns
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.earth import geodetic_from_e, rot_e_from_l
-from georef.navigation.alignment import AlignedStart, Aligner, AlignmentError, align
-from georef.navigation.alignment_blocks import Blocks
-from georef.navigation.alignment_fit import TILT, Problem
-from georef.navigation.gravity import EARTH_RATE_RADPS
-from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, ImuNoise, Inertial, Kind, Start, sort_observations
-from georef.quaternions import rotation_vector
-from georef.records import FixType, StructArray
-from georef.rotations import quaternion_from_rot, rot_from_quaternion, rot_z
+from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.alignment import AlignedStart, Aligner, AlignmentError, align
+from swath.georef.navigation.alignment_blocks import Blocks
+from swath.georef.navigation.alignment_fit import TILT, Problem
+from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, ImuNoise, Inertial, Kind, Start, sort_observations
+from swath.georef.quaternions import rotation_vector
+from swath.georef.records import FixType, StructArray
+from swath.georef.rotations import quaternion_from_rot, rot_from_quaternion, rot_z
 from tests.georef.navigation.vehicles import (
     BEGIN_NS,
     Motion,

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.navigation.bridging import UNKNOWN_RATE_RADPS, made_up_variance, new_bridges
-from georef.navigation.filter import run_filter
-from georef.navigation.inputs import GRADES, Inertial
-from georef.navigation.samples import Sampler
-from georef.navigation.smoother import smooth
-from georef.navigation.strapdown import Samples, samples_of
-from georef.records import IMU_DTYPE
+from swath.georef.navigation.bridging import UNKNOWN_RATE_RADPS, made_up_variance, new_bridges
+from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.inputs import GRADES, Inertial
+from swath.georef.navigation.samples import Sampler
+from swath.georef.navigation.smoother import smooth
+from swath.georef.navigation.strapdown import Samples, samples_of
+from swath.georef.records import IMU_DTYPE
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import ns
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from georef.navigation.earlier_start import drift_rad, earlier_start
-from georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, imu_noise
-from georef.records import StructArray
+from swath.georef.navigation.earlier_start import drift_rad, earlier_start
+from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, imu_noise
+from swath.georef.records import StructArray
 
 FloatArray = NDArray[np.float64]
 

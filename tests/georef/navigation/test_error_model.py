@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.earth import e_from_geodetic, rot_e_from_l
-from georef.navigation.error_model import (
+from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.navigation.error_model import (
     CORE,
     LEANS,
     MOVED,
@@ -21,10 +21,10 @@ from georef.navigation.error_model import (
     propagate,
     transition,
 )
-from georef.navigation.inputs import GRADES, Kind, Setup
-from georef.navigation.measurements import predict, rules_of
-from georef.navigation.smoother import difference
-from georef.navigation.strapdown import (
+from swath.georef.navigation.inputs import GRADES, Kind, Setup
+from swath.georef.navigation.measurements import predict, rules_of
+from swath.georef.navigation.smoother import difference
+from swath.georef.navigation.strapdown import (
     GYRO_LEAN,
     HEIGHT_BIAS,
     LEVER_ARM,
@@ -35,8 +35,8 @@ from georef.navigation.strapdown import (
     TIME_OFFSET,
     advance_part,
 )
-from georef.records import FixType
-from georef.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.records import FixType
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

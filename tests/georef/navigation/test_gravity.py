@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from georef.earth import e_from_geodetic
-from georef.navigation.gravity import gradient_of, gravity_e
-from sim.gravity import gravity_e as simulated
+from swath.georef.earth import e_from_geodetic
+from swath.georef.navigation.gravity import gradient_of, gravity_e
+from swath.sim.gravity import gravity_e as simulated
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.navigation.alignment_noise import HEADING_STEP_NS, spaced_headings
-from georef.navigation.filter import run_filter
-from georef.navigation.heading_noise import find_heading_noise
-from georef.navigation.inputs import GRADES, Kind, Setup
-from georef.navigation.noise import EVIDENCE, NoiseFound
-from georef.navigation.smoother import smooth
-from georef.navigation.solve import stretch_of
-from georef.quaternions import conjugate, product, rotation_vector
-from georef.records import FixType
+from swath.georef.navigation.alignment_noise import HEADING_STEP_NS, spaced_headings
+from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.heading_noise import find_heading_noise
+from swath.georef.navigation.inputs import GRADES, Kind, Setup
+from swath.georef.navigation.noise import EVIDENCE, NoiseFound
+from swath.georef.navigation.smoother import smooth
+from swath.georef.navigation.solve import stretch_of
+from swath.georef.quaternions import conjugate, product, rotation_vector
+from swath.georef.records import FixType
 from tests.georef.navigation.flights import BASELINE_B, Truth, drawn_start, fly, noised, survey
 from tests.georef.navigation.honesty import judge, squares
 from tests.georef.navigation.receivers import ARM, DUAL_ANTENNAS, HEADING_SHARE, SHARE, TAU_S, Receiver, compared

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.navigation.diagnosis import diagnose
-from georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
-from georef.records import StructArray
+from swath.georef.navigation.diagnosis import diagnose
+from swath.georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
+from swath.georef.records import StructArray
 from tests.georef.navigation.flights import Fixes, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import car, uav
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.navigation.inputs import Inertial, NavigationError
-from georef.navigation.samples import Sampler, SampleRule, StampRule
-from georef.records import IMU_DTYPE
+from swath.georef.navigation.inputs import Inertial, NavigationError
+from swath.georef.navigation.samples import Sampler, SampleRule, StampRule
+from swath.georef.records import IMU_DTYPE
 
 FloatArray = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from georef.navigation.filter import run_filter
-from georef.navigation.inputs import Setup, Solution
-from georef.navigation.smoother import forward, smooth
-from sim.inertial import InertialUnit
-from sim.plan_tables import ImuTable
+from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.inputs import Setup, Solution
+from swath.georef.navigation.smoother import forward, smooth
+from swath.sim.inertial import InertialUnit
+from swath.sim.plan_tables import ImuTable
 from tests.georef.navigation.flights import drawn_start
 from tests.georef.navigation.virtual_aircraft import (
     ARM,

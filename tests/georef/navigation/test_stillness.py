@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from georef.earth import e_from_geodetic
-from georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
-from georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
-from georef.timescales import SECOND_NS
+from swath.georef.earth import e_from_geodetic
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
+from swath.georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
+from swath.georef.timescales import SECOND_NS
 from tests.georef.navigation.vehicles import collected
 
 EPOCH_NS = 1_447_000_000 * SECOND_NS

@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from georef.navigation.inputs import GRADES, ImuNoise, Setup
-from georef.navigation.noise import Run
-from georef.navigation.solve import stretch_of
-from georef.navigation.unit_noise import better_grade, contradicted, noise_findings
+from swath.georef.navigation.inputs import GRADES, ImuNoise, Setup
+from swath.georef.navigation.noise import Run
+from swath.georef.navigation.solve import stretch_of
+from swath.georef.navigation.unit_noise import better_grade, contradicted, noise_findings
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, survey
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
-from georef.navigation.inputs import (
+from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     ImuNoise,
     Inertial,
@@ -25,11 +25,11 @@ from georef.navigation.inputs import (
     imu_noise,
     sort_observations,
 )
-from georef.quaternions import rotation_vector
-from georef.records import FixType, StructArray
-from georef.rotations import quaternion_from_rot, rot_l_from_b
-from sim.flight import Trajectory
-from sim.inertial import error_matrix, true_increments
+from swath.georef.quaternions import rotation_vector
+from swath.georef.records import FixType, StructArray
+from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
+from swath.sim.flight import Trajectory
+from swath.sim.inertial import error_matrix, true_increments
 
 FloatArray = NDArray[np.float64]
 
