@@ -30,9 +30,9 @@ from swath.calib.parameters import Wish, unknowns
 from swath.calib.rows import Rows
 from swath.calib.trajectory_errors import Taus, gauss_markov
 from swath.daemon.memory import keep_freed_memory
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import Calibration, nominal
 from swath.georef.records import RETURN_DTYPE
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import Calibration, nominal
 from tests.calib.roofs import GROUND_M, LINES, NOISE, aimed, frame, ranges, trajectory
 
 FloatArray = NDArray[np.float64]

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.calibration_runs import Outcome, Reference, read_reference, run
-from swath.georef.calibration import PARAMETERS, read_calibration
+from swath.georef.scanner.calibration import PARAMETERS, read_calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ from swath.daemon.processing.calibration_flight import read_flight
 from swath.daemon.processing.flights import Wish as Logs
 from swath.daemon.processing.flown import TrajectoryWish
 from swath.daemon.processing.setup import Options
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.uncertainty import Noise
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 from swath.sim.site import e_from_geodetic, rot_e_from_ned
 

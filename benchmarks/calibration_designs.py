@@ -29,7 +29,7 @@ from swath.calib.parameters import INSTALLED, MODELS, Wish, unknowns
 from swath.calib.rows import Rows
 from swath.calib.solve import Settings
 from swath.calib.trajectory_errors import Taus, gauss_markov
-from swath.georef.calibration import INDEX, PARAMETERS, nominal
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 from tests.calib.test_rows import shifted
 

@@ -30,9 +30,9 @@ from swath.daemon.processing.calibration_flight import KNOT_S, read_flight, repl
 from swath.daemon.processing.flights import Wish as Logs
 from swath.daemon.processing.flown import TrajectoryWish
 from swath.daemon.processing.setup import Options
-from swath.georef.calibration import Calibration, read_calibration
 from swath.georef.navigation.cross_covariance import ErrorChain
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import Calibration, read_calibration
 
 FloatArray = NDArray[np.float64]
 

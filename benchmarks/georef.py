@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.memory import keep_freed_memory
-from swath.georef.atmosphere import Air
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.air.atmosphere import Air
 from swath.georef.georeference import BLOCK_ROWS, Georeferencer
-from swath.georef.mapping import Mapping
+from swath.georef.mapping.frame import Mapping
 from swath.georef.records import RETURN_DTYPE, StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise, Uncertainty
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Noise, Uncertainty
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -47,7 +47,7 @@ from swath.georef.formats.las_header import POINT_FORMAT
 from swath.georef.points import Fate, Points
 from swath.georef.records import ChunkBatch, ScannerReturns
 from swath.georef.strips import Segment
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
 
 CRS = "EPSG:32633"
 SOME_POINTS = 1_000_000  # for what is measured on points that are held: all would not fit into a small memory

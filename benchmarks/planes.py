@@ -25,12 +25,12 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.plane_matching import rematch
 from swath.calib.plane_search import find_planes
 from swath.daemon.memory import keep_freed_memory
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import nominal
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -35,7 +35,7 @@ from swath.daemon.processing.calibration_flight import read_flight, smoothed_pri
 from swath.daemon.processing.flights import Wish
 from swath.daemon.processing.flown import TrajectoryWish
 from swath.daemon.processing.setup import Options
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 from tests.calib.cast_flight import cast_flight
 from tests.calib.village import village
 

@@ -33,7 +33,7 @@ from swath.calib.quality import Solution, trajectory_fit
 from swath.calib.robust import global_test
 from swath.calib.solve import Block, HeldEffects, Settings, Solved, determined, settled
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.calibration import PARAMETERS, Calibration
+from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 Rematch = Callable[[dict[str, Calibration]], Features | None]

@@ -1,4 +1,4 @@
-"""A calibration as the text of its file (CONVENTIONS, "Calibration file"); `swath.georef.calibration` reads it."""
+"""A calibration as the text of its file (CONVENTIONS, "Calibration file"); `swath.georef.scanner.calibration` reads it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
+from swath.georef.scanner.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -30,12 +30,12 @@ class Header:
     Attributes:
         id: unique; goes into every product made with it.
         created: with its time zone.
-        method: of `swath.georef.calibration.METHODS`; empty: the calibration's own.
+        method: of `swath.georef.scanner.calibration.METHODS`; empty: the calibration's own.
         scanner_model, scanner_serial, imu_serial: whose calibration it is; empty: not compared.
         installation: id of the mounting.
         logs: name and SHA-256 (hex) of each.
         variance_factor, redundancy: of the adjustment; None: there was none.
-        verdict: one of `swath.georef.calibration.VERDICTS`; empty: nobody judged it.
+        verdict: one of `swath.georef.scanner.calibration.VERDICTS`; empty: nobody judged it.
         verdict_reasons: why it is not simply good, one sentence each.
         held: keys of parameters that were asked for and not estimated.
         trajectory: ``navigated``, ``ins`` or ``file``, from which it was made; empty: not known.

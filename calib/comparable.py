@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.calibration import PARAMETERS, BeamCorrection, Calibration
+from swath.georef.scanner.calibration import PARAMETERS, BeamCorrection, Calibration
 
 FloatArray = NDArray[np.float64]
 

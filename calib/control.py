@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, Swath, Tangent
 from swath.calib.local_plane import LocalPlane, PlaneRules, is_inside, robust_plane
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 
 FloatArray = NDArray[np.float64]
 

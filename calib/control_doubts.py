@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from swath.calib.control import ControlRules, Ground, grounds_at
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.georef.earth import geodetic_from_e
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.mapping.frame import Mapping, MappingError
 
 FloatArray = NDArray[np.float64]
 Undulation = Callable[[FloatArray], tuple[float, str] | None]  # of a position in e: metres, and by which geoid

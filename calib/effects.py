@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.beams import SpinningGeometry
-from swath.georef.calibration import INDEX, PARAMETERS
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.records import Int64Array
-from swath.georef.rotations import rot_from_quaternion
-from swath.georef.trajectory import Poses, Trajectory
+from swath.georef.scanner.beams import SpinningGeometry
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
+from swath.georef.trajectory.trajectory import Poses, Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Effect:
 
     Attributes:
         name: for people.
-        parameter: of the calibration that has it, SI (`swath.georef.calibration.PARAMETERS`).
+        parameter: of the calibration that has it, SI (`swath.georef.scanner.calibration.PARAMETERS`).
         factor, unit: of the report.
         look: of it in the strips.
         remedy: the flight line that shows it.

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.atmosphere import Air
-from swath.georef.beams import Geometry
-from swath.georef.calibration import Calibration
-from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
-from swath.georef.mount import Mount
+from swath.georef.air.atmosphere import Air
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.points import Fate, Rays
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import Geometry
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.mount import Mount
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 Rows = Any  # slice, index array or mask of a swath's returns
@@ -143,7 +143,7 @@ class Flight:
     swaths: tuple[Swath, ...]
 
     def rays(self, swath: Swath, calibration: Calibration, at: Rows = slice(None), *, with_axes: bool = True) -> Rays:
-        """Some of a swath's returns with a calibration: `swath.georef.sensor_model.SensorModel.rays`, air applied."""
+        """Some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model.SensorModel.rays`, air applied."""
         head, trajectory = self.heads[swath.head], self.trajectories[swath.flown]
         model = head.model(calibration)
         count = len(swath.time_ns[at])

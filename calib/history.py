@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.comparable import difference_between
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from swath.calib.effects import SeenFrom, effect_columns
 from swath.calib.flight import Flight, Swath
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ANGLES
-from swath.georef.calibration import PARAMETERS, Calibration
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from swath.calib.inverse import inverted, scales
 from swath.calib.row_tables import OF_PLANE
 from swath.calib.rows import Rows, SingleArray, State, tangents
 from swath.calib.tie_rows import Seen, Ties, covariance_t
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swath.calib.outcome import Held
 from swath.calib.report_words import sized
-from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 FloatArray = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.calibration import Calibration
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ class Held:
     """A parameter of the model that was not estimated.
 
     Attributes:
-        scanner, name: as ``left``, ``lever_arm_z_m`` (names of `swath.georef.calibration.PARAMETERS`).
+        scanner, name: as ``left``, ``lever_arm_z_m`` (names of `swath.georef.scanner.calibration.PARAMETERS`).
         why: in plain words, for people.
         remedy: the flight line or control that would determine it; empty where it was held at the user's word.
         sigma: with which this flight would have determined it, SI; inf: not at all.

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots, curve, nodes_of
 from swath.calib.outcome import Held
-from swath.georef.beams import OusterGeometry, SpinningGeometry
-from swath.georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
 from swath.georef.records import Int64Array
+from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
 
 FloatArray = NDArray[np.float64]
 

@@ -24,11 +24,11 @@ from swath.calib.plane_returns import RIM_M
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.solve import Settings
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.calibration import Calibration
+from swath.georef.geodesy.rotations import boresight, rot_from_quaternion
 from swath.georef.records import RETURN_DTYPE, Int64Array
-from swath.georef.rotations import boresight, rot_from_quaternion
+from swath.georef.scanner.calibration import Calibration
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from swath.calib.flight import Flight, Swath, sensor_t
 from swath.calib.plane_settings import PlaneSettings
 from swath.georef.records import Int64Array
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.uncertainty import Noise
 
 FloatArray = NDArray[np.float64]
 

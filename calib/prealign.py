@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from swath.calib.flight import Flight, Swath
 from swath.calib.height_grids import Lattice, Surface, surface
 from swath.calib.scale import Scale, area_spacing_m, scale_of
-from swath.georef.calibration import INDEX, Calibration
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import INDEX, Calibration
 
 FloatArray = NDArray[np.float64]
 

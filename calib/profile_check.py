@@ -34,7 +34,7 @@ from swath.calib.profile_influence import Influence, influence
 from swath.calib.profile_measure import KINDS, PARAMETER, Settings
 from swath.calib.profiles import MISSING, Profile, survey
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 FloatArray = NDArray[np.float64]
 

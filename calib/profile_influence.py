@@ -13,8 +13,8 @@ from swath.calib.profile_measure import PARAMETER, Ground
 from swath.calib.profile_sections import Corridor
 from swath.calib.profiles import Profile
 from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior
-from swath.georef.calibration import PARAMETERS, Calibration
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.profile_fit import TURNS, Fit, comparable, levers, solve, trajectory_sigmas
 from swath.calib.profile_places import SAMPLES, Place, Track
 from swath.calib.profile_sections import Corridor, Pieces, best_shift, fit_pieces, heights_by_bin
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

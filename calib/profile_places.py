@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath
 from swath.calib.profile_sections import Corridor
-from swath.georef.calibration import Calibration
 from swath.georef.points import Fate
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from swath.calib.profile_fit import levers, solve, trajectory_sigmas
 from swath.calib.profile_measure import Ground, Measured, Settings, part_of
 from swath.calib.profile_places import Track
 from swath.calib.profile_sections import Corridor, fit_pieces
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from swath.calib.profile_measure import KINDS, PARAMETER, Ground, Measured, Sett
 from swath.calib.profile_places import Place, Track, places, tracks_of
 from swath.calib.profile_sections import Corridor
 from swath.calib.profile_targets import measure_range
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from swath.calib.outcome import Adjusted, TrajectoryFit
 from swath.calib.record_matrices import matrices_of
 from swath.calib.record_values import Matrix, Value, utc_text
 from swath.calib.report_words import unknown
-from swath.georef.calibration import INDEX, Calibration
-from swath.georef.earth import geodetic_from_e
-from swath.georef.rotations import boresight
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.geodesy.rotations import boresight
+from swath.georef.scanner.calibration import INDEX, Calibration
 
 FloatArray = NDArray[np.float64]
 Found = dict[str, Value]

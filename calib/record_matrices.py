@@ -15,10 +15,10 @@ from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Residuals
 from swath.calib.record_values import Matrix
-from swath.georef.earth import geodetic_from_e, prime_vertical_radius_m, rot_e_from_l
-from swath.georef.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.geodesy.earth import geodetic_from_e, prime_vertical_radius_m, rot_e_from_l
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.records import Int64Array
-from swath.georef.rotations import attitude_of, rot_from_quaternion
+from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
 
 FloatArray = NDArray[np.float64]
 
@@ -73,11 +73,12 @@ def observed_of(flight: Flight, adjusted: Adjusted, scanner: str) -> Observed | 
 def matrices_of(flight: Flight, features: Features, adjusted: Adjusted, scanner: str) -> dict[str, Matrix]:
     """By attribute; nothing where there are no observations on planes.
 
-    designMatrix1 (n, 16): nᵀ ∂x/∂parameter in the order of `swath.georef.calibration.PARAMETERS`, SI. designMatrix2
-    (n, 4): ((x − c)ᵀ, 1), c the plane's centre, in e. designMatrixObservations (n, 8): nᵀ ∂x/∂observable in the order
-    of `swath.georef.jacobian.OBSERVATIONS`. residuals (n, 8): v = Σ Bᵀ e / M (FORMULAS 6.3) of range and scan angle;
-    the trajectory's are zero here, for its errors are unknowns of their own. designMatrixUnitLength (planes, 4):
-    (2 s1, 2 s2, 2 s3, 0). lidarPlaneParameters (planes, 4): unit normal in e, s4 = −n · c.
+    designMatrix1 (n, 16): nᵀ ∂x/∂parameter in the order of `swath.georef.scanner.calibration.PARAMETERS`, SI.
+    designMatrix2 (n, 4): ((x − c)ᵀ, 1), c the plane's centre, in e. designMatrixObservations (n, 8): nᵀ ∂x/∂observable
+    in the order of `swath.georef.scanner.jacobian.OBSERVATIONS`. residuals (n, 8): v = Σ Bᵀ e / M (FORMULAS 6.3) of
+    range and scan angle; the trajectory's are zero here, for its errors are unknowns of their own.
+    designMatrixUnitLength (planes, 4): (2 s1, 2 s2, 2 s3, 0). lidarPlaneParameters (planes, 4): unit normal in e, s4 =
+    −n · c.
     """
     found: dict[str, Matrix] = {}
     if features.planes:

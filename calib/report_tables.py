@@ -25,7 +25,7 @@ from swath.calib.report_words import (
     unknown,
     words_of,
 )
-from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from swath.calib.outcome import Held
-from swath.georef.calibration import PARAMETERS
+from swath.georef.scanner.calibration import PARAMETERS
 
 MINUS, THIN, SPACE = "−", "\u202f", "\u00a0"  # spaces at which no line ends
 _LABELS: dict[str, tuple[str, str]] = {  # words, symbol

@@ -12,14 +12,14 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.intensity_curve import at_knots, curve_by_knots
 from swath.calib.parameters import Unknowns
 from swath.calib.row_tables import Beam, Head, Looks, Sigmas
-from swath.georef.beams import OusterGeometry
-from swath.georef.calibration import Calibration
-from swath.georef.kernels.types import Track
+from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Rays, contiguous
 from swath.georef.records import Int64Array
-from swath.georef.rotations import rot_x, rot_y, rot_z
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import OusterGeometry
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.kernels.types import Track
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from swath.calib.row_tables import OF_PLANE, STATES, Beam, Head, Knots, Planes, Sigmas, Task
-from swath.georef.calibration import INDEX
 from swath.georef.compiled import kept, kernel
-from swath.georef.kernels.rotations import cross, dot, matrix_at, plus, rot_of, times, transposed_times, vector_at
-from swath.georef.kernels.types import FloatArray, Three, Track
+from swath.georef.geodesy.vectors import cross, dot, matrix_at, plus, rot_of, times, transposed_times, vector_at
 from swath.georef.records import Int64Array
-from swath.georef.trajectory import locate_epoch
+from swath.georef.scanner.calibration import INDEX
+from swath.georef.scanner.kernels.types import FloatArray, Three, Track
+from swath.georef.trajectory.trajectory import locate_epoch
 
 _LEAST_COSINE_2 = 0.01  # of the incidence: no footprint grows without end
 _FARTHEST = 4.0  # sigmas of f that may be errors of measurement; more is a start that is far off
@@ -223,7 +223,7 @@ def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, 
 
 @kernel
 def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int, argument: int, out: Any) -> None:
-    """One parameter's column (FORMULAS 5.2), as `swath.georef.jacobian.parameter_columns_e`."""
+    """One parameter's column (FORMULAS 5.2), as `swath.georef.scanner.jacobian.parameter_columns_e`."""
     outer, value = matrix_at(head.outer, 0), head.value
     if kind == OMEGA:
         for i in range(n):

@@ -27,11 +27,11 @@ from swath.calib.row_tables import Groups as GroupTable
 from swath.calib.row_tables import Knots as KnotTable
 from swath.calib.row_tables import Planes as PlaneTable
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.calibration import Calibration
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.points import contiguous
 from swath.georef.records import Int64Array
-from swath.georef.sensor_model import SensorModel
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.sensor_model import SensorModel
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]

@@ -22,10 +22,10 @@ from swath.calib.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns
 from swath.calib.flight import FlightError
 from swath.calib.strips import Checks
 from swath.calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.records import Int64Array
-from swath.georef.rotations import rot_from_quaternion
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from swath.calib.robust import HUBER, w_critical
 from swath.calib.rows import Rows, SingleArray, State
 from swath.calib.tie_rows import Ties
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -32,9 +32,9 @@ from swath.calib.parameters import Wish, unknowns
 from swath.calib.rows import Rows, SingleArray, State
 from swath.calib.tie_rows import Ties
 from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior, apply, knots_of
-from swath.georef.calibration import Calibration
 from swath.georef.records import Int64Array
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from swath.calib.row_inputs import new_looks
 from swath.calib.row_sums import MODE_GIVE, go_over
 from swath.calib.row_tables import Planes as PlaneTable
 from swath.calib.rows import Batch, Rows, Run, State
-from swath.georef.calibration import Calibration
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import Calibration
 
 FloatArray = NDArray[np.float64]
 

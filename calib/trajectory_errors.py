@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, FlightError
 from swath.calib.inverse import inverted
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.quaternions import product
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain
-from swath.georef.quaternions import product
 from swath.georef.records import Int64Array
-from swath.georef.rotations import attitude_of, rot_from_quaternion
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import Trajectory, gps_text
+from swath.georef.trajectory.trajectory import Trajectory, gps_text
 
 FloatArray = NDArray[np.float64]
 

@@ -29,8 +29,8 @@ from swath.calib.observability import RULES_OF_ALL
 from swath.calib.strips import Numbers
 from swath.calib.trajectory_errors import ERRORS, Taus, TrajectoryPrior, gauss_markov
 from swath.calib.validation_rows import Rows, control_rows, estimated_floor_m, plane_rows
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration
-from swath.georef.earth import geodetic_from_e
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -19,9 +19,9 @@ from swath.calib.features import ControlPoint, Features, Plane
 from swath.calib.flight import Flight
 from swath.calib.local_plane import LocalPlane, plane_through
 from swath.calib.trajectory_errors import ERRORS, TrajectoryPrior
-from swath.georef.calibration import INDEX, Calibration
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
+from swath.georef.scanner.calibration import INDEX, Calibration
 
 FloatArray = NDArray[np.float64]
 

@@ -14,14 +14,14 @@ from itertools import product as combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import geodetic_from_e
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.geodesy.gravity import gravity_e
+from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.gusts import gusts
-from swath.georef.navigation.gravity import gravity_e
-from swath.georef.quaternions import about, conjugate, product, rotated
 from swath.georef.records import FixType, Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
-from swath.georef.trajectory import EARTH_RATE_RADPS, Trajectory
-from swath.georef.trajectory_time import STEP_NS, Turning, turning
+from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS, Trajectory
+from swath.georef.trajectory.turn_rates import STEP_NS, Turning, turning
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 
 FloatArray = NDArray[np.float64]
 ToGrid = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]

@@ -1,15 +1,16 @@
 """From a scanner's returns to points on the map: the whole way, equation by equation.
 
-    sensor     x_s = ρ · (−sin Δη, sin θ cos Δη, cos θ cos Δη)                ISO/TS 19159-2 Eq. 14; swath.georef.beams
-    body       x_b = lever_arm_b + R(ω, φ, κ) · T · x_s                        Eq. 2, 15; NGA Eq. 3 with a gimbal
-    earth      x_e = x_b^e + rot_e_from_l · rot_l_from_b · x_b                 Eq. 10; Eq. 3, 4, 7 in the trajectory
-    air        ρ by the group index, the beam bent towards the nadir           NGA Eq. 4 to 11; swath.georef.atmosphere
-    map        x_m = projection and heights of x_e, by PROJ                    Eq. 8; swath.georef.mapping
-    sigmas     C_m = J C Jᵀ of trajectory, range, angle and calibration        Eq. 13, 14; swath.georef.uncertainty
+    sensor     x_s = ρ · (−sin Δη, sin θ cos Δη, cos θ cos Δη)                ISO/TS 19159-2 Eq. 14;
+    swath.georef.scanner.beams body       x_b = lever_arm_b + R(ω, φ, κ) · T · x_s                        Eq. 2, 15;
+    NGA Eq. 3 with a gimbal earth      x_e = x_b^e + rot_e_from_l · rot_l_from_b · x_b                 Eq. 10; Eq. 3,
+    4, 7 in the trajectory air        ρ by the group index, the beam bent towards the nadir           NGA Eq. 4 to 11;
+    swath.georef.air.atmosphere map        x_m = projection and heights of x_e, by PROJ                    Eq. 8;
+    swath.georef.mapping.frame sigmas     C_m = J C Jᵀ of trajectory, range, angle and calibration        Eq. 13, 14;
+    swath.georef.scanner.uncertainty
 
-The first three are one pass (`swath.georef.sensor_model`, `swath.georef.kernels.rays`). Returns are taken in blocks,
-so that what is between two steps stays in the processor's cache; a point depends on its return and the trajectory
-alone.
+The first three are one pass (`swath.georef.scanner.sensor_model`, `swath.georef.scanner.kernels.rays`). Returns are
+taken in blocks, so that what is between two steps stays in the processor's cache; a point depends on its return and
+the trajectory alone.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.encoder_motion import TellsMotion
-from swath.georef.kernels.columns import fill_columns
-from swath.georef.kernels.types import PointColumns
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import ByteArray, Fate, Points, Rays, contiguous
-from swath.georef.ranging import PulseRates
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Uncertainty
+from swath.georef.scanner.encoder_motion import TellsMotion
+from swath.georef.scanner.kernels.columns import fill_columns
+from swath.georef.scanner.kernels.types import PointColumns
+from swath.georef.scanner.ranging import PulseRates
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Uncertainty
+from swath.georef.trajectory.trajectory import Trajectory
 
 BLOCK_ROWS = 8192
 

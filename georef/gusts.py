@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.timescales.gps_time import SECOND_NS
-from swath.georef.trajectory_time import REACH_STEPS, STEP_NS
+from swath.georef.trajectory.turn_rates import REACH_STEPS, STEP_NS
 
 FloatArray = NDArray[np.float64]
 

@@ -118,7 +118,7 @@ def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:
 
 
 def _scanner_of(text: str, file: Path) -> str:
-    from swath.georef.calibration import CalibrationError, read_calibration
+    from swath.georef.scanner.calibration import CalibrationError, read_calibration
 
     try:
         return read_calibration(text, str(file)).scanner

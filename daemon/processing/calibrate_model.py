@@ -11,7 +11,7 @@ from pathlib import Path
 from swath.calib.parameters import MODELS, Wish
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.model_file import SUFFIX, ModelTables, read_model
-from swath.georef.calibration import PARAMETERS
+from swath.georef.scanner.calibration import PARAMETERS
 
 FREE, FIXED = "free", "fixed"
 # of keys in files the names here, and SI units a unit of the key

@@ -39,7 +39,7 @@ from swath.daemon.processing.navigation_verdict import Level
 from swath.daemon.processing.sidecar import sha256_of
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from swath.daemon.processing.trajectory_files import write_whole
-from swath.georef.calibration import INDEX, PARAMETERS
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 MAP_CELLS = 400  # across a map of differences

@@ -53,10 +53,10 @@ from swath.daemon.processing.flights import Wish, trajectory_verdicts_of
 from swath.daemon.processing.strips_run import refuse_installations
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.text_files import text_of
-from swath.georef.calibration import Calibration
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
+from swath.georef.scanner.calibration import Calibration
 from swath.georef.strips import StripError
-from swath.georef.trajectory import TrajectoryError
+from swath.georef.trajectory.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best

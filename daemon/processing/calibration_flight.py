@@ -27,14 +27,14 @@ from swath.daemon.processing.flights import Wish, note_times, read_flights
 from swath.daemon.processing.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
 from swath.daemon.processing.models import motion_of
 from swath.daemon.processing.workers import run_jobs
-from swath.georef.calibration import Calibration
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import ByteArray, Fate, Points
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
-from swath.georef.stream import GivenMotion
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.stream.stream import GivenMotion
 from swath.georef.strips import Segment, segments
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from swath.georef.navigation.cross_covariance import ErrorChain

@@ -22,13 +22,13 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibrate_model import of_parameters, tables_in_words
 from swath.daemon.processing.calibrate_run import EVERY, PLANES
 from swath.daemon.processing.planned_navigation import navigated
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import PARAMETERS, read_calibration
+from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.navigation.inputs import NavigationError
-from swath.georef.rotations import quaternion_from_rot
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import PARAMETERS, read_calibration
+from swath.georef.scanner.uncertainty import Noise
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.calibration_files import calibration_text
 from swath.sim.coverage import Survey, control_points, fan_of
 from swath.sim.plan import Plan

@@ -14,13 +14,13 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.navigation_figures import figures_of
 from swath.daemon.processing.navigation_series import Flight, separation_of
 from swath.daemon.processing.navigation_verdict import Level, judge
-from swath.georef.calibration import INDEX
+from swath.georef.scanner.calibration import INDEX
 
 if TYPE_CHECKING:
     from swath.daemon.processing.navigate import Navigated
     from swath.daemon.processing.setup import Setup
-    from swath.georef.calibration import Calibration
-    from swath.georef.trajectory import Trajectory
+    from swath.georef.scanner.calibration import Calibration
+    from swath.georef.trajectory.trajectory import Trajectory
 
 LEVELS = {level.words: level for level in Level}
 OF_TRAJECTORY, OF_POINTS = "swath.trajectory", "swath.georef"  # formats of summaries and sidecars

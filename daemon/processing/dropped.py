@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.georeference import Georeferencer
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
 from swath.georef.points import FATE_NAMES, ByteArray, Fate, Points
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.stream import Stream
-from swath.georef.trajectory import Trajectory
+from swath.georef.stream.stream import Stream
+from swath.georef.trajectory.trajectory import Trajectory
 
 BoolArray = NDArray[np.bool_]
 LIFTED_GATE_M = (0.0, 100_000.0)  # the least and the greatest that range_min_m and range_max_m can be

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.processing.navigation_inputs import Mark
 from swath.georef.points import Fate
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -24,7 +24,6 @@ from swath.daemon.processing.models import connect
 from swath.daemon.processing.setup import Setup
 from swath.daemon.replay import source_of_topic
 from swath.drivers.core.parser import Parser
-from swath.georef.mount import AngleSeries, MountError
 from swath.georef.points import Points
 from swath.georef.records import (
     IMU_DTYPE,
@@ -40,9 +39,10 @@ from swath.georef.records import (
     StructArray,
     TimeMessage,
 )
-from swath.georef.stream import CONTEXT_FLAG, Stream, StreamSettings
-from swath.georef.stream_clocks import FrozenClocks, HostClocks
-from swath.georef.trajectory_buffer import SOLUTION_STATUS
+from swath.georef.scanner.mount import AngleSeries, MountError
+from swath.georef.stream.clocks import FrozenClocks, HostClocks
+from swath.georef.stream.stream import CONTEXT_FLAG, Stream, StreamSettings
+from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
 if TYPE_CHECKING:
     from swath.daemon.processing.navigator import Navigator

@@ -28,7 +28,7 @@ from swath.daemon.processing.setup import Options, Setup
 from swath.daemon.processing.workers import refuse_in_import
 from swath.daemon.text_files import text_of
 from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Callable

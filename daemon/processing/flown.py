@@ -12,9 +12,9 @@ from swath.daemon.processing.given_trajectory import Given, judge_given, points_
 from swath.daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
 from swath.daemon.processing.trajectory_files import smrmsg_beside
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.stream_path import SHORTEST_TRAJECTORY
-from swath.georef.trajectory import Trajectory, TrajectoryError
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.stream.path import SHORTEST_TRAJECTORY
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
@@ -58,7 +58,7 @@ class Chosen:
     Attributes:
         trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
         doubts: about it, a line each.
-        solutions: of the device's INS, by what became of them (`swath.georef.trajectory_buffer`); none of a file.
+        solutions: of the device's INS, by what became of them (`swath.georef.trajectory.buffer`); none of a file.
         navigated: what it was smoothed from; None: it comes from elsewhere.
     """
 

@@ -20,8 +20,8 @@ from swath.georef.agreement import (
     heading_offset,
     time_that_explains,
 )
-from swath.georef.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
-from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.mapping.datums import MappingError, between_datums, datum_that_explains, read_source, read_target
 from swath.georef.navigation.inputs import Kind
 from swath.georef.records import StructArray
 from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_from_gps
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from swath.daemon.processing.feed import LogClocks
     from swath.daemon.processing.setup import Setup
-    from swath.georef.trajectory import Trajectory
+    from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from swath.georef.records import (
     StructArray,
     TimeMessage,
 )
-from swath.georef.stream_clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
+from swath.georef.stream.clocks import DevicePlan, FrozenClocks, HeadTime, HostClocks
 from swath.georef.timescales import (
     SECOND_NS,
     Stamps,

@@ -11,8 +11,8 @@ from swath.daemon.processing.feed import read_clocks
 from swath.daemon.processing.navigation_log import session_holes
 from swath.daemon.processing.navigation_sources import config_of_log, files_of, without_scanners
 from swath.daemon.processing.setup import Options, Setup
-from swath.georef.trajectory import Trajectory
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from swath.daemon.config.config import Config

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.geodesy.quaternions import conjugate, rotated
 from swath.georef.points import Fate
-from swath.georef.quaternions import conjugate, rotated
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -28,15 +28,15 @@ from swath.daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, rea
 from swath.daemon.processing.setup import Setup
 from swath.daemon.processing.unread import Unread
 from swath.daemon.replay import source_of_topic
-from swath.georef.earth import geodetic_from_e
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import Clipped, LasError, LasSettings, LasWriter
-from swath.georef.mapping import MappingError
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.mapping.frame import MappingError
 from swath.georef.points import Fate, Points
 from swath.georef.records import ChunkBatch, ScannerReturns
-from swath.georef.stream_clocks import FrozenClocks
+from swath.georef.stream.clocks import FrozenClocks
 from swath.georef.strips import Segment
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 MARGIN_NS = 5_000_000_000  # of log time read on either side: edges a device latched, revolutions, pulses in air
 BETWEEN_STRIPS = "between_strips"

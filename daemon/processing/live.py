@@ -27,7 +27,7 @@ from swath.daemon.processing.live_status import LiveStatus, sentence, write_stat
 from swath.daemon.processing.setup import Options, Setup
 from swath.daemon.run import read_boot_id
 from swath.georef.records import StructArray
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FOLDER = "live"  # in the log directory
 POLL_S = 0.05

@@ -11,8 +11,8 @@ from pyproj import CRS
 
 from swath.daemon.processing.live_mcap import CLOUD_DTYPE
 from swath.georef.compiled import kept
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.kernels.rotations import rot_of
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.vectors import rot_of
 from swath.georef.points import Points
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +25,7 @@ _ENU_SIGNS = np.array([1.0, 1.0, -1.0])
 
 
 class Maps(Protocol):
-    """`swath.georef.mapping.Mapping`, as far as it is wanted here."""
+    """`swath.georef.mapping.frame.Mapping`, as far as it is wanted here."""
 
     @property
     def unit_m(self) -> FloatArray:

@@ -25,10 +25,10 @@ from swath.daemon.processing.live_frame import LocalFrame, Maps
 from swath.daemon.processing.live_grid import CountGrid
 from swath.daemon.processing.live_mcap import NAME, LiveMcap, LivePose
 from swath.georef.compiled import kept
-from swath.georef.earth import geodetic_from_e
+from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 POSE_NS = 100_000_000  # between two poses
 ROOM_AGAIN = 1.05  # of the free space at which writing stopped: where it begins again

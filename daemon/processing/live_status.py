@@ -19,7 +19,7 @@ from swath.daemon.processing.refusals import time_trouble
 from swath.daemon.processing.setup import Setup
 from swath.daemon.replay import source_of_topic
 from swath.georef.points import FATE_NAMES
-from swath.georef.stream import Stream
+from swath.georef.stream.stream import Stream
 
 STATUS = "live.json"
 WINDOW_S = 10.0  # of which latencies are told

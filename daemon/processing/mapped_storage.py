@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.navigation.stores import Storage
+from swath.georef.navigation.filter.stores import Storage
 
 SMALLEST_BYTES = 1 << 20  # smaller arrays are kept in memory
 

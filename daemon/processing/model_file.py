@@ -25,7 +25,7 @@ from swath.daemon.config.loading import describe, shown
 from swath.daemon.config.tables import Section
 from swath.daemon.errors import ConfigError
 from swath.daemon.text_files import text_of
-from swath.georef.calibration import MOST, PARAMETERS
+from swath.georef.scanner.calibration import MOST, PARAMETERS
 from swath.georef.toml_tables import TomlError, toml_tables
 
 SUFFIX = ".toml"

@@ -15,22 +15,22 @@ from swath.drivers.core.registry import find_driver
 from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.ouster_head import OusterHead
 from swath.drivers.scanner.srep import SrepParser
-from swath.georef.atmosphere import Air
-from swath.georef.beams import Geometry, OusterGeometry, SpinningGeometry, line_scanner, read_fibres
-from swath.georef.calibration import Calibration
+from swath.georef.air.atmosphere import Air
 from swath.georef.coarse_terrain import CoarseTerrain
-from swath.georef.encoder_motion import EncoderMotion
 from swath.georef.georeference import Georeferencer
-from swath.georef.mapping import Mapping
-from swath.georef.mount import AngleSeries, Mount, Stage
+from swath.georef.mapping.frame import Mapping
 from swath.georef.points import Fate
-from swath.georef.ranging import PulseRates, ZoneResolver
 from swath.georef.records import InsSolution, Int64Array, StructArray
-from swath.georef.sensor_model import FloatArray, SensorModel
-from swath.georef.stream import GivenMotion, ScannerChain
+from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry, line_scanner, read_fibres
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.encoder_motion import EncoderMotion
+from swath.georef.scanner.mount import AngleSeries, Mount, Stage
+from swath.georef.scanner.ranging import PulseRates, ZoneResolver
+from swath.georef.scanner.sensor_model import FloatArray, SensorModel
+from swath.georef.scanner.uncertainty import Noise, Uncertainty
+from swath.georef.stream.stream import GivenMotion, ScannerChain
 from swath.georef.text_encoding import decoded
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise, Uncertainty
+from swath.georef.trajectory.trajectory import Trajectory
 
 USUAL_WAVELENGTH_NM = 1064.0  # of airborne scanners
 INSTALLATION_TOLERANCE = 1e-6
@@ -207,7 +207,7 @@ def motion_of(table: ScannerConfig) -> EncoderMotion:
 
 
 class TerrainRanges:
-    """Ranges that a terrain model expects of a scanner's beams: `swath.georef.stream.ScannerChain.predict`."""
+    """Ranges that a terrain model expects of a scanner's beams: `swath.georef.stream.stream.ScannerChain.predict`."""
 
     def __init__(self, model: SensorModel, terrain: CoarseTerrain) -> None:
         self._terrain = terrain

@@ -17,6 +17,7 @@ from swath.daemon.processing.mapped_storage import MappedStorage
 from swath.daemon.processing.navigation_inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
 from swath.daemon.processing.navigation_sources import noise_of
 from swath.daemon.processing.navigation_times import Stretch
+from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import (
     GRADES,
     OBSERVATION_DTYPE,
@@ -25,13 +26,12 @@ from swath.georef.navigation.inputs import (
     Solution,
     sort_observations,
 )
-from swath.georef.navigation.stores import IN_MEMORY, Storage
 from swath.georef.records import FixType, StructArray
-from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 if TYPE_CHECKING:
-    from swath.georef.navigation.diagnosis import Finding
+    from swath.georef.navigation.diagnosis.diagnose import Finding
     from swath.georef.navigation.inputs import Setup, Start
     from swath.georef.navigation.solve import Solved
 
@@ -186,9 +186,9 @@ def navigate_inputs(
 
 
 def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: Storage) -> NavigatedLeg:
-    from swath.georef.navigation.alignment import align
-    from swath.georef.navigation.diagnosis import diagnose
-    from swath.georef.navigation.earlier_start import earlier_start
+    from swath.georef.navigation.alignment.align import align
+    from swath.georef.navigation.alignment.earlier_start import earlier_start
+    from swath.georef.navigation.diagnosis.diagnose import diagnose
     from swath.georef.navigation.solve import solve, stretch_of
     from swath.georef.navigation.stillness import with_still_seconds
     from swath.georef.navigation.unit_noise import noise_findings
@@ -211,7 +211,7 @@ def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: 
 
 def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
     """What is wrong with a leg's data that gave no start."""
-    from swath.georef.navigation.diagnosis import diagnose
+    from swath.georef.navigation.diagnosis.diagnose import diagnose
 
     found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
     return [f"{inputs.log}: {finding.text}" for finding in found]

@@ -14,11 +14,11 @@ from swath.daemon.processing.navigation_log import NavigationLog
 from swath.daemon.processing.navigation_observations import Observed
 from swath.daemon.processing.navigation_sources import NavigationSources
 from swath.daemon.processing.navigation_times import ImuTimes
-from swath.georef.earth import e_from_geodetic
-from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.inputs import Inertial, Kind
 from swath.georef.records import StructArray
-from swath.georef.trajectory import gps_text
+from swath.georef.trajectory.trajectory import gps_text
 
 FEWEST_HEIGHTS = 10
 TIME_IS_KNOWN_S = 1e-4  # a better time of the IMU's samples needs no offset to be found: 6 mm at 60 m/s

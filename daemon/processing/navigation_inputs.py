@@ -39,13 +39,13 @@ from swath.daemon.processing.outside_positions import (
     refuse_unreadable,
 )
 from swath.daemon.processing.refusals import refuse_no_time
-from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.diagnosis.data import Finding
+from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import Inertial, Kind, NavigationError, Setup
 from swath.georef.navigation.samples import Sampler
-from swath.georef.navigation.stores import IN_MEMORY, Storage
 from swath.georef.records import EventMark, GnssFix, GnssHeading, StructArray, TimeTag
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory_buffer import SOLUTION_STATUS
+from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
 if TYPE_CHECKING:
     from swath.daemon.config.config import Config

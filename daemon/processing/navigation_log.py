@@ -27,7 +27,7 @@ from swath.georef.records import (
     StructArray,
     TimeMessage,
 )
-from swath.georef.stream_clocks import HostClocks
+from swath.georef.stream.clocks import HostClocks
 
 if TYPE_CHECKING:
     from swath.daemon.log.chunks import LogBatch

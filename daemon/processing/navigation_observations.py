@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic
-from swath.georef.navigation.alignment_noise import white_factor
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
 from swath.georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
-from swath.georef.stream_clocks import HostClocks
+from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import complete_time
 
 FloatArray = NDArray[np.float64]

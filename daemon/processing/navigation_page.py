@@ -32,7 +32,7 @@ from swath.daemon.processing.navigation_sheet import NARROW, WIDE, Drawn, Format
 from swath.daemon.processing.navigation_verdict import Found, Level, Verdict, judge
 from swath.daemon.processing.quicklook_maps import thousands
 from swath.daemon.processing.quicklook_page import STYLE
-from swath.georef.trajectory import gps_text
+from swath.georef.trajectory.trajectory import gps_text
 
 MOST_REASONS = 40
 NARROW_PX = 640  # of the window, up to which the narrow pictures are shown

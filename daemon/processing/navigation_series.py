@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.navigation.inputs import Fate, Kind, Setup, Solution
-from swath.georef.quaternions import about, conjugate, product, rotated
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

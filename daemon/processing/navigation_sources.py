@@ -21,7 +21,7 @@ from swath.daemon.processing.setup import Setup as PointSetup
 from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.drivers.core.registry import UnknownProtocolError, find_driver
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
-from swath.georef.stream_clocks import ClockPlan, DevicePlan
+from swath.georef.stream.clocks import ClockPlan, DevicePlan
 
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.records import DEVICE_CLOCK_DTYPE, Int64Array, StructArray
-from swath.georef.stream_clocks import HostClocks
+from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
-from swath.georef.trajectory import gps_text
+from swath.georef.trajectory.trajectory import gps_text
 
 GREATEST_SIGMA_NS = 1e9  # of a time that is of any use: an offset of this size can still be found
 PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is taken to have missed samples

@@ -81,7 +81,7 @@ class Rule:
 
 
 class Found(Protocol):
-    """A finding of `swath.georef.navigation.diagnosis`."""
+    """A finding of `swath.georef.navigation.diagnosis.diagnose`."""
 
     @property
     def code(self) -> str: ...

@@ -21,9 +21,10 @@ from swath.daemon.processing.navigation_observations import (
     heading_times,
 )
 from swath.daemon.processing.navigation_sources import NavigationSources
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.alignment import Aligner
-from swath.georef.navigation.filter import NavigationFilter
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
+from swath.georef.navigation.alignment.align import Aligner
+from swath.georef.navigation.filter.filter import NavigationFilter
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
 from swath.georef.navigation.samples import Sampler
 from swath.georef.records import (
@@ -37,13 +38,12 @@ from swath.georef.records import (
     Record,
     StructArray,
 )
-from swath.georef.rotations import attitude_of, rot_from_quaternion
 from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 if TYPE_CHECKING:
     from swath.daemon.config.config import Config
-    from swath.georef.navigation.filter_types import Path
-    from swath.georef.stream_clocks import StreamClocks
+    from swath.georef.navigation.filter.types import Path
+    from swath.georef.stream.clocks import StreamClocks
 
 HOLD_S = 0.3  # fixes come so much later than the samples of their time, at most
 TIME_WAIT_NS = 5 * SECOND_NS  # for a clock that is not known yet

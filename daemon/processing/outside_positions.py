@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.navigation_observations import DEFAULT_SIGMAS, Observed
-from swath.georef.earth import e_from_geodetic
 from swath.georef.formats.antenna_positions import read_antenna_positions
 from swath.georef.formats.trajectory_columns import TrajectoryColumns
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.navigation.filter.measurements import POSITION_FLOORS_M
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
-from swath.georef.navigation.measurements import POSITION_FLOORS_M
 from swath.georef.records import FixType, StructArray
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import TrajectoryError, gps_text
+from swath.georef.trajectory.trajectory import TrajectoryError, gps_text
 
 FEWEST_SHIFTED = 10
 MOST_SHIFT_S = 40  # TAI is 37 s from UTC, 19 s from GPS time

@@ -18,9 +18,9 @@ from swath.calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.processing.navigation_observations import heading_observations
 from swath.daemon.processing.navigation_sources import filter_setup, noise_of
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.cross_covariance import error_chain
-from swath.georef.navigation.filter import FilterRun
+from swath.georef.navigation.filter.filter import FilterRun
 from swath.georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     Inertial,

@@ -34,7 +34,7 @@ from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.processing.workers import run_jobs
 from swath.drivers.core.registry import find_driver
 from swath.georef.formats.las import LasSettings
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import Segment, StripError, segments
 from swath.georef.timescales.gps_time import table_leap_seconds, utc_from_gps
 

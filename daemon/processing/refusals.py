@@ -14,8 +14,8 @@ from pyproj import CRS
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.georef.points import Fate
 from swath.georef.timescales import StampScale, TimeState
-from swath.georef.trajectory import gps_text
-from swath.georef.trajectory_buffer import COLUMNS
+from swath.georef.trajectory.buffer import COLUMNS
+from swath.georef.trajectory.trajectory import gps_text
 
 if TYPE_CHECKING:
     from swath.daemon.config.config import Config
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from swath.daemon.processing.flights import Flight
     from swath.daemon.processing.setup import Options
     from swath.georef.timescales import ClockStatus, Stamps
-    from swath.georef.trajectory import Trajectory
+    from swath.georef.trajectory.trajectory import Trajectory
 
 Span = tuple[int, int]
 NO_TIME = Fate.NO_TIME.name.lower()
@@ -297,7 +297,7 @@ def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, lo
     """
     if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
         return []
-    from swath.georef.trajectory_time import correlate_turn_rates  # scipy.signal, which takes seconds to load
+    from swath.georef.trajectory.turn_rates import correlate_turn_rates  # scipy.signal, which takes seconds to load
 
     shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
     if shift.is_wrong:

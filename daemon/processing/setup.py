@@ -31,19 +31,19 @@ from swath.daemon.processing.models import (
 from swath.daemon.processing.terrain import terrain_of
 from swath.drivers.core.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
 from swath.drivers.core.registry import UnknownProtocolError, find_driver
-from swath.georef.calibration import Calibration, CalibrationError, nominal, read_calibration
 from swath.georef.coarse_terrain import CoarseTerrain
-from swath.georef.mapping import Mapping as MappingFrame
-from swath.georef.mapping import MappingError
-from swath.georef.mount import AngleSeries
+from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
+from swath.georef.mapping.frame import Mapping as MappingFrame
+from swath.georef.mapping.frame import MappingError
 from swath.georef.records import InsSolution, NamesEdge, StructArray
-from swath.georef.rotations import attitude_of, rot_l_from_b
-from swath.georef.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
-from swath.georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
+from swath.georef.scanner.calibration import Calibration, CalibrationError, nominal, read_calibration
+from swath.georef.scanner.mount import AngleSeries
+from swath.georef.stream.clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, PpsPlan, StreamClocks
+from swath.georef.stream.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
 from swath.georef.text_encoding import decoded
 from swath.georef.timescales import StampScale
-from swath.georef.trajectory import Trajectory
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory
 
 SECOND_NS = 1_000_000_000
 ARCSEC = math.pi / 648_000

@@ -16,14 +16,14 @@ from swath.daemon.processing.carried_verdict import trajectory_entry
 from swath.daemon.processing.models import air_of
 from swath.daemon.processing.trajectory_files import write_whole
 from swath.daemon.processing.unread import unread_lines
-from swath.georef.calibration import PARAMETERS
 from swath.georef.points import Fate
+from swath.georef.scanner.calibration import PARAMETERS
 
 if TYPE_CHECKING:
     from swath.daemon.processing.flights import Flight
     from swath.daemon.processing.jobs import JobResult
     from swath.daemon.processing.setup import Setup
-    from swath.georef.calibration import Calibration
+    from swath.georef.scanner.calibration import Calibration
 
 FORMAT = "swath.georef"
 FORMAT_VERSION = 1

@@ -24,7 +24,7 @@ from swath.daemon.processing.sidecar import sha256_of
 from swath.daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, files_of
 from swath.daemon.processing.trajectory_files import gone_on_failure, put_in_place, write_aside, write_trajectory
 from swath.daemon.processing.trajectory_summary import write_json
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

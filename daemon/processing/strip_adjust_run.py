@@ -44,9 +44,9 @@ from swath.daemon.processing.strip_agreement import FlightStrips, before_and_aft
 from swath.daemon.processing.strips_run import is_of_logs, refuse_installations
 from swath.daemon.processing.trajectory_files import TrajectoryFiles
 from swath.daemon.processing.user_errors import told_in_a_line
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError as StripTimesError
-from swath.georef.trajectory import TrajectoryError
+from swath.georef.trajectory.trajectory import TrajectoryError
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
 

@@ -28,7 +28,7 @@ from swath.daemon.processing.quicklook_strips import (
     compare,
     strip_frame,
 )
-from swath.georef.mapping import Mapping
+from swath.georef.mapping.frame import Mapping
 
 FloatArray = NDArray[np.float64]
 

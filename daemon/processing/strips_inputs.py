@@ -38,10 +38,10 @@ from swath.daemon.processing.quicklook_strips import FEWEST_RETURNS, TILE
 from swath.daemon.processing.strip_agreement import compare_flight, corners_of
 from swath.georef.formats.trajectory_columns import LATEST_NS
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import WEEK_NS
-from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
 FloatArray = NDArray[np.float64]
 Told = Callable[[str, int, int], None]

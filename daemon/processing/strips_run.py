@@ -21,7 +21,7 @@ from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strip_agreement import Agreement, difference_of
 from swath.daemon.processing.strips_inputs import Strips, strips_of_files, strips_of_flight
 from swath.daemon.processing.user_errors import told_in_a_line
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError
 
 Told = Callable[[str, int, int], None]

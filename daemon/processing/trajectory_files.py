@@ -21,7 +21,7 @@ from swath.daemon.log.durable import try_sync_directory
 from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

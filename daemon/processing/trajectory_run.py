@@ -27,7 +27,7 @@ from swath.daemon.processing.trajectory_files import (
 )
 from swath.daemon.processing.trajectory_summary import pages_of, summary_head, summary_of_run, write_json
 from swath.daemon.processing.user_errors import told_in_a_line
-from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 Written = list[tuple[Path, Path]]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from swath.daemon.processing.event_marks import EventTable
     from swath.daemon.processing.navigate import Navigated, NavigatedLeg
     from swath.daemon.processing.trajectory_run import TrajectoryWish
-    from swath.georef.navigation.diagnosis import Finding
+    from swath.georef.navigation.diagnosis.diagnose import Finding
     from swath.georef.navigation.inputs import Setup, Start
 
 FORMAT = "swath.trajectory"

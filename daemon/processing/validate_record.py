@@ -12,7 +12,7 @@ from swath.calib.record_values import Plain
 from swath.calib.validation import Validation
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.text_files import text_of
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 
 
 @dataclass(frozen=True)

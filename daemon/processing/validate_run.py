@@ -35,8 +35,8 @@ from swath.daemon.processing.trajectory_files import write_whole
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.processing.validate_record import record_files, records_of
 from swath.daemon.text_files import text_of
-from swath.georef.calibration import Calibration, CalibrationError, read_calibration
-from swath.georef.mapping import MappingError
+from swath.georef.mapping.frame import MappingError
+from swath.georef.scanner.calibration import Calibration, CalibrationError, read_calibration
 from swath.georef.strips import StripError
 from swath.georef.text_encoding import decoded
 

@@ -12,13 +12,13 @@ from swath.calib.parameters import Wish
 from swath.calib.plane_matching import rematch
 from swath.calib.plane_search import find_planes
 from swath.calib.trajectory_errors import gauss_markov
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import nominal
-from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.records import RETURN_DTYPE
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.uncertainty import Noise
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 START_NS = 1_465_000_000 * SECOND_NS
 SECONDS, APART_S = 4, 60

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic
-from swath.georef.navigation.alignment import Aligner
-from swath.georef.navigation.filter import NavigationFilter, run_filter
-from swath.georef.navigation.gravity import gravity_e
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.geodesy.gravity import gravity_e
+from swath.georef.navigation.alignment.align import Aligner
+from swath.georef.navigation.filter.filter import NavigationFilter, run_filter
+from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, sort_observations
-from swath.georef.navigation.smoother import forward, smooth
 from swath.georef.records import FixType, StructArray
 from swath.georef.timescales import SECOND_NS
 

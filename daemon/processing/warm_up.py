@@ -57,7 +57,7 @@ from swath.georef.records import (
     TimeTag,
 )
 from swath.georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 COMPILE_EVENT = "numba:compile"
 ROWS = 500

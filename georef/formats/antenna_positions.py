@@ -9,7 +9,7 @@ from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, tra
 from swath.georef.formats.trajectory_csv import is_csv
 from swath.georef.formats.waypoint import is_waypoint, read_waypoint
 from swath.georef.text_encoding import decoded
-from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
+from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError
 
 
 def read_antenna_positions(

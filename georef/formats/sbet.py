@@ -27,10 +27,10 @@ from swath.georef.formats.trajectory_columns import (
     placed_in_week,
     unsaid,
 )
-from swath.georef.quaternions import conjugate, rotated
+from swath.georef.geodesy.quaternions import conjugate, rotated
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
-from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from swath.georef.timescales.gps_time import (
     WEEK_NS,
     table_leap_seconds,
 )
-from swath.georef.trajectory import TrajectoryError
+from swath.georef.trajectory.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic
-from swath.georef.quaternions import about, conjugate, product, rotated
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
-from swath.georef.trajectory import Trajectory, TrajectoryError, gps_text
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
 FloatArray = NDArray[np.float64]
 Span = tuple[int, int]

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import meridian_radius_m, prime_vertical_radius_m
 from swath.georef.formats.trajectory_columns import TrajectoryColumns, unsaid
-from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.geodesy.earth import meridian_radius_m, prime_vertical_radius_m
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from swath.georef.formats.trajectory_csv import is_csv, read_csv
 from swath.georef.formats.waypoint import is_waypoint, read_waypoint
 from swath.georef.text_encoding import decoded, encoding_of
 from swath.georef.timescales.gps_time import SECOND_NS
-from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
+from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory, TrajectoryError
 
 LOOKED_AT = 65_536  # bytes that tell text from numbers
 

@@ -25,7 +25,7 @@ from swath.georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, l
 from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, continuous_of_week, placed_in_week
 from swath.georef.records import FixType, Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S
-from swath.georef.trajectory import TrajectoryError
+from swath.georef.trajectory.trajectory import TrajectoryError
 
 FloatArray = NDArray[np.float64]
 

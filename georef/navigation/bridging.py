@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.compiled import kept, kernel
-from swath.georef.navigation.strapdown import Samples
+from swath.georef.navigation.filter.strapdown import Samples
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

@@ -1,8 +1,8 @@
 """How the smoothed trajectory's errors at different moments go together: their joint covariance.
 
-In the adjoint form of the smoother (`swath.georef.navigation.smoother`) the smoothed error at node j is s_j = e_j −
-P_j λ_j with e_j the filter's own. λ_j is made of innovations, to which no smoothed error is correlated, so that for j
-before k
+In the adjoint form of the smoother (`swath.georef.navigation.filter.smoother`) the smoothed error at node j is s_j =
+e_j − P_j λ_j with e_j the filter's own. λ_j is made of innovations, to which no smoothed error is correlated, so that
+for j before k
 
     cov(s_j, s_k) = cov(e_j, s_k) = P_j Ψᵀ (I − Λ_k P_k)        Ψ = A_k … A_j+1        A = ∏ (I − K h) · Φ
 
@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.error_model import E_ATTITUDE, E_POSITION, MOVED
-from swath.georef.navigation.filter import FilterRun
-from swath.georef.navigation.filter_types import Nodes
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.filter.error_model import E_ATTITUDE, E_POSITION, MOVED
+from swath.georef.navigation.filter.filter import FilterRun
+from swath.georef.navigation.filter.strapdown import VELOCITY
+from swath.georef.navigation.filter.types import Nodes
 from swath.georef.navigation.inputs import NavigationError
-from swath.georef.navigation.strapdown import VELOCITY
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

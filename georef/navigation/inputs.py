@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
+from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

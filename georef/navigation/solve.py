@@ -14,18 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
-from swath.georef.navigation.error_model import MOVED
-from swath.georef.navigation.filter import FilterRun, run_filter, start_state
+from swath.georef.navigation.filter.error_model import MOVED
+from swath.georef.navigation.filter.filter import FilterRun, run_filter, start_state
+from swath.georef.navigation.filter.smoother import SmoothedNodes, difference, forward, smooth_nodes, solution_of
+from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
+from swath.georef.navigation.filter.strapdown import ATTITUDE, TIME_OFFSET
 from swath.georef.navigation.heading_noise import find_heading_noise
 from swath.georef.navigation.inputs import Inertial, Setup, Solution, Start
 from swath.georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
-from swath.georef.navigation.smoother import SmoothedNodes, difference, forward, smooth_nodes, solution_of
-from swath.georef.navigation.stores import IN_MEMORY, Storage
-from swath.georef.navigation.strapdown import ATTITUDE, TIME_OFFSET
 from swath.georef.records import StructArray
-from swath.georef.rotations import attitude_of, rot_from_quaternion
 from swath.georef.timescales import SECOND_NS
 
 FloatArray = NDArray[np.float64]

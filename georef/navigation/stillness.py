@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS

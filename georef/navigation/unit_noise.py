@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.inputs import ImuNoise, Setup
 from swath.georef.navigation.noise import SIGNIFICANT, Judged, Run
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import Calibration, nominal
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import Calibration, nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 Surface = Callable[[FloatArray, FloatArray], FloatArray]

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import Calibration, nominal
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import Calibration, nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.plan import parse_plan
 from swath.sim.scene import Scene, build_scene
 from swath.sim.shots import CAR, ROOF, WALL
@@ -97,7 +97,7 @@ def cast_flight(
         terrain: keys and tables of it.
         lines: to be flown.
         prf_hz: pulse rate.
-        true: what the scanner really is, names of `swath.georef.calibration.PARAMETERS`; None: `TRUE`.
+        true: what the scanner really is, names of `swath.georef.scanner.calibration.PARAMETERS`; None: `TRUE`.
         seed: of noise and gusts.
         range_sigma_m, angle_sigma_rad: noise of a return.
         half_angle_rad: of the scan.

@@ -18,11 +18,11 @@ from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting,
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
 from swath.calib.report_input import DifferenceMap, PairDifference, Profile, ReportInput
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import INDEX, Calibration, nominal
-from swath.georef.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import INDEX, Calibration, nominal
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from swath.calib.features import Features
 from swath.calib.flight import Flight, Head, Tangent
 from swath.calib.plan import MOST_MADE, Line, Scan, Surface, planned
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import Calibration, nominal
-from swath.georef.earth import e_from_geodetic, geodetic_from_e
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import Calibration, nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import exactly_known
 
 FloatArray = NDArray[np.float64]

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import nominal
 from swath.georef.records import RETURN_DTYPE, Int64Array
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import START_NS, exactly_known, frame
 
 FloatArray = NDArray[np.float64]

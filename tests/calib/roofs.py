@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import PARAMETERS, Calibration, nominal
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE, Int64Array
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 START_NS = 1_479_297_618_000_000_000

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, Tangent
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 
 FloatArray = NDArray[np.float64]

@@ -22,8 +22,8 @@ from swath.calib.rows import Rows, State
 from swath.calib.solve import Settings
 from swath.calib.tie_rows import Ties
 from swath.calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration, nominal
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
 from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
 from tests.calib.test_rows import design

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
-from swath.georef.calibration import (
+from swath.georef.scanner.calibration import (
     INDEX,
     PARAMETERS,
     BeamCorrection,

@@ -12,7 +12,7 @@ import pytest
 
 from swath.calib.history import BORESIGHT, HistoryError, compare, history
 from swath.calib.history_plots import history_png
-from swath.georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
+from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 
 SIGMAS = np.radians([0.001, 0.001, 0.002])
 AT = [INDEX[name] for name in BORESIGHT]

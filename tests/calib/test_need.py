@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from swath.calib.need import POINT, SHARE, Need, need_of
 from swath.calib.outcome import TrajectoryFit
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 from tests.calib.roofs import LINES, NOISE, Line, Made, made
 
 pytestmark = pytest.mark.xdist_group("kernels")

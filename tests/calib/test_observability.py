@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from swath.calib.observability import RULES, Rules, decide, kind_of, spectrum
 from swath.calib.outcome import Held
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import INDEX, PARAMETERS, nominal
-from swath.georef.earth import e_from_geodetic, rot_e_from_l
-from swath.georef.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
+from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

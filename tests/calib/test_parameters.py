@@ -11,8 +11,8 @@ from scipy.interpolate import PchipInterpolator
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots
 from swath.calib.parameters import MODELS, ParameterError, Unknowns, Wish, unknowns
-from swath.georef.beams import LineGeometry, SpinningGeometry
-from swath.georef.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset, nominal
+from swath.georef.scanner.beams import LineGeometry, SpinningGeometry
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset, nominal
 from tests.calib.roofs import LINES, frame, trajectory
 
 

@@ -13,7 +13,7 @@ from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
 from swath.calib.scale import scale_of
-from swath.georef.calibration import Calibration
+from swath.georef.scanner.calibration import Calibration
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -27,9 +27,9 @@ from swath.calib.record import (
 )
 from swath.calib.record_tables import BY_KEY, CLASSES, ROWS
 from swath.calib.record_values import Matrix, Plain, utc_text
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import INDEX
-from swath.georef.sensor_model import SensorModel
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import INDEX
+from swath.georef.scanner.sensor_model import SensorModel
 from tests.calib.made_outcome import Outcome, made_outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")

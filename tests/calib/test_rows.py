@@ -14,12 +14,12 @@ from swath.calib.flight import Flight, Head, Swath
 from swath.calib.parameters import Unknowns, Wish, unknowns
 from swath.calib.rows import Rows, State
 from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.georef.beams import Geometry, OusterGeometry, SpinningGeometry
-from swath.georef.calibration import INDEX, Calibration, nominal
-from swath.georef.jacobian import observation_columns_e, parameter_columns_e
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise
+from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry
+from swath.georef.scanner.calibration import INDEX, Calibration, nominal
+from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import LINES, START_NS, frame, made, trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -19,9 +19,9 @@ from swath.calib.strips import differences
 from swath.calib.trajectory_errors import Taus, apply, draw, gauss_markov
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.jacobian import parameter_columns_e
-from swath.georef.mount import Mount, Stage
-from swath.georef.rotations import rot_x
+from swath.georef.geodesy.rotations import rot_x
+from swath.georef.scanner.jacobian import parameter_columns_e
+from swath.georef.scanner.mount import Mount, Stage
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -14,9 +14,9 @@ from swath.calib.features import Features, Patch, Plane, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.picked_points import PickedError, PickedSettings, carried, picked_ties, read_picked
 from swath.calib.tie_points import TieSettings, find_ties, fit_patch, meet
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import nominal
 from swath.georef.records import RETURN_DTYPE
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
 
 FloatArray = NDArray[np.float64]
 

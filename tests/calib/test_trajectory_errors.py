@@ -21,17 +21,17 @@ from swath.calib.trajectory_errors import (
     knots_of,
     positive,
 )
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import nominal
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
-from swath.georef.navigation.error_model import E_ATTITUDE, MOVED
-from swath.georef.navigation.filter import FilterRun, run_filter
+from swath.georef.navigation.filter.error_model import E_ATTITUDE, MOVED
+from swath.georef.navigation.filter.filter import FilterRun, run_filter
+from swath.georef.navigation.filter.smoother import smooth_nodes
 from swath.georef.navigation.inputs import GRADES
-from swath.georef.navigation.smoother import smooth_nodes
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.rotations import rot_from_quaternion
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import ns
 

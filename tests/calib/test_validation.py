@@ -26,7 +26,7 @@ from swath.calib.validation import (
     validate,
 )
 from swath.calib.validation_rows import FLOOR_M, HALF, Rows, estimated_floor_m, plane_rows
-from swath.georef.calibration import INDEX, Calibration
+from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight
 

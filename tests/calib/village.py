@@ -13,9 +13,9 @@ from swath.daemon.processing.calibration_flight import read_flight
 from swath.daemon.processing.flights import Wish
 from swath.daemon.processing.flown import TrajectoryWish
 from swath.daemon.processing.setup import Options
-from swath.georef.calibration import Calibration, read_calibration
 from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.calibration import Calibration, read_calibration
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short
 
 HEADER = """

@@ -11,7 +11,7 @@ import numpy as np
 
 from swath.daemon.cli.main import run_app
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 PLAN = """
 [flight]

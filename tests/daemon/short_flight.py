@@ -21,7 +21,7 @@ from swath.daemon.sim_log import fly_into_log
 from swath.drivers.gnss import novatel_layouts as nov
 from swath.drivers.gnss.novatel_encoder import encode_log
 from swath.drivers.gnss.novatel_tables import CLOCK_VALID
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth
 from swath.sim.gnss.novatel import NovatelMessages

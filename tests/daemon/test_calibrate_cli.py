@@ -26,8 +26,8 @@ from swath.daemon.processing.calibrate_model import model_of
 from swath.daemon.processing.calibrate_run import refuse_no_planes
 from swath.daemon.processing.calibration_plan import PlanWish, plan_calibration
 from swath.daemon.processing.warm_calibration import warm_calibration
-from swath.georef.calibration import Calibration, read_calibration
-from swath.georef.mapping import Mapping
+from swath.georef.mapping.frame import Mapping
+from swath.georef.scanner.calibration import Calibration, read_calibration
 from swath.sim.plan import parse_plan
 from tests.calib.village import KNOWN, Made, judge_unusable, village
 
@@ -127,7 +127,7 @@ def test_a_calibration_is_refused_under_other_settings_than_its_own(
 
 
 def list_of(name: str) -> int:
-    from swath.georef.calibration import INDEX
+    from swath.georef.scanner.calibration import INDEX
 
     return INDEX[name]
 

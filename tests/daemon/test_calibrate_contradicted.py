@@ -15,9 +15,9 @@ from swath.daemon.processing.calibrate_run import Calibrated, CalibrateWish, cal
 from swath.daemon.processing.flights import Wish
 from swath.daemon.processing.flown import TrajectoryWish
 from swath.daemon.processing.setup import Options
-from swath.georef.calibration import INDEX, Calibration, read_calibration
 from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.village import KNOWN, Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from swath.daemon.cli.main import run_app
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration, read_calibration
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, read_calibration
 from tests.calib.village import KNOWN, TRUE, Made, village
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(3000)]

@@ -13,8 +13,8 @@ from swath.calib.picked_points import PickedError
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibrate_inputs import PolygonError, read_polygons, rings_of, ties_of
 from swath.daemon.processing.calibration_flight import refuse_without_noise
-from swath.georef.mapping import Mapping
-from swath.georef.uncertainty import Noise
+from swath.georef.mapping.frame import Mapping
+from swath.georef.scanner.uncertainty import Noise
 from tests.calib.analytic_scene import Line, Scanner, fly, gables
 
 pytestmark = pytest.mark.xdist_group("kernels")

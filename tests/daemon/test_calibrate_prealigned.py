@@ -19,7 +19,7 @@ from swath.calib.plane_search import find_planes
 from swath.calib.report_input import Finding
 from swath.calib.trajectory_errors import Taus, gauss_markov
 from swath.daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
-from swath.georef.calibration import INDEX, Calibration, read_calibration
+from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -26,7 +26,7 @@ from swath.daemon.processing.carried_verdict import (
 )
 from swath.daemon.processing.navigation_verdict import Level
 from swath.daemon.processing.setup import Setup
-from swath.georef.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.georef.flown import flown
 
 TEXT = """

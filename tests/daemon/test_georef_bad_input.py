@@ -23,7 +23,7 @@ from swath.daemon.processing.workers import _held_interrupts
 from swath.georef.formats.sbet import sbet_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.records import ChunkBatch
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.one_line import PLAN, Flown
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

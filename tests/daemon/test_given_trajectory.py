@@ -17,8 +17,8 @@ from swath.daemon.processing.feed import LogClocks, read_clocks
 from swath.daemon.processing.given_trajectory import Belonging, Given, _nearest, judge_given, points_of
 from swath.daemon.processing.setup import Options, Setup
 from swath.georef.agreement import Apart
-from swath.georef.earth import geodetic_from_e
-from swath.georef.trajectory import Trajectory
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 
 UNDULATION_M = 48.0  # of the virtual receiver

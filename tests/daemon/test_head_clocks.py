@@ -28,7 +28,7 @@ from swath.drivers.scanner.hesai_gps import encode_gps_packet
 from swath.drivers.scanner.velodyne import encode_data_packet
 from swath.drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
 from swath.georef.records import DEVICE_CLOCK_DTYPE
-from swath.georef.stream_clocks import FrozenClocks
+from swath.georef.stream.clocks import FrozenClocks
 from swath.georef.timescales import StampScale
 
 NS = 1_000_000_000

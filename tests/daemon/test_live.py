@@ -37,7 +37,7 @@ from swath.daemon.processing.setup import Options, Setup
 from swath.daemon.processing.warm_up import WarmUp
 from swath.daemon.sim_log import fly_into_log
 from swath.georef.points import Fate
-from swath.georef.stream_clocks import DevicePlan
+from swath.georef.stream.clocks import DevicePlan
 from swath.georef.timescales import ClockStatus, TimeState
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight

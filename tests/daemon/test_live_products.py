@@ -22,7 +22,7 @@ from swath.daemon.processing.live_grid import TILE, CountGrid
 from swath.daemon.processing.live_mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
 from swath.daemon.processing.live_products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
 from swath.georef.points import Points
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

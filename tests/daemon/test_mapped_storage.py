@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from swath.daemon.processing.mapped_storage import MappedStorage
-from swath.georef.navigation import filter as filter_module
-from swath.georef.navigation import smoother as smoother_module
+from swath.georef.navigation.filter import filter as filter_module
+from swath.georef.navigation.filter import smoother as smoother_module
+from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import GRADES
 from swath.georef.navigation.solve import Solved, solve
-from swath.georef.navigation.stores import IN_MEMORY, Storage
 from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, setup_for, survey
 
 pytestmark = pytest.mark.xdist_group("kernels")

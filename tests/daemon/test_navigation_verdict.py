@@ -18,7 +18,7 @@ from swath.daemon.processing.navigation_figures import CHI2_MEDIAN, Figures, fig
 from swath.daemon.processing.navigation_page import summary_of
 from swath.daemon.processing.navigation_series import Flight, separation_of
 from swath.daemon.processing.navigation_verdict import RULES, Level, judge
-from swath.georef.navigation.diagnosis import Finding
+from swath.georef.navigation.diagnosis.diagnose import Finding
 from swath.georef.navigation.inputs import Fate, Kind
 from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.navigation_flights import SMOOTHER_SIGMA, sound_flight, with_rows

@@ -15,7 +15,7 @@ from swath.daemon.processing.setup import Options, Setup
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE
 from swath.georef.points import Fate, Points
 from swath.georef.timescales import SECOND_NS
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -30,9 +30,9 @@ from swath.daemon.sim_log import fly_into_log
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.points import Fate
 from swath.georef.records import ChunkBatch, Int64Array, Record, StructArray
-from swath.georef.stream import Stream, StreamSettings
-from swath.georef.trajectory import Trajectory
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.stream.stream import Stream, StreamSettings
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
 from swath.sim.plan import parse_plan

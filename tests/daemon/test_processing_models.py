@@ -25,14 +25,14 @@ from swath.daemon.processing.models import (
 from swath.drivers.core.parser import DeviceSettings
 from swath.drivers.core.registry import find_driver
 from swath.drivers.scanner.srep import SrepParser
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import RangeOffset, nominal
 from swath.georef.georeference import Georeferencer
-from swath.georef.mount import AngleSeries
 from swath.georef.points import Fate
-from swath.georef.ranging import ZoneResolver
-from swath.georef.sensor_model import SensorModel
-from swath.georef.stream import ScannerChain
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import RangeOffset, nominal
+from swath.georef.scanner.mount import AngleSeries
+from swath.georef.scanner.ranging import ZoneResolver
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.stream.stream import ScannerChain
 from tests.daemon.standin import aircraft_config
 from tests.georef.scanner_cases import rows_of, still_trajectory
 

@@ -21,16 +21,16 @@ from swath.daemon.processing.models import TerrainRanges, connect, make_resolver
 from swath.drivers.core.parser import DeviceSettings
 from swath.drivers.scanner.srep import SrepParser
 from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import RangeOffset, nominal
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
-from swath.georef.ranging import PulseRates
 from swath.georef.records import ChunkBatch, Int64Array, ScannerReturns, StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.stream import CompletePath, ScannerChain, Stream, StreamSettings
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import RangeOffset, nominal
+from swath.georef.scanner.ranging import PulseRates
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.stream.stream import CompletePath, ScannerChain, Stream, StreamSettings
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from swath.daemon.config import parse_config
 from swath.daemon.processing.models import make_motion
 from swath.daemon.processing.setup import Options, Setup
+from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.points import Points
-from swath.georef.rotations import quaternion_from_rot
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import config_text, default_wires
 from tests.sim.test_proof import (
     EVERY_ERROR,

@@ -22,11 +22,11 @@ from swath.drivers.core.parser import DeviceSettings, PacketParser
 from swath.drivers.core.registry import find_driver
 from swath.drivers.scanner.hesai_heads import XT32
 from swath.drivers.scanner.velodyne_heads import VLP16, VLP32C, SpinningHead
-from swath.georef.beams import OusterGeometry, SpinningGeometry
-from swath.georef.calibration import nominal
 from swath.georef.records import StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.drivers import ouster_cases
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.spinning import are_near, feed, payloads, read_pcd, returns_of, xyz

@@ -19,10 +19,10 @@ from swath.daemon.processing.setup import Options
 from swath.daemon.processing.sidecar import unit_doubts
 from swath.daemon.processing.unread import Unread, unread_lines
 from swath.drivers.core.parser import Parser, ParserCounters
-from swath.georef.mapping import Mapping
+from swath.georef.mapping.frame import Mapping
 from swath.georef.records import INS_DTYPE
 from swath.georef.timescales import ClockStatus, TimeState
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 S = 1_000_000_000
 A, B = Path("a.mcap"), Path("b.mcap")

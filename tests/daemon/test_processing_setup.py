@@ -15,9 +15,9 @@ from swath.daemon.config import Config
 from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup import Options, Setup
-from swath.georef.beams import LineGeometry, SpinningGeometry
 from swath.georef.records import INS_DTYPE, NamesEdge
-from swath.georef.stream_clocks import DevicePlan, GnssPlan, PpsPlan
+from swath.georef.scanner.beams import LineGeometry, SpinningGeometry
+from swath.georef.stream.clocks import DevicePlan, GnssPlan, PpsPlan
 from swath.georef.timescales import StampScale
 from tests.daemon.standin import AIRCRAFT, aircraft_config
 

@@ -17,12 +17,12 @@ from scipy.stats import chi2
 
 from swath.daemon.config import ScannerConfig
 from swath.daemon.processing.models import make_motion
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import PARAMETERS, read_calibration
-from swath.georef.earth import rot_e_from_l
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise, Uncertainty
+from swath.georef.geodesy.earth import rot_e_from_l
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import PARAMETERS, read_calibration
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Noise, Uncertainty
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.test_processing_proof import IBRC, true_trajectory
 from tests.sim.test_proof import EVERY_ERROR, TURNED, Flown, fly_and_decode
 

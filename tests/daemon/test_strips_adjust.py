@@ -22,10 +22,10 @@ from swath.daemon.processing.navigation_verdict import Level
 from swath.daemon.processing.setup import Options
 from swath.daemon.processing.strip_adjust_products import write_adjustment
 from swath.daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, correct_strips
-from swath.georef.earth import rot_e_from_l
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.trajectory import Trajectory
+from swath.georef.geodesy.earth import rot_e_from_l
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.village import Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

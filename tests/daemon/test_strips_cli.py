@@ -26,7 +26,7 @@ from swath.daemon.processing.strip_agreement import before_and_after, difference
 from swath.daemon.processing.strips_inputs import strips_of_files, strips_of_flight
 from swath.daemon.processing.strips_run import refuse_installations
 from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.mapping import Mapping
+from swath.georef.mapping.frame import Mapping
 from swath.georef.timescales.gps_time import WEEK_NS
 from tests.calib.cast_flight import Cast, cast_flight
 from tests.daemon.standin import aircraft_config

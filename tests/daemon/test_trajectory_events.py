@@ -13,7 +13,7 @@ import pytest
 from swath.daemon.processing.event_marks import HEADER, PLACED, event_table
 from swath.daemon.processing.navigation_inputs import Mark
 from swath.georef.records import EventMark, TimeScale, TimeTag
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

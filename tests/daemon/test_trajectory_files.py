@@ -19,7 +19,7 @@ from swath.daemon.processing.trajectory_files import (
 from swath.georef.formats.sbet import sbet_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -37,8 +37,8 @@ from swath.drivers.core.parser import DeviceSettings
 from swath.drivers.gnss.nmea import NmeaParser
 from swath.drivers.gnss.nmea_sentences import encode_gga
 from swath.georef.formats.antenna_positions import read_antenna_positions
-from swath.georef.navigation.alignment_noise import white_factor
-from swath.georef.navigation.diagnosis_data import Finding
+from swath.georef.navigation.alignment.noise import white_factor
+from swath.georef.navigation.diagnosis.data import Finding
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Kind
 from swath.georef.records import (
     IMU_DTYPE,
@@ -53,8 +53,8 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
-from swath.georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
-from swath.georef.trajectory import Poses
+from swath.georef.stream.clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
+from swath.georef.trajectory.trajectory import Poses
 from tests.daemon.short_flight import CLOCK_SIGMA_S, MARK_AFTER_NS, Flown, fly_short
 from tests.drivers.harness import feed_pieces
 

@@ -11,7 +11,7 @@ import pytest
 from swath.daemon.processing.flown import _from_device
 from swath.daemon.processing.ins_point import offset_in_b, point_doubts
 from swath.georef.records import INS_DTYPE
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -13,7 +13,7 @@ import pytest
 
 from swath.calib.calibration_file import Header, calibration_text
 from swath.daemon.cli.main import run_app
-from swath.georef.calibration import INDEX
+from swath.georef.scanner.calibration import INDEX
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

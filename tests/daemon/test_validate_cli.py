@@ -23,7 +23,7 @@ from swath.daemon.processing import validate_run
 from swath.daemon.processing.calibration_flight import KeptFlight
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.navigation_verdict import Level
-from swath.georef.calibration import INDEX, Calibration, nominal, read_calibration
+from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
@@ -262,7 +262,7 @@ def test_a_record_that_cannot_be_told_is_one_line(
 
 def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
     """Points on the true surface, or below it; how many."""
-    from swath.georef.earth import geodetic_from_e
+    from swath.georef.geodesy.earth import geodetic_from_e
 
     places = made.true_t[0][20_000:180_000:8_000]
     rows = ["name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m"]

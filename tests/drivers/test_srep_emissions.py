@@ -12,7 +12,7 @@ from swath.drivers.core.parser import DeviceSettings
 from swath.drivers.scanner.srep import FLAG_NO_POINT, SrepParser
 from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
 from swath.georef.records import ChunkBatch, ScannerReturns, StructArray
-from swath.georef.stream import CONTEXT_FLAG
+from swath.georef.stream.stream import CONTEXT_FLAG
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -27,9 +27,9 @@ from swath.daemon.processing.model_file import read_model
 from swath.daemon.processing.validate_run import _entry, read_file
 from swath.daemon.sim_plans import Wish
 from swath.daemon.text_files import text_of
-from swath.georef.beams import GeometryError, read_fibres
-from swath.georef.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.scanner.beams import GeometryError, read_fibres
+from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 from swath.georef.strips import CSV_COLUMNS, StripError
 from swath.sim.plan import PRESETS
 from tests.fuzz.engine import Target

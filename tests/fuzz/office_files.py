@@ -20,8 +20,8 @@ from swath.daemon.processing.strips_inputs import strips_of_files
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.mapping import Mapping
-from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.mapping.frame import Mapping
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.fuzz.engine import Target
 from tests.fuzz.mutation import damage
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, changed_text, told

@@ -15,7 +15,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from swath.daemon.processing.terrain import read_terrain
-from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.sim.errors import PlanError
 from swath.sim.plan import Plan, load_plan
 from swath.sim.site import Site

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from swath.drivers.scanner.beams import BeamTable, beam_table
 from swath.drivers.scanner.beams import beam_points as velodyne_points
-from swath.georef.beams import (
+from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.scanner.beams import (
     FibreGeometry,
     Geometry,
     LineGeometry,
@@ -20,9 +21,8 @@ from swath.georef.beams import (
     RisleyGeometry,
     SpinningGeometry,
 )
-from swath.georef.calibration import BeamCorrection, Calibration, RangeOffset, nominal
-from swath.georef.records import RETURN_DTYPE, StructArray
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.calibration import BeamCorrection, Calibration, RangeOffset, nominal
+from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 PointsS = Callable[[Calibration, StructArray, FloatArray, FloatArray], FloatArray]  # rows, θ, ρ → (n, 3) in s

@@ -13,8 +13,15 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from swath.georef.atmosphere import Air, AtmosphereError, _table, group_refractivity_ppm, saturated_hpa, standard_air
-from swath.georef.kernels.air import BLOCK, means
+from swath.georef.air.atmosphere import (
+    Air,
+    AtmosphereError,
+    _table,
+    group_refractivity_ppm,
+    saturated_hpa,
+    standard_air,
+)
+from swath.georef.air.kernels import BLOCK, means
 from swath.georef.refraction import SPHERE_M, ardc_k, layer_air, layer_constant_ppm, spherical_bending
 from swath.sim.atmosphere import Air as SimulatedAir
 from swath.sim.plan_tables import AtmosphereTable

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import beam_points
 from swath.drivers.scanner.velodyne_heads import VLP16
-from swath.georef.beams import (
+from swath.georef.scanner.beams import (
     FibreGeometry,
     Geometry,
     GeometryError,
@@ -22,8 +22,8 @@ from swath.georef.beams import (
     line_scanner,
     read_fibres,
 )
-from swath.georef.calibration import BeamCorrection, Calibration, nominal
-from swath.georef.sensor_model import SensorModel
+from swath.georef.scanner.calibration import BeamCorrection, Calibration, nominal
+from swath.georef.scanner.sensor_model import SensorModel
 from tests.georef.scanner_cases import rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

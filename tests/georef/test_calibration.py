@@ -8,7 +8,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from swath.georef.calibration import (
+from swath.georef.scanner.calibration import (
     INDEX,
     PARAMETERS,
     BeamCorrection,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pyproj.datadir import get_user_data_dir
 from pyproj.network import is_network_enabled, set_network_enabled
 
-from swath.georef import datums
-from swath.georef.earth import e_from_geodetic
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.mapping import datums
+from swath.georef.mapping.frame import Mapping, MappingError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from swath.georef.earth import (
+from swath.georef.geodesy.earth import (
     A_M,
     B_M,
     e_from_geodetic,

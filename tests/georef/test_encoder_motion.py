@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.encoder_motion import EncoderMotion
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.scanner.encoder_motion import EncoderMotion
 from swath.sim.scanners.motions import polygon, sine, triangle, turning
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.georef.flown import SECOND, START_NS, WEEK, flown
 
 pytestmark = pytest.mark.xdist_group("kernels")

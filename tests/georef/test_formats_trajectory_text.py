@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from swath.georef.earth import prime_vertical_radius_m
 from swath.georef.formats.trajectory_csv import HEADER, csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
-from swath.georef.trajectory import Trajectory, TrajectoryError
+from swath.georef.geodesy.earth import prime_vertical_radius_m
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.georef.flown import SECOND, START_NS, WEEK, flown
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.georef import georeference
-from swath.georef.atmosphere import Air
-from swath.georef.beams import Geometry, LineGeometry, SpinningGeometry
-from swath.georef.calibration import nominal
+from swath.georef.air.atmosphere import Air
+from swath.georef.geodesy.vectors import angle_of
 from swath.georef.georeference import Georeferencer
-from swath.georef.kernels.rotations import angle_of
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise, Uncertainty
+from swath.georef.scanner.beams import Geometry, LineGeometry, SpinningGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Noise, Uncertainty
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.georef.scanner_cases import rows_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

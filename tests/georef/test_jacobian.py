@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import INDEX, PARAMETERS, Calibration, nominal
-from swath.georef.jacobian import OBSERVATIONS, columns_l, observation_columns_e, parameter_columns_e
-from swath.georef.mount import Mount, Stage
 from swath.georef.points import Rays
 from swath.georef.records import StructArray
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
+from swath.georef.scanner.jacobian import OBSERVATIONS, columns_l, observation_columns_e, parameter_columns_e
+from swath.georef.scanner.mount import Mount, Stage
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.georef.scanner_cases import CASES, TURNED, Case, rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

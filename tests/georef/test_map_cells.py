@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef import map_cells
-from swath.georef.map_cells import APPROXIMATION_M, EXACT, LEVELS, TOLERANCE_M, MapCells, expand_cells
+from swath.georef.mapping import cells as map_cells
+from swath.georef.mapping.cells import APPROXIMATION_M, EXACT, LEVELS, TOLERANCE_M, MapCells, expand_cells
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

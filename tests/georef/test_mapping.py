@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from swath.georef import mapping as module
-from swath.georef.earth import e_from_geodetic, meridian_radius_m
-from swath.georef.mapping import Mapping, MappingError
+from swath.georef.geodesy.earth import e_from_geodetic, meridian_radius_m
+from swath.georef.mapping import frame as module
+from swath.georef.mapping.frame import Mapping, MappingError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -268,8 +268,8 @@ def test_a_grid_that_is_installed_gives_orthometric_heights(tmp_path: Path) -> N
     nodes = write_gtx(tmp_path / "egm96_15.gtx", -90.0, -180.0, 0.25, (721, 1440))
     script = (
         "import json, numpy as np\n"
-        "from swath.georef.mapping import Mapping\n"
-        "from swath.georef.earth import e_from_geodetic\n"
+        "from swath.georef.mapping.frame import Mapping\n"
+        "from swath.georef.geodesy.earth import e_from_geodetic\n"
         "frame = Mapping('EPSG:32632+5773')\n"
         "e = e_from_geodetic(np.radians([[47.3]]), np.radians([[8.6]]), [[500.0]])[0]\n"
         "print(json.dumps([frame.exact(e)[0, 2], frame.description(), frame.wkt[:9]]))"

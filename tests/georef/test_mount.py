@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swath.georef.beams import LineGeometry, OusterGeometry
-from swath.georef.calibration import nominal
-from swath.georef.mount import AngleSeries, Mount, MountError, Stage
 from swath.georef.points import Fate
 from swath.georef.records import INS_DTYPE
-from swath.georef.sensor_model import SensorModel
+from swath.georef.scanner.beams import LineGeometry, OusterGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.mount import AngleSeries, Mount, MountError, Stage
+from swath.georef.scanner.sensor_model import SensorModel
 from tests.georef.scanner_cases import TURNED, rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

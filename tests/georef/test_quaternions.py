@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.georef.quaternions import about, conjugate, product, rotated, rotation_vector
+from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector
 
 FloatArray = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.ranging import PulseRates, RangingError, ZoneResolver
 from swath.georef.records import RETURN_DTYPE, StructArray
+from swath.georef.scanner.ranging import PulseRates, RangingError, ZoneResolver
 from tests.sim.srep_spoken import Spoken, joined, scanner, speak
 
 pytestmark = pytest.mark.xdist_group("kernels")

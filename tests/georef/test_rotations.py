@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from swath.georef.rotations import (
+from swath.georef.geodesy.rotations import (
     attitude_of,
     boresight,
     quaternion_from_rot,

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import Calibration, RangeOffset, nominal
-from swath.georef.mount import Mount, Stage
+from swath.georef.geodesy.rotations import boresight, rot_x
 from swath.georef.points import Fate, Rays
 from swath.georef.records import StructArray
-from swath.georef.rotations import boresight, rot_x
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import Calibration, RangeOffset, nominal
+from swath.georef.scanner.mount import Mount, Stage
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.trajectory.trajectory import Trajectory
 from tests.georef.scanner_cases import CASES, IBRC, TURNED, Case, rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.georef.encoder_motion import EncoderMotion
 from swath.georef.points import ByteArray, Fate, Points
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
@@ -23,7 +22,9 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
-from swath.georef.stream import (
+from swath.georef.scanner.encoder_motion import EncoderMotion
+from swath.georef.stream.clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, HostClocks, PpsPlan, StreamClocks
+from swath.georef.stream.stream import (
     CONTEXT_FLAG,
     CompletePath,
     GivenMotion,
@@ -32,9 +33,8 @@ from swath.georef.stream import (
     Stream,
     StreamSettings,
 )
-from swath.georef.stream_clocks import ClockPlan, DevicePlan, FrozenClocks, GnssPlan, HostClocks, PpsPlan, StreamClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from swath.georef.records import NamesEdge, PpsEdge, TimeMessage, TimeScale, TimeTag
-from swath.georef.stream_clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
+from swath.georef.stream.clocks import ClockPlan, GnssPlan, HostClocks, PpsPlan
 from swath.georef.timescales import HOUR_NS, SECOND_NS, TimeState, gps_ns_from_utc, unix_ns_from_gps
 
 DATE = dt.date(2026, 5, 10)

@@ -11,7 +11,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
 from swath.georef.points import Fate
-from swath.georef.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from swath.georef.records import INS_DTYPE, StructArray
-from swath.georef.trajectory import Trajectory
-from swath.georef.trajectory_buffer import TrajectoryBuffer
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.georef.trajectory import Trajectory, TrajectoryError
-from swath.georef.trajectory_time import TimeShift, correlate_turn_rates
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
+from swath.georef.trajectory.turn_rates import TimeShift, correlate_turn_rates
 from swath.sim.inertial import true_increments
 from tests.georef.flown import START_NS, flown
 from tests.sim.inertial_motion import rough_flight

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.georef.beams import LineGeometry
-from swath.georef.calibration import PARAMETERS, Calibration, nominal
-from swath.georef.jacobian import observation_columns_e, parameter_columns_e
-from swath.georef.mount import Mount, Stage
 from swath.georef.points import Fate
 from swath.georef.records import RETURN_DTYPE
-from swath.georef.sensor_model import SensorModel
-from swath.georef.trajectory import Trajectory
-from swath.georef.uncertainty import Noise, Uncertainty, UncertaintyError
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
+from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
+from swath.georef.scanner.mount import Mount, Stage
+from swath.georef.scanner.sensor_model import SensorModel
+from swath.georef.scanner.uncertainty import Noise, Uncertainty, UncertaintyError
+from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -10,10 +10,10 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
 from swath.georef.records import FixType, StructArray
-from swath.georef.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
 from swath.sim.flight import Trajectory
 from swath.sim.inertial import error_matrix, true_increments
 from tests.georef.navigation.vehicles import Motion, ns, observed

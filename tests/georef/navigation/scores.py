@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.quaternions import rotated
+from swath.georef.geodesy.rotations import rot_l_from_b
 from swath.georef.navigation.inputs import Solution, Start
-from swath.georef.quaternions import rotated
 from swath.georef.records import StructArray
-from swath.georef.rotations import rot_l_from_b
 from tests.georef.navigation.vehicles import BEGIN_NS, collected, ns
 
 FloatArray = NDArray[np.float64]

@@ -11,10 +11,10 @@ from pyins import filters, measurements, strapdown
 from pyins.inertial_sensor import EstimationModel as Model
 from pyins.util import LLA_COLS, RPH_COLS, VEL_COLS
 
-from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.filter import run_filter
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import forward
 from swath.georef.navigation.inputs import GRADES
-from swath.georef.navigation.smoother import forward
 from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, setup_for, survey
 
 pytestmark = [

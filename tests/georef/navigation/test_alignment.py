@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.alignment import AlignedStart, Aligner, AlignmentError, align
-from swath.georef.navigation.alignment_blocks import Blocks
-from swath.georef.navigation.alignment_fit import TILT, Problem
-from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
+from swath.georef.geodesy.quaternions import rotation_vector
+from swath.georef.geodesy.rotations import quaternion_from_rot, rot_from_quaternion, rot_z
+from swath.georef.navigation.alignment.align import AlignedStart, Aligner, AlignmentError, align
+from swath.georef.navigation.alignment.blocks import Blocks
+from swath.georef.navigation.alignment.fit import TILT, Problem
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, ImuNoise, Inertial, Kind, Start, sort_observations
-from swath.georef.quaternions import rotation_vector
 from swath.georef.records import FixType, StructArray
-from swath.georef.rotations import quaternion_from_rot, rot_from_quaternion, rot_z
 from tests.georef.navigation.vehicles import (
     BEGIN_NS,
     Motion,

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.georef.navigation.bridging import UNKNOWN_RATE_RADPS, made_up_variance, new_bridges
-from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import smooth
+from swath.georef.navigation.filter.strapdown import Samples, samples_of
 from swath.georef.navigation.inputs import GRADES, Inertial
 from swath.georef.navigation.samples import Sampler
-from swath.georef.navigation.smoother import smooth
-from swath.georef.navigation.strapdown import Samples, samples_of
 from swath.georef.records import IMU_DTYPE
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.vehicles import ns

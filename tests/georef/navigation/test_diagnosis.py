@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from swath.georef.earth import geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.diagnosis import Finding, diagnose
-from swath.georef.navigation.diagnosis_time import TimeOffset, time_offset
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.navigation.diagnosis.diagnose import Finding, diagnose
+from swath.georef.navigation.diagnosis.time import TimeOffset, time_offset
 from swath.georef.navigation.inputs import INNOVATION_DTYPE, Fate, Inertial, Kind, Setup, sort_observations
 from swath.georef.records import FixType, StructArray
 from tests.georef.navigation.vehicles import BEGIN_NS, Recording, car, observed, reference, uav

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.georef.navigation.earlier_start import drift_rad, earlier_start
+from swath.georef.navigation.alignment.earlier_start import drift_rad, earlier_start
 from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Setup, Start, imu_noise
 from swath.georef.records import StructArray
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic, rot_e_from_l
-from swath.georef.navigation.error_model import (
+from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.navigation.filter.error_model import (
     CORE,
     LEANS,
     MOVED,
@@ -21,10 +22,9 @@ from swath.georef.navigation.error_model import (
     propagate,
     transition,
 )
-from swath.georef.navigation.inputs import GRADES, Kind, Setup
-from swath.georef.navigation.measurements import predict, rules_of
-from swath.georef.navigation.smoother import difference
-from swath.georef.navigation.strapdown import (
+from swath.georef.navigation.filter.measurements import predict, rules_of
+from swath.georef.navigation.filter.smoother import difference
+from swath.georef.navigation.filter.strapdown import (
     GYRO_LEAN,
     HEIGHT_BIAS,
     LEVER_ARM,
@@ -35,8 +35,8 @@ from swath.georef.navigation.strapdown import (
     TIME_OFFSET,
     advance_part,
 )
+from swath.georef.navigation.inputs import GRADES, Kind, Setup
 from swath.georef.records import FixType
-from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swath.georef.earth import e_from_geodetic, rot_e_from_l
-from swath.georef.navigation.error_model import layout_of
-from swath.georef.navigation.filter import NavigationFilter, run_filter, start_covariance, start_state
-from swath.georef.navigation.gate import PATIENCE
-from swath.georef.navigation.gravity import EARTH_RATE_RADPS, gravity_e
+from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
+from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_e
+from swath.georef.geodesy.rotations import attitude_of
+from swath.georef.navigation.filter.error_model import layout_of
+from swath.georef.navigation.filter.filter import NavigationFilter, run_filter, start_covariance, start_state
+from swath.georef.navigation.filter.gate import PATIENCE
+from swath.georef.navigation.filter.smoother import difference, forward
+from swath.georef.navigation.filter.stores import LATEST_ROWS
+from swath.georef.navigation.filter.strapdown import SLOW, SLOW_VELOCITY
 from swath.georef.navigation.inputs import GRADES, Fate, ImuNoise, Inertial, Kind, Start
-from swath.georef.navigation.smoother import difference, forward
-from swath.georef.navigation.stores import LATEST_ROWS
-from swath.georef.navigation.strapdown import SLOW, SLOW_VELOCITY
 from swath.georef.records import FixType, StructArray
-from swath.georef.rotations import attitude_of
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import (
     FILTER,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swath.georef.earth import e_from_geodetic
-from swath.georef.navigation.gravity import gradient_of, gravity_e
+from swath.georef.geodesy.earth import e_from_geodetic
+from swath.georef.geodesy.gravity import gradient_of, gravity_e
 from swath.sim.gravity import gravity_e as simulated
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.navigation.alignment_noise import HEADING_STEP_NS, spaced_headings
-from swath.georef.navigation.filter import run_filter
+from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
+from swath.georef.navigation.alignment.noise import HEADING_STEP_NS, spaced_headings
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import smooth
 from swath.georef.navigation.heading_noise import find_heading_noise
 from swath.georef.navigation.inputs import GRADES, Kind, Setup
 from swath.georef.navigation.noise import EVIDENCE, NoiseFound
-from swath.georef.navigation.smoother import smooth
 from swath.georef.navigation.solve import stretch_of
-from swath.georef.quaternions import conjugate, product, rotation_vector
 from swath.georef.records import FixType
 from tests.georef.navigation.flights import BASELINE_B, Truth, drawn_start, fly, noised, survey
 from tests.georef.navigation.honesty import judge, squares

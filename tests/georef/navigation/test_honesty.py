@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, Fate
-from swath.georef.navigation.smoother import forward, smooth
 from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, noised, setup_for, survey
 from tests.georef.navigation.honesty import judge, squares
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.navigation.diagnosis import diagnose
+from swath.georef.navigation.diagnosis.diagnose import diagnose
 from swath.georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
 from swath.georef.records import StructArray
 from tests.georef.navigation.flights import Fixes, fly, noised, setup_for, survey

@@ -11,9 +11,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup
 from swath.georef.navigation.noise import EVIDENCE, SIGNIFICANT, rescaled, second_moments
-from swath.georef.quaternions import conjugate, product, rotation_vector
 from swath.georef.records import FixType, StructArray
 from tests.georef.navigation.flights import Truth, fly, survey
 from tests.georef.navigation.honesty import judge

@@ -11,9 +11,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from swath.georef.navigation.filter import run_filter
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import Setup, Solution
-from swath.georef.navigation.smoother import forward, smooth
 from swath.sim.inertial import InertialUnit
 from swath.sim.plan_tables import ImuTable
 from tests.georef.navigation.flights import drawn_start

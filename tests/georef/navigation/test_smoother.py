@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.navigation.error_model import MOVED
-from swath.georef.navigation.filter import FilterRun, run_filter, start_state
+from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
+from swath.georef.navigation.filter.error_model import MOVED
+from swath.georef.navigation.filter.filter import FilterRun, run_filter, start_state
+from swath.georef.navigation.filter.smoother import difference, forward, smooth, smooth_nodes, solution_of
 from swath.georef.navigation.inputs import GRADES, Kind, Solution, Start
-from swath.georef.navigation.smoother import difference, forward, smooth, smooth_nodes, solution_of
-from swath.georef.quaternions import conjugate, product, rotation_vector
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import (
     LINES_S,

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.navigation.filter import run_filter
+from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
+from swath.georef.geodesy.rotations import attitude_of
+from swath.georef.navigation.filter.filter import run_filter
+from swath.georef.navigation.filter.smoother import smooth
 from swath.georef.navigation.inputs import GRADES, Inertial, Kind, Start
-from swath.georef.navigation.smoother import smooth
 from swath.georef.navigation.solve import solve
-from swath.georef.quaternions import conjugate, product, rotation_vector
 from swath.georef.records import FixType
-from swath.georef.rotations import attitude_of
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import flight_errors, of_maxima, off_fixes, rms, start_of, without
 from tests.georef.navigation.vehicles import car, collected, ns, reference

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.georef.earth import e_from_geodetic
+from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from swath.georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
 from swath.georef.timescales import SECOND_NS

@@ -11,12 +11,12 @@ from pyins.transform import lla_to_ecef
 from pyins.util import DV_COLS, LLA_COLS, RPH_COLS, THETA_COLS, VEL_COLS
 from scipy.linalg import expm
 
-from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
-from swath.georef.navigation.filter import start_state
-from swath.georef.navigation.gravity import EARTH_RATE_RADPS
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
+from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
+from swath.georef.navigation.filter.filter import start_state
+from swath.georef.navigation.filter.strapdown import ACCEL_BIAS, GYRO_BIAS, STATE_SIZE, navigate
 from swath.georef.navigation.inputs import ImuNoise, Inertial
-from swath.georef.navigation.strapdown import ACCEL_BIAS, GYRO_BIAS, STATE_SIZE, navigate
-from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
 from swath.sim.gravity import gravity_e
 from swath.sim.inertial import true_increments
 from tests.georef.navigation.flights import drawn_start, errors, fly, setup_for, survey

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from swath.georef.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.quaternions import rotation_vector
+from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.inputs import (
     OBSERVATION_DTYPE,
     ImuNoise,
@@ -25,9 +27,7 @@ from swath.georef.navigation.inputs import (
     imu_noise,
     sort_observations,
 )
-from swath.georef.quaternions import rotation_vector
 from swath.georef.records import FixType, StructArray
-from swath.georef.rotations import quaternion_from_rot, rot_l_from_b
 from swath.sim.flight import Trajectory
 from swath.sim.inertial import error_matrix, true_increments
 

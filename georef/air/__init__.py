@@ -1,0 +1,1 @@
+"""The light's way through the air: group index and refraction."""

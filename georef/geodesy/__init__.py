@@ -1,0 +1,1 @@
+"""The ellipsoid and its gravity; rotations, quaternions and vectors."""

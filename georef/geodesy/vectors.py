@@ -1,0 +1,193 @@
+"""Rotations on single vectors, numbers only."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swath.georef.compiled import kernel
+from swath.georef.scanner.kernels.types import FloatArray, Matrix, Three
+
+SMALL_ANGLE_2 = 1e-2  # below 0.1 rad the series below are exact to the last bit
+LARGE_ANGLE = 1e5  # up to here a whole number of quarter turns times the first part of π/2 is exact
+_PER_QUARTER = 2.0 / math.pi
+_TO_WHOLE = 1.5 * 2.0**52  # added, it leaves no room for a fraction
+_QUARTER = (1.5707963267341256, 6.077100506506192e-11, 2.022266248795951e-21)  # π/2 in three parts of 33 bits
+
+
+@kernel
+def vector_at(array: FloatArray, k: int) -> Three:
+    """Row k of (n, 3)."""
+    return array[k, 0], array[k, 1], array[k, 2]
+
+
+@kernel
+def matrix_at(array: FloatArray, k: int) -> Matrix:
+    """Matrix k of (n, 3, 3)."""
+    return (
+        (array[k, 0, 0], array[k, 0, 1], array[k, 0, 2]),
+        (array[k, 1, 0], array[k, 1, 1], array[k, 1, 2]),
+        (array[k, 2, 0], array[k, 2, 1], array[k, 2, 2]),
+    )
+
+
+@kernel
+def rot_at(q: FloatArray, k: int) -> Matrix:
+    """Matrix of unit quaternion k of (n, 4), scalar first."""
+    return rot_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
+
+
+@kernel
+def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
+    """Matrix of a unit quaternion."""
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@kernel
+def dot(a: Three, b: Three) -> float:
+    """Inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def times(m: Matrix, v: Three) -> Three:
+    """A matrix times a vector."""
+    return dot(m[0], v), dot(m[1], v), dot(m[2], v)
+
+
+@kernel
+def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
+    """factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
+    sin = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
+    cos = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
+    return angle * sin, cos
+
+
+@kernel
+def sine_cosine(square: float, angle: float) -> tuple[float, float]:
+    """sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
+    if square >= SMALL_ANGLE_2:
+        return math.sin(angle), math.cos(angle)
+    return small_sine_cosine(square, angle)
+
+
+@kernel
+def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, float]:
+    """What `sin_cos` gave, or where it does not reach the library's."""
+    if abs(angle) < LARGE_ANGLE:
+        return sin, cos
+    return math.sin(angle), math.cos(angle)
+
+
+@kernel
+def sin_cos(angle: float) -> tuple[float, float]:
+    """Sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
+
+    Without a branch; beyond LARGE_ANGLE it means nothing.
+    """
+    quarters = (angle * _PER_QUARTER if abs(angle) < LARGE_ANGLE else 0.0) + _TO_WHOLE - _TO_WHOLE
+    rest = angle - quarters * _QUARTER[0]
+    low = quarters * _QUARTER[1]
+    high = rest - low
+    low = quarters * _QUARTER[2] - ((rest - high) - low)
+    x = high - low
+    z = x * x
+    odd = 8.33333333332248946124e-03 + z * (
+        -1.98412698298579493134e-04
+        + z * (2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10))
+    )
+    even = 4.16666666666666019037e-02 + z * (
+        -1.38888888888741095749e-03
+        + z
+        * (
+            2.48015872894767294178e-05
+            + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11))
+        )
+    )
+    sin, cos = x + x * z * (z * odd - 1.66666666666666324348e-01), 1.0 - (0.5 * z - z * z * even)
+    quadrant = np.int32(quarters) & 3
+    if quadrant & 1:
+        sin, cos = cos, sin
+    return -sin if quadrant & 2 else sin, -cos if (quadrant + 1) & 2 else cos
+
+
+@kernel
+def angle_of(across: float, down: float) -> float:
+    """atan2 to 2e-8 rad, by steps that every processor rounds alike (Abramowitz and Stegun 4.4.49)."""
+    a, b = abs(across), abs(down)
+    t = min(a, b) / max(a, b, 1e-300)
+    s = t * t
+    odd = -0.0752896400 + s * (0.0429096138 + s * (-0.0161657367 + s * 0.0028662257))
+    odd = 1.0 + s * (-0.3333314528 + s * (0.1999355085 + s * (-0.1420889944 + s * (0.1065626393 + s * odd))))
+    angle = t * odd
+    angle = 0.5 * math.pi - angle if a > b else angle
+    angle = math.pi - angle if down < 0.0 else angle
+    return -angle if across < 0.0 else angle
+
+
+@kernel
+def plus(a: Three, factor: float, b: Three) -> Three:
+    """a + factor · b."""
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
+
+
+@kernel
+def unit(a: Three) -> Three:
+    """A vector's direction; of none, none."""
+    per_length = 1.0 / math.sqrt(max(dot(a, a), 1e-300))
+    return per_length * a[0], per_length * a[1], per_length * a[2]
+
+
+@kernel
+def cross(a: Three, b: Three) -> Three:
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def transposed_times(m: Matrix, v: Three) -> Three:
+    """A matrix, transposed, times a vector."""
+    a, b, c = m
+    return plus(plus((v[0] * a[0], v[0] * a[1], v[0] * a[2]), v[1], b), v[2], c)
+
+
+@kernel
+def product(a: Matrix, b: Matrix) -> Matrix:
+    """Of two matrices."""
+    return transposed_times(b, a[0]), transposed_times(b, a[1]), transposed_times(b, a[2])
+
+
+@kernel
+def turned_by(sin: float, cos: float, v: Three) -> Three:
+    """Ry(angle) v, of the angle's sine and cosine."""
+    return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
+
+
+@kernel
+def small_turn_factors(square: float, share: float) -> tuple[float, float]:
+    """`turn_factors` of turns that are small for sure."""
+    first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
+    second = 0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square * (1.0 / 40320.0 - square / 3628800.0)))
+    return share * first, share * share * second
+
+
+@kernel
+def turn_factors(square: float, share: float) -> tuple[float, float]:
+    """a, b of exp(share [φ]×) v = v + a φ × v + b φ × (φ × v) (Rodrigues), of ``square`` = |share φ|²."""
+    if square >= SMALL_ANGLE_2:
+        angle = math.sqrt(square)
+        sin, cos = math.sin(0.5 * angle), math.cos(0.5 * angle)
+        return share * 2.0 * sin * cos / angle, share * share * 2.0 * sin * sin / square
+    return small_turn_factors(square, share)
+
+
+@kernel
+def turned_on(phi: Three, a: float, b: float, v: Three) -> Three:
+    """v + a φ × v + b φ × (φ × v)."""
+    once = cross(phi, v)
+    return plus(plus(v, a, once), b, cross(phi, once))

@@ -1,0 +1,1 @@
+"""The mapping frame: projection, datums, cells."""

@@ -1,0 +1,1 @@
+"""What innovations say of a flight's installation and timing."""

@@ -1,0 +1,62 @@
+"""The local level at a state, compiled: its axes in e; roll, pitch and heading, and their errors by those of ψ."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.georef.compiled import kernel
+from swath.georef.geodesy.gravity import normal_of
+from swath.georef.geodesy.vectors import cross, dot, plus
+from swath.georef.navigation.filter.strapdown import POSITION
+from swath.georef.scanner.kernels.types import Matrix, Three
+
+FloatArray = NDArray[np.float64]
+
+
+class Axes(NamedTuple):
+    """Of l, in e, and of the nose: what headings and sigmas are reckoned by."""
+
+    north: Three
+    east: Three
+    down: Three
+
+
+@kernel
+def level_axes(x: FloatArray) -> Axes:
+    """North, east and down at the state's position, in e; at a pole those of longitude 0."""
+    up, _ = normal_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
+    flat = math.sqrt(up[0] * up[0] + up[1] * up[1])
+    east = (-up[1] / flat, up[0] / flat, 0.0) if flat > 0.0 else (0.0, 1.0, 0.0)
+    return Axes(cross(up, east), east, (-up[0], -up[1], -up[2]))
+
+
+@kernel
+def in_level(axes: Axes, v: Three) -> Three:
+    """Components north, east, down of a vector in e."""
+    return dot(axes.north, v), dot(axes.east, v), dot(axes.down, v)
+
+
+@kernel
+def attitude_rows(axes: Axes, rot: Matrix) -> tuple[Three, Matrix]:
+    """Roll, pitch, heading, and the rows that make errors of them out of ψ in e."""
+    nose = in_level(axes, (rot[0][0], rot[1][0], rot[2][0]))
+    flat = max(math.sqrt(nose[0] * nose[0] + nose[1] * nose[1]), 1e-9)
+    cos, sin = nose[0] / flat, nose[1] / flat
+    right = dot(axes.down, (rot[0][1], rot[1][1], rot[2][1]))
+    below = dot(axes.down, (rot[0][2], rot[1][2], rot[2][2]))
+    n, e, d = axes
+    zero = (0.0, 0.0, 0.0)
+    roll = plus(plus(zero, cos / flat, n), sin / flat, e)
+    pitch = plus(plus(zero, -sin, n), cos, e)
+    angles = math.atan2(right, below), math.atan2(-nose[2], flat), math.atan2(nose[1], nose[0])
+    return angles, (roll, pitch, plus(d, -nose[2], roll))
+
+
+@kernel
+def wrapped(angle: float) -> float:
+    """To −π … π."""
+    return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)

@@ -1,0 +1,1 @@
+"""The scanner's model: calibration, beams, mount, covariance, pulses in air."""

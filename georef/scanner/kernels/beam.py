@@ -1,0 +1,120 @@
+"""One beam in the head's own axes: where it starts, where it points, and how both turn with the scan angle.
+
+A geometry is a row of eight numbers a channel (`swath.georef.scanner.beams` fills them). In all of them column 7 is
+metres added to the range; columns 0 to 6 are
+
+    LINE       sin Δη, cos Δη, sin ε, cos ε of a mirror tilted by ε towards x; θ where the channel itself says it
+    NUTATING   sin ψ, cos ψ of the normal from its shaft; sin β, cos β of the shaft from the laser's beam
+    RISLEY     horizontal and vertical part of the ray before the last surface; sin, cos of the second wedge; refractive
+               index; turns of the second prism a turn of the first
+    SPINNING   sin, cos of elevation; azimuth; right, forward, up of the beam's start; sense of turning (1, −1)
+"""
+
+from __future__ import annotations
+
+import math
+
+from swath.georef.compiled import kernel
+from swath.georef.scanner.kernels.types import Eight, Three, Two
+
+LINE, NUTATING, RISLEY, SPINNING = 0, 1, 2, 3
+ONE, BY_CHANNEL, FIBRE_BY_CHANNEL, FIBRE_BY_ENCODER = 0, 1, 2, 3  # how a return chooses its row
+COLUMNS = 8
+FIXED_ANGLE, RANGE = 4, 7
+_EIGHTH = 0.25 * math.pi
+
+
+@kernel
+def mirror_angle(theta: float) -> float:
+    """Of the normal of a line scanner's mirror."""
+    return _EIGHTH + 0.5 * theta
+
+
+@kernel
+def line_beam(row: Eight, sin: float, cos: float) -> Three:
+    """Off a mirror whose normal stands at 45° − θ/2 to a laser on the +y side: u = u0 − 2 (u0·n) n (FORMULAS 2.2).
+
+    With ε = 0 this is ISO/TS 19159-2 Eq. 14's (−sin Δη, sin θ cos Δη, cos θ cos Δη). Sine and cosine are of
+    `mirror_angle`.
+    """
+    twice = 2.0 * (row[0] * row[2] + row[1] * row[3] * sin)
+    return twice * row[2] - row[0], twice * row[3] * sin - row[1], twice * row[3] * cos
+
+
+@kernel
+def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
+    """∂u/∂θ and ∂u/∂Δη of `line_beam`."""
+    twice = 2.0 * (row[0] * row[2] + row[1] * row[3] * sin)
+    by_theta = row[1] * row[3] * cos
+    by_eta = 2.0 * (row[1] * row[2] - row[0] * row[3] * sin)
+    across = (
+        by_theta * row[2],
+        row[3] * (by_theta * sin + 0.5 * twice * cos),
+        row[3] * (by_theta * cos - 0.5 * twice * sin),
+    )
+    return across, (by_eta * row[2] - row[1], by_eta * row[3] * sin + row[0], by_eta * row[3] * cos)
+
+
+@kernel
+def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
+    """Off a mirror whose normal leans by ψ from its shaft, the laser along +x (FORMULAS 2.2, Palmer)."""
+    aside = row[0] * cos
+    x, y, z = aside * row[2] - row[1] * row[3], row[0] * sin, aside * row[3] + row[1] * row[2]
+    return 1.0 - 2.0 * x * x, -2.0 * x * y, -2.0 * x * z
+
+
+@kernel
+def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
+    """∂u/∂γ of `nutating_beam`."""
+    sin, cos = row[0] * sin, row[0] * cos
+    x, y, z = cos * row[2] - row[1] * row[3], sin, cos * row[3] + row[1] * row[2]
+    dx, dy, dz = -sin * row[2], cos, -sin * row[3]
+    return -4.0 * x * dx, -2.0 * (dx * y + x * dy), -2.0 * (dx * z + x * dz)
+
+
+@kernel
+def risley_beam(row: Eight, first: Two, second: Two) -> Three:
+    """Through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
+
+    Before it the ray is a cone about z that turns with the first prism: the three surfaces before are passed once for
+    all, in `swath.georef.scanner.beams`. nan where the light is totally reflected. ``first``, ``second``: sine and
+    cosine of both prisms' angles.
+    """
+    x, y, z = row[0] * first[1], row[0] * first[0], row[1]
+    nx, ny, nz = row[2] * second[1], row[2] * second[0], row[3]
+    along = nx * x + ny * y + nz * z
+    more = math.sqrt(1.0 - row[4] * row[4] * (1.0 - along * along)) - row[4] * along
+    return row[4] * x + more * nx, row[4] * y + more * ny, row[4] * z + more * nz
+
+
+@kernel
+def risley_turn(row: Eight, first: Two, second: Two) -> Three:
+    """∂u/∂γ of `risley_beam`."""
+    x, y, z = row[0] * first[1], row[0] * first[0], row[1]
+    nx, ny, nz = row[2] * second[1], row[2] * second[0], row[3]
+    dnx, dny = -row[5] * ny, row[5] * nx
+    along = nx * x + ny * y + nz * z
+    dalong = dnx * x + dny * y - nx * y + ny * x
+    behind = math.sqrt(1.0 - row[4] * row[4] * (1.0 - along * along))
+    more = behind - row[4] * along
+    dmore = row[4] * dalong * (row[4] * along / behind - 1.0)
+    return dmore * nx + more * dnx - row[4] * y, dmore * ny + more * dny + row[4] * x, dmore * nz
+
+
+@kernel
+def spinning_angle(row: Eight, theta: float) -> float:
+    """Azimuth of a channel of a spinning head."""
+    return row[6] * theta + row[2]
+
+
+@kernel
+def spinning_beam(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
+    """Where a spinning head's beam starts (m), and its direction; azimuth from y towards x (FORMULAS 2.2)."""
+    start = row[4] * sin + row[3] * cos, row[4] * cos - row[3] * sin, row[5]
+    return start, (row[1] * sin, row[1] * cos, row[0])
+
+
+@kernel
+def spinning_turn(row: Eight, start: Three, direction: Three, range_m: float) -> Three:
+    """∂point/∂θ, m/rad."""
+    return row[6] * (start[1] + range_m * direction[1]), -row[6] * (start[0] + range_m * direction[0]), 0.0

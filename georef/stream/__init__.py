@@ -1,0 +1,1 @@
+"""Points while data come: clocks, path and scanners side by side."""

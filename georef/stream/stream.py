@@ -1,0 +1,375 @@
+"""Streaming georeferencing: records in the order of the log in, points out as soon as the trajectory covers them.
+
+Records are only collected when they come. All that is decided (what a clock says, whether a return is placed, waited
+for or given up) is decided in `Stream.advance`, at ticks of the log's own time. So the same log gives the same points
+however its records were cut, and whether it was still being written meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.georef.points import FATE_NAMES, ByteArray, Fate, Points
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.return_rows import Held, any_has, beyond, compact, joined, split, taken
+from swath.georef.stream.clocks import StreamClocks
+from swath.georef.stream.path import CompletePath, GrowingPath, Path
+
+if TYPE_CHECKING:
+    from swath.georef.trajectory.trajectory import Trajectory
+
+__all__ = ["CompletePath", "GrowingPath", "Path", "ScannerChain", "Stream", "StreamSettings"]
+
+SECOND_NS = 1_000_000_000
+CONTEXT_FLAG = 128  # of a return's flags: it is there for its neighbours only and gives no point itself
+FATES_BY_NAME = {name: fate for fate, name in FATE_NAMES.items()}
+NO_ROWS, NO_TIMES = np.empty(0, RETURN_DTYPE), np.empty(0, np.int64)
+ZONE_UNKNOWN = 255  # of a return's MTA zone
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSettings:
+    """How long what is waited for, in seconds of the log's time, and how much may wait.
+
+    Attributes:
+        trajectory_wait_s: a placed return for the trajectory to cover it.
+        time_wait_s: a return for a time that is good enough, as before the clocks are locked.
+        settle_s: so long a return is held before its time is asked, so that what the clocks hear after it counts too;
+            0: as soon as it comes.
+        max_time_sigma_ns: a worse time is none. A device that runs free is known by the arrival of its packets, 2 ms.
+        max_rows: of a scanner that wait for time, and as many that wait for the trajectory; the oldest are given up.
+    """
+
+    trajectory_wait_s: float = 2.0
+    time_wait_s: float = 5.0
+    settle_s: float = 0.0
+    max_time_sigma_ns: float = 1e6
+    max_rows: int = 4_000_000
+
+
+class Georeferences(Protocol):
+    """What makes points of a scanner's returns: `swath.georef.georeference.Georeferencer`."""
+
+    def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
+        """Points, and the fate of every row."""
+
+
+class Resolver(Protocol):
+    """Finds emissions of returns with pulses in air, may hold some back: `swath.georef.scanner.ranging.ZoneResolver`."""
+
+    counts: Counter[str]
+
+    @property
+    def waiting(self) -> int:
+        """Returns held back."""
+
+    def feed(self, rows: StructArray, predicted_m: NDArray[np.float64] | None = None) -> StructArray:
+        """Rows of which all is known now, in the order of emission."""
+
+    def flush(self) -> StructArray:
+        """The rest."""
+
+
+Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]]
+
+
+class Motion(Protocol):
+    """Finds the encoder's rate and acceleration from readings around: `swath.georef.scanner.encoder_motion.EncoderMotion`."""
+
+    def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
+        """Rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
+
+    def flush(self) -> Moving:
+        """The rest."""
+
+
+class GivenMotion:
+    """Hands the encoder's motion of the rows at hand to a `swath.georef.georeference.Georeferencer`."""
+
+    def __init__(self) -> None:
+        self.rate = self.acceleration = np.empty(0)
+
+    def motion(self, rows: StructArray, time_ns: Int64Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(n,) rad/s, rad/s² of the rows that are georeferenced now."""
+        del rows, time_ns
+        return self.rate, self.acceleration
+
+    def keep(self, which: NDArray[np.bool_]) -> None:
+        """Of those rows only the masked ones are georeferenced next."""
+        self.rate, self.acceleration = self.rate[which], self.acceleration[which]
+
+
+Predict = Callable[[StructArray, Int64Array, "Trajectory"], NDArray[np.float64]]
+LeftOut = Callable[[StructArray, Int64Array, ByteArray, "Trajectory | None"], None]
+
+
+@dataclass(slots=True)
+class ScannerChain:
+    """What a scanner's returns go through.
+
+    Attributes:
+        name: of the configuration.
+        georeferencer: makes points.
+        resolver: finds emissions where a return's zone is unknown; None: all are known.
+        predict: (n,) ranges that a terrain model expects of rows at GPS times; None: there is no model.
+        reach_ns: how much later than its stamp a return may ask the trajectory.
+        motion: tells how the encoder moved, where the calibration asks for it; holds back what it cannot tell yet.
+        given: where the georeferencer finds that; goes with ``motion``.
+        left_out: takes the returns that gave no point: rows, GPS times (-1: unknown), fates, and the trajectory where
+            one was asked. Those that the resolver drops it only counts.
+    """
+
+    name: str
+    georeferencer: Georeferences
+    resolver: Resolver | None = None
+    predict: Predict | None = None
+    reach_ns: int = 0
+    motion: Motion | None = None
+    given: GivenMotion | None = None
+    left_out: LeftOut | None = None
+
+
+class _Lane:
+    """One scanner's returns on their way."""
+
+    def __init__(self, chain: ScannerChain, settings: StreamSettings) -> None:
+        self.chain = chain
+        self.new: list[StructArray] = []
+        self.fates: Int64Array = np.zeros(len(Fate), np.int64)
+        self._settings = settings
+        self._untimed: deque[Held] = deque()
+        self._timed: deque[Held] = deque()
+        self._resolves = False  # a return of unknown zone has come
+        self._held_back = 0  # by resolver and motion
+
+    @property
+    def waiting(self) -> int:
+        """Returns that have no fate yet."""
+        return sum(len(held.rows) for queue in (self._untimed, self._timed) for held in queue) + self._held_back
+
+    def advance(self, tick_ns: int, clocks: StreamClocks, path: Path, *, last: bool) -> Points | None:
+        """Move on what can move; ``last``: nothing more will come."""
+        self._take(tick_ns)
+        self._place(tick_ns, clocks, last=last)
+        trajectory, covered_ns = path.update(), path.covered_until_ns
+        if trajectory is None or covered_ns is None:
+            self._give_up_unseen(tick_ns, last=last)
+            return None
+        ready = self._covered(tick_ns, covered_ns, last=last)
+        rows = joined([held.rows for held in ready], NO_ROWS)
+        time_ns = joined([held.time_ns for held in ready], NO_TIMES)
+        if self.chain.resolver is not None:
+            rows, time_ns = self._resolved(self.chain.resolver, rows, time_ns, trajectory, clocks, last=last)
+        return self._points(rows, time_ns, trajectory, last=last)
+
+    def _take(self, tick_ns: int) -> None:
+        pieces, self.new = [rows for rows in self.new if len(rows)], []
+        if pieces:
+            self._untimed.append(Held(compact(joined(pieces, NO_ROWS)), tick_ns, NO_TIMES))
+        for held in beyond(self._untimed, self._settings.max_rows):
+            self._give_up(held.rows, Fate.NO_TIME)
+
+    def _place(self, tick_ns: int, clocks: StreamClocks, *, last: bool) -> None:
+        """Give GPS times to what came and to what still has none; those that never will have one are counted."""
+        waiting, self._untimed = self._untimed, deque()
+        worth_asking = self._is_worth_asking(waiting, tick_ns, clocks)
+        for held in waiting:
+            waited_s = (tick_ns - held.since_ns) / SECOND_NS
+            if waited_s < self._settings.settle_s and not last:
+                self._untimed.append(held)
+                continue
+            overdue = last or waited_s >= self._settings.settle_s + self._settings.time_wait_s
+            if self._was_asked(held, tick_ns) and not overdue and not worth_asking:
+                self._untimed.append(held)
+                continue
+            good, time_ns = self._times(held.rows, clocks)
+            timed, rest = split(Held(held.rows, tick_ns, time_ns), good)
+            self._timed += timed
+            for untimed in rest:
+                if overdue:
+                    self._give_up(untimed.rows, Fate.NO_TIME)
+                else:
+                    self._untimed.append(Held(untimed.rows, held.since_ns, held.time_ns))
+        for held in beyond(self._timed, self._settings.max_rows):
+            self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
+
+    def _times(self, rows: StructArray, clocks: StreamClocks) -> tuple[NDArray[np.bool_], Int64Array]:
+        return clocks.place(f"scanner/{self.chain.name}", rows, self._settings.max_time_sigma_ns)
+
+    def _was_asked(self, held: Held, tick_ns: int) -> bool:
+        return (tick_ns - held.since_ns) / SECOND_NS > self._settings.settle_s
+
+    def _is_worth_asking(self, waiting: deque[Held], tick_ns: int, clocks: StreamClocks) -> bool:
+        """Whether the first or the last return that was asked in vain has a time by now, so that all are asked."""
+        asked = [held for held in waiting if self._was_asked(held, tick_ns)]
+        if not asked:
+            return False
+        ends = np.concatenate([asked[0].rows[:1], asked[-1].rows[-1:]])
+        return bool(self._times(ends, clocks)[0].any())
+
+    def _is_overdue(self, held: Held, tick_ns: int) -> bool:
+        return (tick_ns - held.since_ns) / SECOND_NS >= self._settings.trajectory_wait_s
+
+    def _give_up_unseen(self, tick_ns: int, *, last: bool) -> None:
+        """Nothing is known of where the aircraft was."""
+        while self._timed and (last or self._is_overdue(self._timed[0], tick_ns)):
+            held = self._timed.popleft()
+            self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
+
+    def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[Held]:
+        """Taken from the queue: what the trajectory covers, and what has waited for it for too long."""
+        ready: list[Held] = []
+        waiting, self._timed = self._timed, deque()
+        for held in waiting:
+            if last or self._is_overdue(held, tick_ns):
+                ready.append(held)
+                continue
+            covered, rest = split(held, held.time_ns <= covered_ns - self.chain.reach_ns)
+            ready += covered
+            self._timed += rest
+        return ready
+
+    def _resolved(
+        self,
+        resolver: Resolver,
+        rows: StructArray,
+        time_ns: Int64Array,
+        trajectory: Trajectory,
+        clocks: StreamClocks,
+        *,
+        last: bool,
+    ) -> tuple[StructArray, Int64Array]:
+        """Rows with the times of their emissions, of those that have become known."""
+        self._resolves = self._resolves or any_has(rows, "mta_zone", ZONE_UNKNOWN)
+        if not self._resolves:
+            return rows, time_ns
+        held = resolver.waiting
+        predict = self.chain.predict
+        given = (
+            [resolver.feed(rows, None if predict is None else predict(rows, time_ns, trajectory))] if len(rows) else []
+        )
+        given += [resolver.flush()] if last else []
+        known = joined(given, rows)
+        self._held_back += resolver.waiting - held
+        good, emitted_ns = self._times(known, clocks)
+        if good.all():
+            return known, emitted_ns
+        self._give_up(known[~good], Fate.NO_TIME)
+        return taken(known, good), emitted_ns[good]
+
+    def _points(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory, *, last: bool) -> Points | None:
+        chain = self.chain
+        if chain.motion is not None and chain.given is not None:
+            rows, time_ns, chain.given.rate, chain.given.acceleration = self._moving(
+                chain.motion, rows, time_ns, last=last
+            )
+        if any_has(rows, "flags", CONTEXT_FLAG):
+            own = rows["flags"] & CONTEXT_FLAG == 0
+            rows, time_ns = taken(rows, own), time_ns[own]
+            if chain.given is not None:
+                chain.given.keep(own)
+        if not len(rows):
+            return None
+        points, fates = chain.georeferencer.georeference(rows, time_ns, trajectory)
+        self.fates += np.bincount(fates, minlength=len(self.fates))
+        if chain.left_out is not None and fates.any():
+            lost = fates != Fate.GEOREFERENCED
+            if chain.given is not None:
+                chain.given.keep(lost)
+            chain.left_out(taken(rows, lost), time_ns[lost], fates[lost], trajectory)
+        return points if len(points) else None
+
+    def _moving(self, motion: Motion, rows: StructArray, time_ns: Int64Array, *, last: bool) -> Moving:
+        """Rows with the encoder's motion, of those where it is known."""
+        moving = motion.feed(rows, time_ns)
+        if last:
+            (one, at_ns, rate, acceleration), rest = moving, motion.flush()
+            moving = (
+                joined([one, rest[0]], NO_ROWS),
+                joined([at_ns, rest[1]], NO_TIMES),
+                np.concatenate([rate, rest[2]]),
+                np.concatenate([acceleration, rest[3]]),
+            )
+        self._held_back += len(rows) - len(moving[0])
+        return moving
+
+    def _give_up(self, rows: StructArray, fate: Fate, time_ns: Int64Array | None = None) -> None:
+        """Count returns without a point, but for those of the margin; pulses that gave none are no returns."""
+        own = (rows["flags"] & CONTEXT_FLAG == 0) & (rows["number_of_returns"] > 0)
+        count = int(np.count_nonzero(own))
+        self.fates[fate] += count
+        if self.chain.left_out is not None and count:
+            times = np.full(count, -1) if time_ns is None else time_ns[own]
+            self.chain.left_out(taken(rows, own), times, np.full(count, fate, np.uint8), None)
+
+
+class Stream:
+    """Takes records by source; gives (scanner's name, points) at ticks, in order of names and of arrival.
+
+    Attributes:
+        clocks: fed by whoever reads the log: readings, edges, messages, devices' samples.
+        path: fed alike with a device's INS solutions.
+    """
+
+    def __init__(
+        self,
+        chains: Mapping[str, ScannerChain],
+        clocks: StreamClocks,
+        path: Path,
+        settings: StreamSettings | None = None,
+    ) -> None:
+        self.clocks = clocks
+        self.path = path
+        self._lanes = {name: _Lane(chains[name], settings or StreamSettings()) for name in sorted(chains)}
+        self._tick_ns = 0
+
+    def chain(self, name: str) -> ScannerChain:
+        """What a scanner's returns go through."""
+        return self._lanes[name].chain
+
+    @property
+    def scanners(self) -> list[str]:
+        """Names, in the order in which points come."""
+        return list(self._lanes)
+
+    def add_returns(self, name: str, rows: StructArray) -> None:
+        """Returns of a scanner in the order in which its parser gave them; those with `CONTEXT_FLAG` give no point."""
+        self._lanes[name].new.append(rows)
+
+    def advance(self, tick_ns: int) -> list[tuple[str, Points]]:
+        """Decide on all that came, at a time of the log that never goes back."""
+        self._tick_ns = tick_ns
+        return self._advance(last=False)
+
+    def close(self) -> list[tuple[str, Points]]:
+        """The log is over: what still waits is georeferenced or given up."""
+        return self._advance(last=True)
+
+    def _advance(self, *, last: bool) -> list[tuple[str, Points]]:
+        self.clocks.update()
+        given = []
+        for name, lane in self._lanes.items():
+            points = lane.advance(self._tick_ns, self.clocks, self.path, last=last)
+            if points is not None:
+                given.append((name, points))
+        return given
+
+    def waiting(self, name: str) -> int:
+        """Returns of a scanner whose fate is not known yet."""
+        lane = self._lanes[name]
+        return lane.waiting + sum(len(rows) for rows in lane.new)
+
+    def fates(self, name: str) -> dict[Fate, int]:
+        """What became of a scanner's returns so far; those without a fate yet are `waiting`."""
+        lane = self._lanes[name]
+        counts = {fate: int(lane.fates[fate]) for fate in Fate}
+        if lane.chain.resolver is not None:
+            for reason, count in lane.chain.resolver.counts.items():
+                counts[FATES_BY_NAME[reason]] += count
+        return {fate: count for fate, count in counts.items() if count}

@@ -1,0 +1,1 @@
+"""Trajectories: fixed ones and those that grow."""
