@@ -132,7 +132,7 @@ def record_udp(length: int, rate: float, seconds: float) -> Figure:
 
 BARE = """
 import os, socket, sys, time
-from swath.drivers.transports.mmsg import MessageReader, ask_receive_buffer
+from swath.drivers.transports.datagrams import MessageReader, ask_receive_buffer
 port, path = int(sys.argv[1]), sys.argv[2]
 sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 ask_receive_buffer(sock, 32 << 20)

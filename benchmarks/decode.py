@@ -24,20 +24,20 @@ from fastcrc.crc64 import xz as crc64_xz
 
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.memory import keep_freed_memory
-from swath.drivers.core.frame_kinds import GNSS_KINDS
-from swath.drivers.core.framing import Frame, Framer
-from swath.drivers.core.parser import DeviceSettings, Parser, ParserCounters
+from swath.drivers.captures.opening import read_candump, read_pcap
+from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.imu.canmod_gps import CanmodGpsParser
-from swath.drivers.imu.dbc import DbcParser
-from swath.drivers.scanner.hesai import HesaiParser
-from swath.drivers.scanner.hesai_heads import QT64, XT32
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.ouster_layout import LidarLayout
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from swath.drivers.scanner.velodyne import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
-from swath.drivers.scanner.velodyne_heads import VLP16, VLP32C, VLS128
-from swath.drivers.transports.capture_file import read_candump, read_pcap
+from swath.drivers.imu.dbc.parser import DbcParser
+from swath.drivers.parser import DeviceSettings, Parser, ParserCounters
+from swath.drivers.scanner.hesai.heads import QT64, XT32
+from swath.drivers.scanner.hesai.parser import HesaiParser
+from swath.drivers.scanner.ouster.layout import LidarLayout
+from swath.drivers.scanner.ouster.parser import OusterParser
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepParser
+from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, VLS128
+from swath.drivers.scanner.velodyne.parser import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
 from swath.georef.records import IMU_DTYPE, RETURN_DTYPE, ByteRows, ChunkBatch, ImuSamples, Record, ScannerReturns
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"

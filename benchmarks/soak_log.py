@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log_parsers import stored_parsers
 from swath.daemon.replay import source_of_topic
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 from swath.georef.records import ChunkBatch
 
 

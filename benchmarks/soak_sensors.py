@@ -18,7 +18,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from swath.drivers.scanner.srep import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepHeader, encode_datagram
 
 PULSES = 72  # with one return slot: datagrams of 1204 bytes
 TICK_HZ = 10_000_000

@@ -10,7 +10,7 @@ import time
 
 from swath.daemon.config import DeviceEntry
 from swath.daemon.identify import Heard, not_understood
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.records import ChunkBatch, Int64Array
 

@@ -15,8 +15,8 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.exporting import MANIFEST
 from swath.daemon.log.format import LogError, safe_attachment_path
 from swath.daemon.sidecar import SUFFIX
+from swath.drivers.captures.opening import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.capture_file import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
 
 _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10

@@ -9,8 +9,8 @@ from swath.daemon.acquire import Wire
 from swath.daemon.config import Config
 from swath.daemon.log.format import ChannelSpec
 from swath.daemon.run import make_wire
-from swath.drivers.transports.capture_base import CapturedUnit
-from swath.drivers.transports.uri import TransportSpec
+from swath.drivers.captures.base import CapturedUnit
+from swath.drivers.transports.spec import TransportSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 from swath.daemon.capture_routes import Port, Routes
 from swath.daemon.sidecar import complete, cut_by_sidecar, sidecar_of
-from swath.drivers.transports.capture_base import (
+from swath.drivers.captures.base import (
     LATEST_NS,
     Address,
     CapturedUnit,
@@ -19,7 +19,7 @@ from swath.drivers.transports.capture_base import (
     read_lines,
     until_damage,
 )
-from swath.drivers.transports.capture_file import (
+from swath.drivers.captures.opening import (
     BareTime,
     chunk_table,
     read_bare,
@@ -28,7 +28,7 @@ from swath.drivers.transports.capture_file import (
     read_serial,
     read_tagged,
 )
-from swath.drivers.transports.pcap_frames import NOBODY
+from swath.drivers.captures.pcap_writer import NOBODY
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,11 @@ from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.host_clock import ClockDiscipline, read_clock_discipline
 from swath.daemon.identify import Heard, describe_time, not_understood
 from swath.daemon.places import nearest_there
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
-from swath.drivers.transports.can_link import interface_bitrate
-from swath.drivers.transports.uri import TransportSpec, open_transport, parse_pps
+from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.spec import TransportSpec, open_transport, parse_pps
 from swath.georef.records import ChunkBatch, TimeMessage
 from swath.georef.timescales import ahead_s, distance_text
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from swath.daemon.events import Events, Severity
 from swath.daemon.threads import name_thread
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.records import Chunk, Int64Array
 

@@ -15,11 +15,11 @@ from typing import Any
 
 from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.core.startup import Answer, StartupMessage, StartupWish
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.startup import Answer, StartupMessage, StartupWish
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.uri import TransportSpec, open_transport
+from swath.drivers.transports.spec import TransportSpec, open_transport
 
 SLICE_S = 0.1
 SETTLE_S = 0.3  # for a device to change the rate of its line

@@ -14,9 +14,9 @@ from swath.daemon.log.chunks import LogBatch
 from swath.daemon.log.format import ChannelSpec
 from swath.daemon.log.reader import LOOK_AHEAD_BYTES, LOOK_AHEAD_NS
 from swath.daemon.sidecar import SidecarWriter
-from swath.drivers.transports.candump_file import candump_line, held_by_line
-from swath.drivers.transports.capture_base import LATEST_NS, Address
-from swath.drivers.transports.pcap_frames import (
+from swath.drivers.captures.base import LATEST_NS, Address
+from swath.drivers.captures.candump import candump_line, held_by_line
+from swath.drivers.captures.pcap_writer import (
     FILE_HEADER,
     LATEST_PCAP_NS,
     NOBODY,
@@ -25,7 +25,7 @@ from swath.drivers.transports.pcap_frames import (
     pcap_frames,
 )
 from swath.drivers.transports.rtklib_tag import TagWriter
-from swath.drivers.transports.uri import TransportSpec, parse_transport
+from swath.drivers.transports.spec import TransportSpec, parse_transport
 from swath.georef.records import Int64Array
 
 # .ubx, .gps, .sbf: the names by which RTKLIB's convbin knows a format (app/convbin/convbin.c)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swath.daemon.config import CorrectionsConfig, DeviceEntry, DeviceTable, GnssConfig, ImuConfig, ScannerConfig
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import all_drivers, find_driver
+from swath.drivers.driver import all_drivers, find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # one frame may be chance

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from swath.daemon.config.config import Config, attachment_name, plain_table
 from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import LogError
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
-from swath.drivers.core.registry import UnknownProtocolError, find_driver
+from swath.drivers.driver import UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.toml_tables import TomlError, toml_tables
 
 

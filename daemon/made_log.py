@@ -24,7 +24,7 @@ from swath.daemon.log.encode import MESSAGE_HEADER_BYTES, encode_block
 from swath.daemon.log.format import CHUNK_OPEN_NS, SessionInfo
 from swath.daemon.log.writer import PartWriter
 from swath.daemon.parts import Attachment, Parts
-from swath.drivers.transports.capture_base import Address
+from swath.drivers.captures.base import Address
 
 STATUS_NS = 1_000_000_000
 _BEHIND = 1000  # units in a row so far behind the newest: its stamp was the wrong one

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from swath.daemon.log.chunks import LogBatch
-from swath.drivers.core.parser import DriverSettingsError, Parser
+from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.records import ChunkBatch
 
 RATE_STATUSES = 6  # rates are of the last five seconds

@@ -29,10 +29,10 @@ from swath.daemon.process import RecorderProcess
 from swath.daemon.recorder import Recorder, RecorderSettings
 from swath.daemon.sd_notify import ServiceManager
 from swath.daemon.timekeeper import TimeKeeper
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock
-from swath.drivers.transports.uri import TransportSpec, open_transport, parse_pps
+from swath.drivers.transports.spec import TransportSpec, open_transport, parse_pps
 from swath.georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls

@@ -19,7 +19,7 @@ from io import BufferedIOBase
 from pathlib import Path
 from types import TracebackType
 
-from swath.drivers.transports.capture_base import LATEST_NS, CaptureDamageError, CapturedUnit, open_capture, read_bytes
+from swath.drivers.captures.base import LATEST_NS, CaptureDamageError, CapturedUnit, open_capture, read_bytes
 
 SUFFIX = ".swath.csv.gz"
 _HEADER = "unit,time_ns,length,native,data"

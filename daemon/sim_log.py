@@ -29,8 +29,8 @@ from swath.daemon.made_log import MadeLog, Source, session_name
 from swath.daemon.process import CLOCK_PERIOD_S
 from swath.daemon.run import make_timekeeper
 from swath.daemon.sim_flight import Flight, VirtualClock, VirtualUnit
+from swath.drivers.captures.base import Address
 from swath.drivers.transports.base import UnitBlock
-from swath.drivers.transports.capture_base import Address
 
 HOST = "virtual"
 FIRST_HEAD = 201  # 192.168.1.201, where heads are as they come from the factory

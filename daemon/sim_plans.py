@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.drivers.core.extras import how_to_install
+from swath.drivers.extras import how_to_install
 
 if TYPE_CHECKING:
     from swath.daemon.sim_flight import Flight

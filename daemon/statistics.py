@@ -13,7 +13,7 @@ from swath.daemon.log.chunks import LogBatch, json_objects
 from swath.daemon.log.reader import Session
 from swath.daemon.log_parsers import stored_parsers
 from swath.daemon.replay import source_of_topic
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 from swath.georef.records import ChunkBatch, Int64Array
 
 USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from swath.daemon.events import Events, Severity
 from swath.daemon.host_clock import ClockDiscipline
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.records import ChunkBatch, Int64Array, NamesEdge, Record, TimeMessage
 from swath.georef.timescales import HostTimeline, PpsClock, WallComparison

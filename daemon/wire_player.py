@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.uri import TransportSpec, open_transport
+from swath.drivers.transports.spec import TransportSpec, open_transport
 
 EMPTY_LOOKS = 15  # of 10 ms, until a port counts as read to its end
 _PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted

@@ -7,9 +7,9 @@ from itertools import takewhile
 from pathlib import Path
 
 from swath.daemon.wire_player import TimedUnit
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.transports.capture_file import CapturedUnit, read_candump, read_pcap, read_serial
+from swath.drivers.captures.opening import CapturedUnit, read_candump, read_pcap, read_serial
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, TimeMessage, TimeScale
 from swath.georef.timescales import SECOND_NS, WEEK_NS
 

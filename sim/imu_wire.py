@@ -2,7 +2,7 @@
 
 One sample is four frames: X, Y and Z with specific force and angular rate of that axis, then SAMPLE with the counter at
 the interval's end. The counter at an edge of PPS comes in a message of its own, SYNC. Frames are written by
-`swath.drivers.imu.dbc_encoder` through the very DBC and signal map that the recorder reads them with.
+`swath.drivers.imu.dbc.encoder` through the very DBC and signal map that the recorder reads them with.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.imu.dbc_encoder import encode_latch, encode_samples
-from swath.drivers.imu.dbc_settings import map_signals
+from swath.drivers.imu.dbc.encoder import encode_latch, encode_samples
+from swath.drivers.imu.dbc.settings import map_signals
+from swath.drivers.parser import DeviceSettings
 from swath.sim.clocks import PulsePerSecond, generator
 from swath.sim.errors import PlanError
 from swath.sim.imu_grades import noise_of

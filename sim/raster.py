@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from swath.drivers.core.extras import how_to_install
+from swath.drivers.extras import how_to_install
 from swath.sim.errors import PlanError
 from swath.sim.plan import Plan
 from swath.sim.site import Site, geodetic_from_e

@@ -90,7 +90,7 @@ def test_drivers_and_the_shared_modules_use_of_georef_only_what_is_shared() -> N
     files = [*(ROOT / "drivers").rglob("*.py"), *shared]
     others = {path.name: georef_modules_imported(path) - SHARED_OF_GEOREF for path in files}
     assert {name: modules for name, modules in others.items() if modules} == {}
-    assert georef_modules_imported(ROOT / "drivers/gnss/nmea.py")
+    assert georef_modules_imported(ROOT / "drivers/gnss/nmea/parser.py")
 
 
 def test_files_and_checkout_stay_small() -> None:
@@ -118,7 +118,7 @@ def test_modules_stay_readable_in_one_sitting() -> None:
 
 
 def test_every_device_has_a_page() -> None:
-    from swath.drivers.core.registry import KINDS, all_drivers
+    from swath.drivers.driver import KINDS, all_drivers
 
     protocols = {protocol for kind in KINDS for protocol in all_drivers(kind)}
     pages = {path.stem for path in (ROOT / "docs/devices").glob("*.md")}
@@ -171,7 +171,7 @@ def test_every_event_is_explained() -> None:
 
 
 def test_the_example_of_a_new_device_is_a_driver() -> None:
-    from swath.drivers.core.parser import DeviceSettings, Driver
+    from swath.drivers.parser import DeviceSettings, Driver
     from swath.georef.records import Chunk
 
     (example,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/adding-a-device.md").read_text(), re.M | re.S)
@@ -194,7 +194,7 @@ def loaded_by(code: str) -> set[str]:
 
 
 def test_importing_the_recorder_loads_nothing_of_processing() -> None:
-    loaded = loaded_by("import swath.daemon.run, swath.drivers.core.registry as r; [r.all_drivers(k) for k in r.KINDS]")
+    loaded = loaded_by("import swath.daemon.run, swath.drivers.driver as r; [r.all_drivers(k) for k in r.KINDS]")
     assert "swath.daemon" in loaded
     assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
@@ -222,7 +222,7 @@ def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
     )
     processing = ["swath.calib.**", "swath.georef.**", "laspy", "matplotlib", "numba", "pyproj", "scipy"]
     assert light["ignore_imports"] == [
-        "swath.drivers.compiled.rows -> numba",
+        "swath.drivers.scanner.slots_compiled -> numba",
         "swath.daemon.sim_plans -> swath.sim.*",
         "swath.daemon.processing.calibration_plan -> swath.sim.*",
         "swath.daemon.processing.calibration_plan_page -> swath.sim.*",

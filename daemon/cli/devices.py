@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from swath.drivers.core.parser import Driver
+    from swath.drivers.parser import Driver
 
 
 def describe_driver(driver: Driver) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
 ) -> None:
     """List the protocols there are: how they come, what they yield, what the configuration must say."""
-    from swath.drivers.core.registry import KINDS, all_drivers
+    from swath.drivers.driver import KINDS, all_drivers
 
     listed = [describe_driver(driver) for kind in KINDS for driver in all_drivers(kind).values()]
     if as_json:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from swath.daemon.device_setup import DeviceSetup, Step, WireSetup
 
-MAX_BAUD = 20_000_000  # as in swath.drivers.transports.uri, which loads NumPy: too much for a help
+MAX_BAUD = 20_000_000  # as in swath.drivers.transports.spec, which loads NumPy: too much for a help
 
 
 def command(

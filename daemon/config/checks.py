@@ -16,12 +16,12 @@ from pydantic import BaseModel
 from swath.daemon.config.calibration_file import check_calibration
 from swath.daemon.config.config import Config, DeviceTable
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
-from swath.drivers.core.parser import DeviceKind, Driver, DriverSettingsError
-from swath.drivers.core.registry import UnknownProtocolError, find_driver
-from swath.drivers.core.startup import StartupWish
+from swath.drivers.driver import UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceKind, Driver, DriverSettingsError
+from swath.drivers.startup import StartupWish
 
 if TYPE_CHECKING:
-    from swath.drivers.transports.uri import TransportSpec
+    from swath.drivers.transports.spec import TransportSpec
 
 WILDCARD = "0.0.0.0"
 ROTATION_TOLERANCE = 1e-6  # of a matrix typed with 7 digits; 0.2 arc seconds
@@ -41,7 +41,7 @@ def check_devices(config: Config) -> list[str]:
 
 
 def _check_pps(config: Config) -> Iterator[str]:
-    from swath.drivers.transports.uri import parse_pps
+    from swath.drivers.transports.spec import parse_pps
 
     taken: dict[tuple[str, str], str] = {}
     for name, pps in config.pps.items():
@@ -170,7 +170,7 @@ def _described(model: type[BaseModel], key: str) -> str | None:
 
 
 def _check_transport(config: Config, section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
-    from swath.drivers.transports.uri import parse_transport
+    from swath.drivers.transports.spec import parse_transport
 
     allowed = ", ".join(driver.transports)
     try:
@@ -261,7 +261,7 @@ def _check_wires(config: Config) -> Iterator[str]:
 
 
 def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
-    from swath.drivers.transports.uri import parse_transport
+    from swath.drivers.transports.spec import parse_transport
 
     for kind, name, table in config.device_tables():
         for key in ("transport", "auxiliary"):

@@ -22,10 +22,10 @@ from swath.daemon.config.tables import (
     SessionConfig,
     Tables,
 )
-from swath.drivers.core.parser import DeviceKind, DeviceSettings
+from swath.drivers.parser import DeviceKind, DeviceSettings
 
 if TYPE_CHECKING:
-    from swath.drivers.transports.uri import TransportSpec
+    from swath.drivers.transports.spec import TransportSpec
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
@@ -161,7 +161,7 @@ class Config:
 
     def devices(self) -> Iterator[DeviceEntry]:
         """Every device: GNSS, IMU, scanners, corrections, in the order of the file."""
-        from swath.drivers.transports.uri import parse_transport
+        from swath.drivers.transports.spec import parse_transport
 
         for kind, name, table in self.device_tables():
             auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None

@@ -16,9 +16,9 @@ from swath.daemon.host_clock import read_clock_discipline
 from swath.daemon.log.claim import is_being_written
 from swath.daemon.parts import read_sign
 from swath.daemon.places import nearest_there
-from swath.drivers.transports.can_link import interface_bitrate
+from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.spec import TransportSpec
 from swath.drivers.transports.udp_socket import DEFAULT_BUFFER_MB
-from swath.drivers.transports.uri import TransportSpec
 
 DEFAULT_DIRECTORY = Path("/var/lib/swath")
 DEFAULT_RESERVE_BYTES = 512e6

@@ -23,7 +23,7 @@ from swath.daemon.log.reader import Session
 from swath.daemon.processing.models import connect
 from swath.daemon.processing.setup import Setup
 from swath.daemon.replay import source_of_topic
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 from swath.georef.points import Points
 from swath.georef.records import (
     IMU_DTYPE,

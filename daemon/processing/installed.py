@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.drivers.core.extras import how_to_install
+from swath.drivers.extras import how_to_install
 
 PROCESS = ("numba", "scipy", "pyproj", "laspy", "lazrs")
 EXTRA_OF = {"foxglove": "live", "matplotlib": "process"}  # package: what brings it

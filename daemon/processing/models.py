@@ -10,11 +10,11 @@ import numpy as np
 
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import AtmosphereConfig, GimbalConfig, ScannerConfig
-from swath.drivers.core.parser import Parser
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import Parser
 from swath.drivers.scanner.beams import BeamTable
-from swath.drivers.scanner.ouster_head import OusterHead
-from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.scanner.ouster.head import OusterHead
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.air.atmosphere import Air
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer

@@ -13,7 +13,7 @@ from swath.daemon.processing.feed import edges_of, readings_of
 from swath.daemon.processing.log_index import SCANNER, Listening
 from swath.daemon.processing.unread import refused_by
 from swath.daemon.replay import source_of_topic
-from swath.drivers.core.parser import PacketParser
+from swath.drivers.parser import PacketParser
 from swath.georef.records import (
     IMU_DTYPE,
     INS_DTYPE,

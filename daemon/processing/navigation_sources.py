@@ -18,8 +18,8 @@ from swath.daemon.log_parsers import stored_config
 from swath.daemon.processing.models import gimbal_sources
 from swath.daemon.processing.setup import Options
 from swath.daemon.processing.setup import Setup as PointSetup
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, Parser
-from swath.drivers.core.registry import UnknownProtocolError, find_driver
+from swath.drivers.driver import UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
 from swath.georef.stream.clocks import ClockPlan, DevicePlan
 

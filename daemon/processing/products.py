@@ -32,7 +32,7 @@ from swath.daemon.processing.trajectory_files import TrajectoryFiles, put_in_pla
 from swath.daemon.processing.unread import unread_lines
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.processing.workers import run_jobs
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
 from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import Segment, StripError, segments

@@ -13,7 +13,7 @@ from pyproj.exceptions import ProjError
 
 from swath.daemon.config.config import Config
 from swath.daemon.errors import ConfigError
-from swath.drivers.core.extras import how_to_install
+from swath.drivers.extras import how_to_install
 from swath.georef.coarse_terrain import CoarseTerrain
 
 FloatArray = NDArray[np.float64]

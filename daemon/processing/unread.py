@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from swath.drivers.core.parser import Parser
+from swath.drivers.parser import Parser
 
 BAD_CHECKSUM = "bad_checksum"
 SEQUENCE_GAP = "sequence_gap"

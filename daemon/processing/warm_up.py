@@ -32,14 +32,14 @@ from swath.daemon.processing.live_grid import CountGrid, count_points
 from swath.daemon.processing.live_products import Thinning
 from swath.daemon.processing.setup import Options, Setup
 from swath.daemon.processing.warm_navigation import warm_navigation
-from swath.drivers.core.parser import DeviceSettings, Parser
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.hesai import MODE_LAST_STRONGEST, encode_point_packet
-from swath.drivers.scanner.hesai import MODE_STRONGEST as HESAI_STRONGEST
-from swath.drivers.scanner.hesai_heads import XT32
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from swath.drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings, Parser
+from swath.drivers.scanner.hesai.heads import XT32
+from swath.drivers.scanner.hesai.parser import MODE_LAST_STRONGEST, encode_point_packet
+from swath.drivers.scanner.hesai.parser import MODE_STRONGEST as HESAI_STRONGEST
+from swath.drivers.scanner.ouster.parser import OusterParser
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
 from swath.georef.formats.las import LasSettings, LasWriter
 from swath.georef.points import Points
 from swath.georef.records import (

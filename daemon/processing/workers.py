@@ -15,7 +15,7 @@ from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.jobs import Job, JobResult, run_job
-from swath.drivers.core.extras import how_to_install
+from swath.drivers.extras import how_to_install
 
 TELL_EVERY_S = 0.2
 CONNECT_S = 10

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import datetime as dt
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 
 DEFAULT_DATE_FLOOR = dt.date(2009, 1, 1)
 GPS_EPOCH = dt.date(1980, 1, 6)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from swath.drivers.core.parser import ParserCounters
+from swath.drivers.parser import ParserCounters
 
 PartT = TypeVar("PartT")
 

@@ -1,4 +1,4 @@
-"""Named devices over `swath.drivers.imu.dbc`: their messages are known, their CAN identifiers are what the user set."""
+"""Named devices over `swath.drivers.imu.dbc.parser`: their messages are known, their CAN identifiers are what the user set."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from swath.drivers.core.can_frames import CAN_EFF_MASK, frame_id
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.imu.dbc_settings import SignalMap, map_signals
+from swath.drivers.can_frames import CAN_EFF_MASK, frame_id
+from swath.drivers.imu.dbc.settings import SignalMap, map_signals
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 
 
 def profile_map(

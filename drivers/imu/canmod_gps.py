@@ -1,7 +1,7 @@
 """CSS Electronics CANmod.gps: an automotive IMU (100 Hz) and a GNSS receiver (1 Hz) on one CAN bus.
 
-A preset over `swath.drivers.imu.dbc` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence inside).
-The
+A preset over `swath.drivers.imu.dbc.parser` with the maker's own DBC (canmod-gps.dbc beside this file, MIT licence
+inside). The
 device has no counter and no PPS output: its samples are timed by their arrival, and its time message, a second old
 and some 0.5 s late, names the edge before it for a host that has PPS from elsewhere.
 """
@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swath.drivers.core.can_frames import decode_can_frames
-from swath.drivers.core.parser import DeviceSettings, Driver
-from swath.drivers.imu.dbc import DbcParser
-from swath.drivers.imu.dbc_signals import SignalLayout, find_signal, load_database
+from swath.drivers.can_frames import decode_can_frames
+from swath.drivers.imu.dbc.parser import DbcParser
+from swath.drivers.imu.dbc.signals import SignalLayout, find_signal, load_database
+from swath.drivers.parser import DeviceSettings, Driver
 from swath.georef.records import (
     ByteRows,
     DeviceStatus,

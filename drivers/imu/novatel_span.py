@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from swath.drivers.core.parser import DeviceSettings, Driver
-from swath.drivers.gnss.novatel import NovatelParser
-from swath.drivers.gnss.novatel_startup import imu_startup_messages
+from swath.drivers.gnss.novatel.parser import NovatelParser
+from swath.drivers.gnss.novatel.startup import imu_startup_messages
+from swath.drivers.parser import DeviceSettings, Driver
 from swath.georef.records import ImuSamples, InsSolution
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from swath.drivers.core.parser import DeviceSettings, Driver
-from swath.drivers.gnss.sbf import SbfParser
-from swath.drivers.gnss.sbf_startup import imu_startup_messages
+from swath.drivers.gnss.sbf.parser import SbfParser
+from swath.drivers.gnss.sbf.startup import imu_startup_messages
+from swath.drivers.parser import DeviceSettings, Driver
 from swath.georef.records import ImuSamples, InsSolution
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swath.drivers.scanner.ouster_head import SYNC_PULSE
-from swath.drivers.scanner.ouster_layout import HEALTH, LidarLayout
+from swath.drivers.scanner.ouster.head import SYNC_PULSE
+from swath.drivers.scanner.ouster.layout import HEALTH, LidarLayout
 from swath.georef.records import DeviceStatus, Int64Array, StructArray
 
 

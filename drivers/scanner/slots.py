@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.core.extras import how_to_install
-from swath.drivers.core.parser import DriverSettingsError
+from swath.drivers.extras import how_to_install
+from swath.drivers.parser import DriverSettingsError
 from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 # Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
@@ -195,7 +195,7 @@ def filler(*, compiled: bool) -> Fill:
     if not compiled:
         return ReturnSlots.fill
     try:
-        from swath.drivers.compiled.rows import fill
+        from swath.drivers.scanner.slots_compiled import fill
     except ImportError as error:
         raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
     return fill

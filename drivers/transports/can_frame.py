@@ -10,7 +10,7 @@ import struct
 
 import can
 
-from swath.drivers.core.can_frames import (
+from swath.drivers.can_frames import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
     CAN_ERR_FLAG,

@@ -20,8 +20,8 @@ import serial
 from swath.drivers.transports.base import TransportError, UnitBlock, is_no_serial_port
 from swath.drivers.transports.descriptor import HUNG_UP, DescriptorTransport, Gate, wait_writable
 from swath.drivers.transports.holders import process_holding
-from swath.drivers.transports.pps_dcd import line_set
-from swath.drivers.transports.uri import TransportSpec
+from swath.drivers.transports.pps.serial_dcd import line_set
+from swath.drivers.transports.spec import TransportSpec
 
 DEFAULT_BAUD = 115200
 READ_BYTES = 65536

@@ -16,10 +16,10 @@ import struct
 import time
 
 from swath.drivers.transports.base import TransportError, UnitBlock
+from swath.drivers.transports.datagrams import DropCounter, MessageReader, ask_receive_buffer, ask_stamps
 from swath.drivers.transports.descriptor import DescriptorTransport, Gate
 from swath.drivers.transports.holders import udp_port_holder
-from swath.drivers.transports.mmsg import DropCounter, MessageReader, ask_receive_buffer, ask_stamps
-from swath.drivers.transports.uri import TransportSpec
+from swath.drivers.transports.spec import TransportSpec
 
 MAX_DATAGRAM_BYTES = 65535  # total length of an IPv4 packet is 16 bits, RFC 791
 SLOTS = 512

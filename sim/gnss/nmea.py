@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from swath.drivers.gnss.nmea_sentences import (
+from swath.drivers.gnss.nmea.sentences import (
     encode_gga,
     encode_gst,
     encode_hdt,

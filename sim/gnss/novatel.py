@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from swath.drivers.gnss import novatel_layouts as nov
-from swath.drivers.gnss.novatel_encoder import encode_log
-from swath.drivers.gnss.novatel_tables import CLOCK_VALID, POSITION_NONE, SOL_COMPUTED, UTC_VALID
+from swath.drivers.gnss.novatel import layouts as nov
+from swath.drivers.gnss.novatel.encoder import encode_log
+from swath.drivers.gnss.novatel.tables import CLOCK_VALID, POSITION_NONE, SOL_COMPUTED, UTC_VALID
 from swath.georef.records import FixType
 from swath.sim.gnss.calendar import Calendar
 from swath.sim.gnss.pulse import Pulse

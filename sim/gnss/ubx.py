@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from swath.drivers.gnss import ubx_messages as ubx
+from swath.drivers.gnss.ubx import messages as ubx
 from swath.georef.records import FixType
 from swath.georef.timescales import week_from_gps
 from swath.sim.gnss.calendar import NS_PER_MS, NS_PER_S, Calendar, Stamp

@@ -1,6 +1,6 @@
 """What an Ouster OS1 says: its metadata, and lidar packets, single (strongest) or dual return.
 
-Packets by `swath.drivers.scanner.ouster_layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second
+Packets by `swath.drivers.scanner.ouster.layout`. The head counts nanoseconds in mode TIME_FROM_SYNC_PULSE_IN: a second
 a pulse since power-on (`swath.sim.scanners.spinning_wire.HeadClock`).
 """
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from swath.drivers.scanner.ouster_head import SYNC_PULSE, read_head
-from swath.drivers.scanner.ouster_layout import LidarLayout
+from swath.drivers.scanner.ouster.head import SYNC_PULSE, read_head
+from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.errors import PlanError
 from swath.sim.plan import Plan

@@ -16,8 +16,8 @@ import math
 
 import numpy as np
 
-from swath.drivers.scanner.ouster_head import read_head
-from swath.drivers.scanner.velodyne_heads import PLACES, VLP16
+from swath.drivers.scanner.ouster.head import read_head
+from swath.drivers.scanner.velodyne.heads import PLACES, VLP16
 from swath.sim.clocks import Oscillator
 from swath.sim.errors import PlanError
 from swath.sim.plan_tables import ScannerTable

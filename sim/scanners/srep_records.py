@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.scanner.srep_layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
+from swath.drivers.scanner.srep.layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
 from swath.sim.plan_tables import ScannerTable
 from swath.sim.scanners.line_heads import emission_ticks
 from swath.sim.scanners.ranging import LIGHT_MPS, packed

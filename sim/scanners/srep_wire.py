@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.scanner.srep_layout import (
+from swath.drivers.scanner.srep.layout import (
     FLAG_LASER_ON,
     FLAG_PPS_LOCKED,
     FLAG_RANGE_GATE,

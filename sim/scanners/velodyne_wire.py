@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from swath.drivers.gnss.nmea_sentences import encode_rmc
-from swath.drivers.scanner.velodyne import MODE_DUAL, MODE_STRONGEST, encode_data_packet
-from swath.drivers.scanner.velodyne_heads import BLOCKS, PLACES
-from swath.drivers.scanner.velodyne_position import HOUR_US, encode_position_packet
+from swath.drivers.gnss.nmea.sentences import encode_rmc
+from swath.drivers.scanner.velodyne.heads import BLOCKS, PLACES
+from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
+from swath.drivers.scanner.velodyne.position import HOUR_US, encode_position_packet
 from swath.georef.timescales import SECOND_NS, utc_from_gps
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan import Plan

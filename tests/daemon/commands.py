@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 from swath.daemon.cli.main import COMMANDS, main
-from swath.drivers.core.registry import KINDS, all_drivers
+from swath.drivers.driver import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).parents[2]

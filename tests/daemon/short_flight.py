@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from swath.daemon.config import Config, load_config
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.sim_log import fly_into_log
-from swath.drivers.gnss import novatel_layouts as nov
-from swath.drivers.gnss.novatel_encoder import encode_log
-from swath.drivers.gnss.novatel_tables import CLOCK_VALID
+from swath.drivers.gnss.novatel import layouts as nov
+from swath.drivers.gnss.novatel.encoder import encode_log
+from swath.drivers.gnss.novatel.tables import CLOCK_VALID
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth

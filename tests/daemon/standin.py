@@ -12,11 +12,11 @@ import numpy as np
 
 from swath.daemon.config import Config, load_config
 from swath.daemon.errors import ExitCode, UserError
-from swath.drivers.gnss.novatel_encoder import encode_log
-from swath.drivers.gnss.novatel_layouts import Time
-from swath.drivers.imu.dbc_encoder import encode_samples
-from swath.drivers.imu.dbc_settings import map_signals
-from swath.drivers.scanner.srep_layout import FLAG_LASER_ON, FLAG_PPS_LOCKED, SrepHeader, encode_datagram
+from swath.drivers.gnss.novatel.encoder import encode_log
+from swath.drivers.gnss.novatel.layouts import Time
+from swath.drivers.imu.dbc.encoder import encode_samples
+from swath.drivers.imu.dbc.settings import map_signals
+from swath.drivers.scanner.srep.layout import FLAG_LASER_ON, FLAG_PPS_LOCKED, SrepHeader, encode_datagram
 
 AIRCRAFT = Path(__file__).parents[2] / "fixtures/config/aircraft.toml"
 WEEK, MONDAY_S = 2423, 86_400 + 9 * 3600 + 18  # 2026-06-15T09:00:00Z in GPS time

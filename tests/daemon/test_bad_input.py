@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.transports.capture_file import read_pcap
+from swath.drivers.captures.opening import read_pcap
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table

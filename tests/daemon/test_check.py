@@ -24,12 +24,12 @@ import pytest
 from swath.daemon.check import Report, bitrate_problems, check_everything
 from swath.daemon.config import DeviceEntry, parse_config
 from swath.daemon.identify import describe_tag, identify
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
-from swath.drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
-from swath.drivers.transports.capture_file import read_pcap
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.velodyne.position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
+from swath.drivers.transports.spec import parse_transport
 from swath.georef.records import ChunkBatch, TimeScale, TimeTag
 from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from swath.daemon.cli.main import COMMANDS, make_app
 from swath.daemon.errors import ExitCode
-from swath.drivers.core.registry import KINDS, all_drivers
+from swath.drivers.driver import KINDS, all_drivers
 from tests.daemon.rig import HANGS_S
 
 ROOT = Path(__file__).parents[2]

@@ -21,8 +21,8 @@ from swath.daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log_parsers import stored_parsers
 from swath.daemon.processing.models import mount_of
-from swath.drivers.core.registry import all_drivers
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.driver import all_drivers
+from swath.drivers.transports.spec import parse_transport
 
 ROOT = Path(__file__).parents[2]
 FIXTURES = ROOT / "fixtures/config"

@@ -24,8 +24,8 @@ import pytest
 
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log_parsers import stored_parsers
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.scanner.srep import SrepHeader, encode_datagram
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.scanner.srep.parser import SrepHeader, encode_datagram
 from swath.georef.records import ChunkBatch, DeviceClockSamples, Record
 from swath.georef.timescales import DeviceClock, PpsClock
 from tests.daemon import faulty_can

@@ -15,7 +15,7 @@ from swath.daemon.cli import setup
 from swath.daemon.config import parse_config
 from swath.daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
 from swath.daemon.errors import ExitCode, UserError
-from swath.drivers.transports import uri
+from swath.drivers.transports import spec as uri
 from tests.daemon.commands import swath
 from tests.daemon.receivers import (
     novatel_replies,

@@ -25,8 +25,8 @@ from swath.daemon.config import Config, load_config
 from swath.daemon.exporting import MANIFEST, ExportReport, export_session
 from swath.daemon.log.reader import open_logs
 from swath.daemon.sidecar import SUFFIX
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
 from tests.daemon.exchange import Unit, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log

@@ -23,10 +23,10 @@ from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
 from swath.daemon.processing.log_index import index_log
 from swath.daemon.processing.refusals import refuse_no_time, time_trouble
 from swath.daemon.processing.setup import Setup
-from swath.drivers.scanner.hesai import encode_point_packet
-from swath.drivers.scanner.hesai_gps import encode_gps_packet
-from swath.drivers.scanner.velodyne import encode_data_packet
-from swath.drivers.scanner.velodyne_position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
+from swath.drivers.scanner.hesai.gps import encode_gps_packet
+from swath.drivers.scanner.hesai.parser import encode_point_packet
+from swath.drivers.scanner.velodyne.parser import encode_data_packet
+from swath.drivers.scanner.velodyne.position import PPS_ABSENT, PPS_LOCKED, PPS_SYNCHRONIZING, encode_position_packet
 from swath.georef.records import DEVICE_CLOCK_DTYPE
 from swath.georef.stream.clocks import FrozenClocks
 from swath.georef.timescales import StampScale

@@ -20,10 +20,10 @@ from swath.daemon.log.reader import open_logs
 from swath.daemon.places import take_directory
 from swath.daemon.replay import timed_units
 from swath.daemon.sidecar import read_sidecar, sidecar_of
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.transports.capture_base import CaptureDamageError
-from swath.drivers.transports.capture_file import read_candump, read_pcap, read_serial
-from swath.drivers.transports.pcap_frames import FILE_HEADER, pcap_frames
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.captures.base import CaptureDamageError
+from swath.drivers.captures.opening import read_candump, read_pcap, read_serial
+from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath
 from tests.daemon.exchange import CONFIG, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch
 from tests.daemon.commands import swath
 from tests.daemon.rig import Recorder, session_table

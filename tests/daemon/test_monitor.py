@@ -32,8 +32,8 @@ from swath.daemon.log.writer import PartWriter
 from swath.daemon.monitor import Monitor
 from swath.daemon.monitor_source import Decoding
 from swath.daemon.run import read_boot_id
-from swath.drivers.core.parser import PacketParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.parser import PacketParser
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
-from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.scanner.ouster.head import read_head
 from swath.sim.scanners import ouster_wire
 from swath.sim.scanners.spinning_wire import HeadClock
 from tests.daemon import one_line

@@ -22,9 +22,9 @@ from swath.daemon.processing.models import (
     mount_of,
     refuse_logged_gimbals,
 )
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.srep import SrepParser
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate
 from swath.georef.scanner.beams import LineGeometry

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.processing.models import TerrainRanges, connect, make_resolver
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points

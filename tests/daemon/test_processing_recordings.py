@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.processing.models import geometry_of
-from swath.drivers.core.parser import DeviceSettings, PacketParser
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.hesai_heads import XT32
-from swath.drivers.scanner.velodyne_heads import VLP16, VLP32C, SpinningHead
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings, PacketParser
+from swath.drivers.scanner.hesai.heads import XT32
+from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, SpinningHead
 from swath.georef.records import StructArray
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import nominal

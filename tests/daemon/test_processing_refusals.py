@@ -18,7 +18,7 @@ from swath.daemon.processing.feed import LogClocks
 from swath.daemon.processing.setup import Options
 from swath.daemon.processing.sidecar import unit_doubts
 from swath.daemon.processing.unread import Unread, unread_lines
-from swath.drivers.core.parser import Parser, ParserCounters
+from swath.drivers.parser import Parser, ParserCounters
 from swath.georef.mapping.frame import Mapping
 from swath.georef.records import INS_DTYPE
 from swath.georef.timescales import ClockStatus, TimeState

@@ -33,9 +33,9 @@ from swath.daemon.processing.navigation_observations import (
 from swath.daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
 from swath.daemon.processing.navigation_times import counted_arrivals, imu_times
 from swath.daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.gnss.nmea import NmeaParser
-from swath.drivers.gnss.nmea_sentences import encode_gga
+from swath.drivers.gnss.nmea.parser import NmeaParser
+from swath.drivers.gnss.nmea.sentences import encode_gga
+from swath.drivers.parser import DeviceSettings
 from swath.georef.formats.antenna_positions import read_antenna_positions
 from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.diagnosis.data import Finding

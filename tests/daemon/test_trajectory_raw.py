@@ -18,7 +18,7 @@ from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
 from swath.daemon.processing.navigation_inputs import InputWish, read_inputs
 from swath.daemon.processing.navigation_times import imu_times, stretches
-from swath.drivers.gnss.novatel_encoder import encode_frame
+from swath.drivers.gnss.novatel.encoder import encode_frame
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.gnss.novatel import NovatelMessages

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.transports.base import Transport, TransportError
-from swath.drivers.transports.can_link import interface_bitrate
-from swath.drivers.transports.can_socket import SocketCanTransport
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.spec import parse_transport
 
 
 def ip(*arguments: str) -> None:

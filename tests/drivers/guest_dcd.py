@@ -9,9 +9,9 @@ import threading
 import time
 
 from swath.drivers.transports.base import RawEdge
-from swath.drivers.transports.pps_dcd import SerialDcdPps
+from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.transports.spec import parse_transport
 
 PORT = "/dev/ttyS1"
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from swath.drivers.transports.base import RawEdge, TransportError
-from swath.drivers.transports.pps_device import KernelPps
+from swath.drivers.transports.pps.kernel import KernelPps
 
 PARAMETERS = Path("/sys/module/pps_sim/parameters")
 SECOND_NS = 1_000_000_000

@@ -26,8 +26,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.framing import FrameKind
-from swath.drivers.core.parser import Parser, ParserCounters
+from swath.drivers.framing.framer import FrameKind
+from swath.drivers.parser import Parser, ParserCounters
 from swath.georef.records import (
     Chunk,
     ChunkBatch,

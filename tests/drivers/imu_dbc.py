@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings, Parser
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.parser import DeviceSettings, Parser
 from swath.georef.records import (
     IMU_DTYPE,
     ByteRows,

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.ouster_layout import PROFILES, LidarLayout
-from swath.drivers.transports.capture_file import read_pcap
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.ouster.layout import PROFILES, LidarLayout
+from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.georef.records import ImuSamples, Record, ScannerReturns, StructArray
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "ouster"

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.core.parser import PacketParser
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.beams import BeamTable, beam_points
-from swath.drivers.transports.capture_file import read_pcap
 from swath.georef.records import DeviceClockSamples, Record, ScannerReturns, StructArray
 from tests.drivers.recordings import FIXTURES
 

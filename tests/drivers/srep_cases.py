@@ -13,7 +13,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 
 TEST_VECTOR = bytes.fromhex(
     "535245500105020007000000030002002a0000008096980000ca9a3b0000000000d3d73b000000000000080000c2eb0b"

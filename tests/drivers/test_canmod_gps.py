@@ -13,10 +13,10 @@ import can
 import numpy as np
 import pytest
 
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.driver import find_driver
 from swath.drivers.imu.canmod_gps import CanmodGpsParser, make_time_parser, utc_tag
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import DeviceStatus, FixType, GnssFix, Record, TimeMessage
 from tests.drivers.harness import STREAM_HOST_NS, check_packet_damage, check_packets, packet_batches
 from tests.drivers.imu_dbc import imu_rows

@@ -15,9 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swath.drivers.core.can_frames import decode_can_frames
-from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.capture_file import (
+from swath.drivers.can_frames import decode_can_frames
+from swath.drivers.captures.opening import (
     BareTime,
     CapturedUnit,
     CaptureTally,
@@ -28,6 +27,7 @@ from swath.drivers.transports.capture_file import (
     read_pcap,
     read_serial,
 )
+from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.ip_packets import IpPackets, ip_packet
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"

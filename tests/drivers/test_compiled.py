@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from swath.drivers.compiled.rows import fill
-from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
-from swath.drivers.core.registry import all_drivers
+from swath.drivers.driver import all_drivers
+from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
 from swath.drivers.scanner.slots import PairRule, ReturnSlots, common_words, filler, in_order, returns_table
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.slots_compiled import fill
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Record, ScannerReturns, StructArray
 from tests.drivers.spinning import feed
 from tests.fuzz.recordings import packets_of, settings_of
@@ -118,7 +118,7 @@ def test_any_pulses_give_the_same_rows(named: tuple[bool, bool] | None, seed: in
 
 
 def test_without_numba_one_line_says_what_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "swath.drivers.compiled.rows")
+    monkeypatch.delitem(sys.modules, "swath.drivers.scanner.slots_compiled")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(DriverSettingsError, match=r"wants numba: pip install '\.\[process\]'"):
         filler(compiled=True)

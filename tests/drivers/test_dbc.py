@@ -13,17 +13,17 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.can_frames import (
+from swath.drivers.can_frames import (
     CAN_EFF_FLAG,
     CAN_ERR_FLAG,
     CAN_FRAME_DTYPE,
     decode_can_frames,
     encode_can_frame,
 )
-from swath.drivers.core.parser import DeviceSettings, Driver, DriverSettingsError, Parser
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
 from swath.drivers.imu.counters import CounterUnwrapper
-from swath.drivers.imu.dbc import DbcParser, make_clock_parser
+from swath.drivers.imu.dbc.parser import DbcParser, make_clock_parser
+from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, Parser
 from swath.georef.records import ChunkBatch, DeviceClockSamples, Int64Array, Record, StructArray
 from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
 from tests.drivers.imu_dbc import (

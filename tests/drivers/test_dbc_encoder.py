@@ -9,12 +9,12 @@ import cantools.database
 import numpy as np
 import pytest
 
-from swath.drivers.core.can_frames import CAN_EFF_MASK, CAN_FRAME_DTYPE
-from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.can_frames import CAN_EFF_MASK, CAN_FRAME_DTYPE
 from swath.drivers.imu import sbg_ellipse, xsens_mti
-from swath.drivers.imu.dbc import DbcParser
-from swath.drivers.imu.dbc_encoder import encode_latch, encode_samples
-from swath.drivers.imu.dbc_settings import SignalMap, map_signals
+from swath.drivers.imu.dbc.encoder import encode_latch, encode_samples
+from swath.drivers.imu.dbc.parser import DbcParser
+from swath.drivers.imu.dbc.settings import SignalMap, map_signals
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch
 from tests.drivers.imu_dbc import IMU_DBC, clock_rows, imu_rows, settings, without
 

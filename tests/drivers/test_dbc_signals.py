@@ -12,8 +12,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DriverSettingsError
-from swath.drivers.imu.dbc_signals import find_signal, load_database, signal_layout
+from swath.drivers.imu.dbc.signals import find_signal, load_database, signal_layout
+from swath.drivers.parser import DriverSettingsError
 from tests.drivers.imu_dbc import IMU_DBC
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"

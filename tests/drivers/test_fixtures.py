@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 import yaml
 
-from swath.drivers.core.parser import DeviceKind, DeviceSettings, Parser
-from swath.drivers.core.registry import find_driver
-from swath.drivers.gnss.novatel import message_name
+from swath.drivers.captures.opening import read_candump, read_pcap
+from swath.drivers.driver import find_driver
+from swath.drivers.gnss.novatel.parser import message_name
 from swath.drivers.imu.nmea2000 import pgn_and_source
-from swath.drivers.scanner.ouster_head import read_head
-from swath.drivers.transports.capture_file import read_candump, read_pcap
+from swath.drivers.parser import DeviceKind, DeviceSettings, Parser
+from swath.drivers.scanner.ouster.head import read_head
 from swath.georef.records import Chunk, ChunkBatch, Record, ScannerReturns, TimeMessage
 from tests.drivers.harness import packet_batches
 from tests.drivers.imu_dbc import imu_rows

@@ -17,7 +17,7 @@ from pyrtcm import calc_crc24q as crc24q_reference  # type: ignore[import-untype
 from pysbf2 import calc_crc as crc16_reference
 from pyubx2 import calc_checksum as fletcher_reference
 
-from swath.drivers.core.checksums import (
+from swath.drivers.framing.checksums import (
     CRC24Q_MARKED_BYTES,
     CRC24Q_STEP_BYTES,
     FLETCHER_STEP_BYTES,
@@ -28,7 +28,8 @@ from swath.drivers.core.checksums import (
     nmea_xor,
     ubx_fletcher,
 )
-from swath.drivers.core.frame_kinds import (
+from swath.drivers.framing.framer import Frame, FrameKind, Framer
+from swath.drivers.framing.kinds import (
     GNSS_KINDS,
     NMEA_MAX_BYTES,
     NOVATEL,
@@ -37,10 +38,9 @@ from swath.drivers.core.frame_kinds import (
     SBF_MAX_BYTES,
     UBX_MAX_PAYLOAD_BYTES,
 )
-from swath.drivers.core.framing import Frame, FrameKind, Framer
-from swath.drivers.core.parser import StreamParser
-from swath.drivers.gnss.nmea_sentences import encode_sentence
-from swath.drivers.gnss.ubx_messages import encode_frame
+from swath.drivers.gnss.nmea.sentences import encode_sentence
+from swath.drivers.gnss.ubx.messages import encode_frame
+from swath.drivers.parser import StreamParser
 from swath.georef.records import Chunk, Record
 from tests.drivers.harness import check_damage, check_garbage, check_stream
 from tests.drivers.recordings import every_recording, expected, gpsd_lines, gpsd_output, recording

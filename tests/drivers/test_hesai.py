@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.scanner.beams import beam_points
-from swath.drivers.scanner.hesai import (
+from swath.drivers.scanner.hesai.gps import encode_gps_packet
+from swath.drivers.scanner.hesai.heads import QT64, XT32, HesaiHead, read_angle_file
+from swath.drivers.scanner.hesai.parser import (
     DUAL_NAMES,
     MODE_FIRST,
     MODE_FIRST_STRONGEST,
@@ -26,8 +28,6 @@ from swath.drivers.scanner.hesai import (
     HesaiParser,
     encode_point_packet,
 )
-from swath.drivers.scanner.hesai_gps import encode_gps_packet
-from swath.drivers.scanner.hesai_heads import QT64, XT32, HesaiHead, read_angle_file
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.gnss import nmea_sentences as nmea
-from swath.drivers.gnss.nmea import DRIVERS, NmeaParser
+from swath.drivers.gnss.nmea import sentences as nmea
+from swath.drivers.gnss.nmea.parser import DRIVERS, NmeaParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import Chunk, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage, TimeScale
 from tests.drivers.harness import (
     canonical,

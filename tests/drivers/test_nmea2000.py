@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.driver import find_driver
 from swath.drivers.imu.nmea2000 import Nmea2000Parser, make_time_parser, pgn_and_source
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
 from tests.drivers.harness import STREAM_HOST_NS, check_packet_damage, check_packets, packet_batches, run_packets
 

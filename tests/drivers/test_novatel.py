@@ -9,10 +9,10 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.gnss.novatel import NovatelParser, make_time_parser
-from swath.drivers.gnss.novatel_tables import FIX_TYPES
+from swath.drivers.driver import find_driver
+from swath.drivers.gnss.novatel.parser import NovatelParser, make_time_parser
+from swath.drivers.gnss.novatel.tables import FIX_TYPES
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import (
     Chunk,
     DeviceStatus,

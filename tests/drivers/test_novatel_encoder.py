@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
-from swath.drivers.gnss import novatel_layouts as nov
-from swath.drivers.gnss.novatel import NovatelParser, make_time_parser
-from swath.drivers.gnss.novatel_encoder import encode_frame, encode_log
-from swath.drivers.gnss.novatel_tables import IMU_SCALES, TIME_STATUS_FINE
+from swath.drivers.driver import find_driver
+from swath.drivers.gnss.novatel import layouts as nov
+from swath.drivers.gnss.novatel.encoder import encode_frame, encode_log
+from swath.drivers.gnss.novatel.parser import NovatelParser, make_time_parser
+from swath.drivers.gnss.novatel.tables import IMU_SCALES, TIME_STATUS_FINE
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import (
     Chunk,
     EventMark,

@@ -14,8 +14,8 @@ import dpkt
 import numpy as np
 import pytest
 
-from swath.drivers.core.checksums import crc32_novatel
-from swath.drivers.transports.capture_file import CaptureTally, read_pcap
+from swath.drivers.captures.opening import CaptureTally, read_pcap
+from swath.drivers.framing.checksums import crc32_novatel
 from swath.georef.records import DeviceStatus, GnssFix, GnssHeading, InsSolution, TimeMessage
 from tests.drivers.novatel_ascii import FIXTURES, WEEK_NS, recording
 from tests.drivers.ros_bag import Message, read_bag

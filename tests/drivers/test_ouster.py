@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.ouster_head import beam_points, read_head
-from swath.drivers.scanner.ouster_imu import SAMPLE_DTYPE, encode_imu_packet
-from swath.drivers.scanner.ouster_layout import PROFILES, LidarLayout, with_crc
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.ouster.head import beam_points, read_head
+from swath.drivers.scanner.ouster.imu import SAMPLE_DTYPE, encode_imu_packet
+from swath.drivers.scanner.ouster.layout import PROFILES, LidarLayout, with_crc
+from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.georef.records import (
     RETURN_DTYPE,
     RETURN_FLAG_LAST,

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.ouster_head import read_head
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.scanner.ouster.head import read_head
+from swath.drivers.scanner.ouster.parser import OusterParser
 from tests.drivers.ouster_cases import SERIAL, metadata, metadata_of, parser_of
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.ouster_head import beam_points, read_head
-from swath.drivers.scanner.ouster_layout import LidarLayout
-from swath.drivers.transports.capture_file import read_pcap
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.ouster.head import beam_points, read_head
+from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.georef.records import Chunk, StructArray
 from tests.drivers.ouster_cases import EXPECTED, FIXTURES, feed, metadata_of, payloads, recorded, returns_of
 

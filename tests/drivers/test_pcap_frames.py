@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swath.drivers.transports.capture_base import Address
-from swath.drivers.transports.capture_file import read_pcap
-from swath.drivers.transports.pcap_frames import FILE_HEADER, LATEST_PCAP_NS, largest_payload, pcap_frames
+from swath.drivers.captures.base import Address
+from swath.drivers.captures.opening import read_pcap
+from swath.drivers.captures.pcap_writer import FILE_HEADER, LATEST_PCAP_NS, largest_payload, pcap_frames
 
 SCANNER: Address = ("192.168.1.201", 2368)
 HEAD: Address = ("fe80::1", 2368)

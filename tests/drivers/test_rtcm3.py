@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pyubx2 import ERR_IGNORE, RTCM3_PROTOCOL, UBXReader
 
-from swath.drivers.core.checksums import crc24q
-from swath.drivers.core.parser import DeviceSettings
 from swath.drivers.corrections.rtcm3 import Rtcm3Parser
+from swath.drivers.framing.checksums import crc24q
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, DeviceStatus
 from tests.drivers.harness import check_damage, check_stream
 from tests.drivers.recordings import expected, recording

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swath.drivers.captures.opening import CaptureTally, read_tagged
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.capture_file import CaptureTally, read_tagged
 from swath.drivers.transports.rtklib_tag import TagWriter, read_tags
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "rtklib"

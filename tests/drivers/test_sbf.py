@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from pysbf2 import ERR_RAISE, SBF_MSGIDS, SBF_PROTOCOL, SBFReader
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.gnss import sbf_blocks as sbf
-from swath.drivers.gnss.sbf import SbfParser, make_time_parser
-from swath.drivers.gnss.sbf_frame import NAMES, Layout, number_of, read_header
+from swath.drivers.gnss.sbf import blocks as sbf
+from swath.drivers.gnss.sbf.frame import NAMES, Layout, number_of, read_header
+from swath.drivers.gnss.sbf.parser import SbfParser, make_time_parser
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
 from tests.drivers.harness import canonical, check_damage, check_garbage, check_stream, feed_pieces
 from tests.drivers.recordings import expected, recording

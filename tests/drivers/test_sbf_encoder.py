@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from pysbf2 import ERR_RAISE, SBF_PROTOCOL, SBFReader
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
-from swath.drivers.gnss import sbf_blocks as sbf
-from swath.drivers.gnss.nmea_sentences import encode_sentence
-from swath.drivers.gnss.sbf import SbfParser
-from swath.drivers.gnss.sbf_frame import encode_frame
+from swath.drivers.driver import find_driver
+from swath.drivers.gnss.nmea.sentences import encode_sentence
+from swath.drivers.gnss.sbf import blocks as sbf
+from swath.drivers.gnss.sbf.frame import encode_frame
+from swath.drivers.gnss.sbf.parser import SbfParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import (
     Chunk,
     EventMark,

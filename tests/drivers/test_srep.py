@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import SrepHeader, datagram_bytes, encode_datagram
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.scanner.srep.layout import SrepHeader, datagram_bytes, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import (
     Chunk,
     ChunkBatch,

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.srep import FLAG_NO_POINT, SrepParser
-from swath.drivers.scanner.srep_layout import SrepHeader, encode_datagram
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import FLAG_NO_POINT, SrepParser
 from swath.georef.records import ChunkBatch, ScannerReturns, StructArray
 from swath.georef.stream.stream import CONTEXT_FLAG
 

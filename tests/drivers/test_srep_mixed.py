@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from fastcrc.crc32 import iso_hdlc as crc32
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner import srep
+from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.sequence import LATE_DATAGRAMS
 from swath.drivers.scanner.slots import ReturnSlots
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import CRC, SrepHeader, encode_datagram
+from swath.drivers.scanner.srep import parser as srep
+from swath.drivers.scanner.srep.layout import CRC, SrepHeader, encode_datagram
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Chunk, ChunkBatch, Record, StructArray
 from tests.drivers.harness import Outcome, outcome
 

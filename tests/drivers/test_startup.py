@@ -8,11 +8,15 @@ import re
 import pytest
 from pyubx2 import SET, UBX_CONFIG_DATABASE, UBXMessage, UBXReader
 
-from swath.drivers.core.frame_kinds import UBX_NAMES
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.startup import Answer, AnswerListener, StartupMessage, StartupWish
-from swath.drivers.gnss import novatel_layouts, novatel_startup, sbf_frame, sbf_startup, ubx_startup
-from swath.drivers.gnss.ubx_startup import AckListener
+from swath.drivers.framing.kinds import UBX_NAMES
+from swath.drivers.gnss.novatel import layouts as novatel_layouts
+from swath.drivers.gnss.novatel import startup as novatel_startup
+from swath.drivers.gnss.sbf import frame as sbf_frame
+from swath.drivers.gnss.sbf import startup as sbf_startup
+from swath.drivers.gnss.ubx import startup as ubx_startup
+from swath.drivers.gnss.ubx.startup import AckListener
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupWish
 from tests.drivers.recordings import FIXTURES
 
 ACK = UBXMessage("ACK", "ACK-ACK", 0, clsID=0x06, msgID=0x8A).serialize()

@@ -15,14 +15,14 @@ import can
 import numpy as np
 import pytest
 
-from swath.drivers.core.can_frames import CANFD_BRS, CANFD_FDF, encode_can_frame
+from swath.drivers.can_frames import CANFD_BRS, CANFD_FDF, encode_can_frame
 from swath.drivers.transports.base import Transport, TransportError, UnitBlock
-from swath.drivers.transports.can_bus import PythonCanTransport
+from swath.drivers.transports.can_adapter import PythonCanTransport
+from swath.drivers.transports.can_bitrate import bitrate_of_link, interface_bitrate
 from swath.drivers.transports.can_frame import pack_frame, unpack_frame
-from swath.drivers.transports.can_link import bitrate_of_link, interface_bitrate
-from swath.drivers.transports.can_socket import SocketCanTransport
-from swath.drivers.transports.mmsg import MessageReader, ask_stamps
-from swath.drivers.transports.uri import open_transport, parse_transport
+from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.datagrams import MessageReader, ask_stamps
+from swath.drivers.transports.spec import open_transport, parse_transport
 
 MULTICAST = "can:udp_multicast:239.74.163.2?port={}"
 

@@ -14,8 +14,8 @@ import pytest
 
 from swath.drivers.session import Session
 from swath.drivers.transports.base import PpsSource, RawEdge, TransportError
-from swath.drivers.transports.pps_dcd import SerialDcdPps, edge_at_wake_up
-from swath.drivers.transports.pps_device import (
+from swath.drivers.transports.pps.fixed import FixedPps
+from swath.drivers.transports.pps.kernel import (
     FETCH_DATA,
     PARAMETERS,
     PPS_FETCH,
@@ -25,7 +25,7 @@ from swath.drivers.transports.pps_device import (
     KernelPps,
     edge_of,
 )
-from swath.drivers.transports.pps_fixed import FixedPps
+from swath.drivers.transports.pps.serial_dcd import SerialDcdPps, edge_at_wake_up
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -19,7 +19,7 @@ import pytest
 from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import TransportError, UnitBlock
 from swath.drivers.transports.serial_port import SerialTransport
-from swath.drivers.transports.uri import TransportSpec, parse_transport
+from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 
 class Device:
@@ -166,7 +166,7 @@ def test_another_process_holds_the_port(device: Device) -> None:
     code = (
         "import sys\n"
         "from swath.drivers.transports.serial_port import SerialTransport\n"
-        "from swath.drivers.transports.uri import parse_transport\n"
+        "from swath.drivers.transports.spec import parse_transport\n"
         "t = SerialTransport(parse_transport('serial:' + sys.argv[1])); t.open()\n"
         "sys.stdout.write('open\\n'); sys.stdout.flush(); sys.stdin.read()\n"
     )

@@ -17,8 +17,8 @@ import pytest
 
 from swath.drivers.transports import holders
 from swath.drivers.transports.base import HEAD_ROOM_BYTES, TransportError, UnitBlock
+from swath.drivers.transports.spec import parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
-from swath.drivers.transports.uri import parse_transport
 
 GROUP = "239.74.163.77"
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.transports.can_bus import PythonCanTransport, keyword_value
-from swath.drivers.transports.can_socket import SocketCanTransport
-from swath.drivers.transports.pps_device import FixedPps, KernelPps, SerialDcdPps
+from swath.drivers.transports.can_adapter import PythonCanTransport, keyword_value
+from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
+from swath.drivers.transports.spec import open_transport, parse_pps, parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
-from swath.drivers.transports.uri import open_transport, parse_pps, parse_transport
 
 
 def test_udp_with_every_option() -> None:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pyubx2 import ERR_IGNORE, GET, UBX_PROTOCOL, UBXMessage, UBXReader
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.gnss import ubx_messages as ubx
-from swath.drivers.gnss.ubx import DRIVERS, UbxParser
+from swath.drivers.gnss.ubx import messages as ubx
+from swath.drivers.gnss.ubx.parser import DRIVERS, UbxParser
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, EventMark, FixType, GnssFix, NamesEdge, Record, TimeMessage, TimeScale
 from swath.georef.timescales import gps_ns_from_week, whole_gps_ns
 from tests.drivers.harness import (

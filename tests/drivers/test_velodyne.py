@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points
-from swath.drivers.scanner.velodyne import (
+from swath.drivers.scanner.velodyne.heads import VLP16
+from swath.drivers.scanner.velodyne.parser import (
     MODE_DUAL,
     MODE_LAST,
     MODE_STRONGEST,
     VelodyneParser,
     encode_data_packet,
 )
-from swath.drivers.scanner.velodyne_heads import VLP16
-from swath.drivers.scanner.velodyne_position import encode_position_packet, rmc_time
+from swath.drivers.scanner.velodyne.position import encode_position_packet, rmc_time
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,

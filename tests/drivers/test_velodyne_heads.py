@@ -9,13 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.scanner.beams import beam_points
-from swath.drivers.scanner.velodyne import MODE_DUAL, MODE_LAST, MODE_STRONGEST, VelodyneParser, encode_data_packet
-from swath.drivers.scanner.velodyne_calibration import read_calibration
-from swath.drivers.scanner.velodyne_heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
-from swath.drivers.scanner.velodyne_position import encode_position_packet
+from swath.drivers.scanner.velodyne.calibration import read_calibration
+from swath.drivers.scanner.velodyne.heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead
+from swath.drivers.scanner.velodyne.parser import (
+    MODE_DUAL,
+    MODE_LAST,
+    MODE_STRONGEST,
+    VelodyneParser,
+    encode_data_packet,
+)
+from swath.drivers.scanner.velodyne.position import encode_position_packet
 from swath.georef.records import (
     RETURN_DTYPE,
     RETURN_FLAG_LAST,

@@ -9,11 +9,11 @@ import cantools.database
 import numpy as np
 import pytest
 
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.core.registry import find_driver
-from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.driver import find_driver
+from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.xsens_mti import dbc_text, make_parser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from tests.drivers.harness import check_packet_damage, check_packets
 from tests.drivers.imu_dbc import feed, imu_rows
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swath.drivers.core.frame_kinds import XBUS, XBUS_MAX_DATA_BYTES
-from swath.drivers.core.framing import Framer
-from swath.drivers.core.parser import DeviceSettings, DriverSettingsError, ParserCounters
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.framing.framer import Framer
+from swath.drivers.framing.kinds import XBUS, XBUS_MAX_DATA_BYTES
 from swath.drivers.imu import xsens_xbus as xbus
 from swath.drivers.imu.xsens_xbus import XbusParser, make_time_parser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, ParserCounters
 from swath.georef.records import Chunk, ChunkBatch, NamesEdge, Record, TimeMessage
 from tests.drivers.harness import (
     STREAM_HOST_NS,

@@ -24,14 +24,14 @@ from swath.daemon.control import LINE_BYTES, Control
 from swath.daemon.errors import one_line
 from swath.daemon.events import Event, Events, Severity
 from swath.daemon.recorder import WriterHealth
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import KINDS, all_drivers
-from swath.drivers.core.startup import MAX_REPLY_BYTES, StartupWish
-from swath.drivers.transports import ntrip_client
+from swath.drivers.driver import KINDS, all_drivers
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.startup import MAX_REPLY_BYTES, StartupWish
+from swath.drivers.transports import ntrip as ntrip_client
 from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.descriptor import Gate
-from swath.drivers.transports.ntrip_client import NtripTransport
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.transports.ntrip import NtripTransport
+from swath.drivers.transports.spec import parse_transport
 from tests.drivers.harness import random_pieces
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.frames import FramePool, mutate_stream

@@ -25,7 +25,7 @@ from swath.daemon.log.format import ChannelSpec, LogError
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.writer import PartWriter
 from swath.daemon.sidecar import SUFFIX
-from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.transports.base import TransportError
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import FindingError, Target

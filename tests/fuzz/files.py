@@ -11,8 +11,8 @@ from pathlib import Path
 
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
+from swath.drivers.captures.opening import CaptureTally, read_candump, read_pcap, read_serial
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.capture_file import CaptureTally, read_candump, read_pcap, read_serial
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import damage

@@ -7,10 +7,10 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from swath.drivers.core import frame_kinds
-from swath.drivers.core.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
-from swath.drivers.core.framing import FrameKind, Framer
-from swath.drivers.core.parser import ParserCounters
+from swath.drivers.framing import kinds as frame_kinds
+from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
+from swath.drivers.framing.framer import FrameKind, Framer
+from swath.drivers.parser import ParserCounters
 from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {kind.name: kind for kind in vars(frame_kinds).values() if isinstance(kind, FrameKind)}

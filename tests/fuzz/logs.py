@@ -27,7 +27,7 @@ from swath.daemon.log.scan import Damage, scan
 from swath.daemon.log.writer import PartWriter
 from swath.daemon.replay import timed_units
 from swath.daemon.statistics import session_statistics
-from swath.drivers.core.can_frames import encode_can_frame
+from swath.drivers.can_frames import encode_can_frame
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import scan_lines
 from tests.fuzz import mcap_parts as mcap

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from swath.daemon.config.config import Config, plain_table
 from swath.daemon.config.tables import Tables
-from swath.drivers.core.can_frames import encode_can_frame
-from swath.drivers.core.parser import DeviceSettings, Driver, Parser
-from swath.drivers.imu.dbc import DbcParser
+from swath.drivers.can_frames import encode_can_frame
+from swath.drivers.captures.opening import read_candump, read_pcap
+from swath.drivers.imu.dbc.parser import DbcParser
+from swath.drivers.parser import DeviceSettings, Driver, Parser
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.capture_file import read_candump, read_pcap
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import split_datagrams
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.core import framing
-from swath.drivers.core.framing import Framer
-from swath.drivers.core.parser import DeviceSettings, ParserCounters
-from swath.drivers.gnss.ubx import UbxParser
+from swath.drivers.framing import framer as framing
+from swath.drivers.framing.framer import Framer
+from swath.drivers.gnss.ubx.parser import UbxParser
+from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.georef.records import Chunk
 from tests.fuzz.engine import Target, check, fuzz
 from tests.fuzz.frames import KINDS, SEALS, FramePool, mutate_stream, split_frames

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import beam_points
-from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.scanner.beams import (
     FibreGeometry,
     Geometry,

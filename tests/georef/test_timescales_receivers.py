@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, NamesEdge, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales import (
     HOUR_NS,

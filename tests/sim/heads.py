@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.core.parser import PacketParser
+from swath.drivers.parser import PacketParser
 from swath.georef.records import DeviceClockSamples, Record, ScannerReturns
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan import Plan, parse_plan

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.srep import SrepParser
-from swath.drivers.scanner.srep_layout import HEADER_DTYPE
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import HEADER_DTYPE
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Chunk, DeviceClockSamples, ScannerReturns
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable

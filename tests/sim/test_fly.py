@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, GnssFix, ScannerReturns
 from swath.sim.calibration_files import calibration_text
 from swath.sim.companions import companion_files, config_text, default_wires

@@ -17,8 +17,8 @@ import pytest
 from pyubx2 import UBXReader
 
 from swath.daemon.config.tables import GnssConfig
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import (
     Chunk,
     FixType,

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ImuConfig
-from swath.drivers.core.can_frames import CAN_FRAME_DTYPE
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.can_frames import CAN_FRAME_DTYPE
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.errors import PlanError

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.scanner.ouster import OusterParser
-from swath.drivers.scanner.ouster_head import beam_points, read_head
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.ouster.head import beam_points, read_head
+from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, DeviceClockSamples, ScannerReturns
 from swath.sim.errors import PlanError
 from swath.sim.plan import Plan

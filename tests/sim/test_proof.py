@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from swath.drivers.core.parser import DeviceSettings
-from swath.drivers.core.registry import find_driver
+from swath.drivers.driver import find_driver
+from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points as velodyne_points
-from swath.drivers.scanner.ouster_head import beam_points as ouster_points
-from swath.drivers.scanner.ouster_head import read_head
-from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.drivers.scanner.ouster.head import beam_points as ouster_points
+from swath.drivers.scanner.ouster.head import read_head
+from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import beam_points as velodyne_points
-from swath.drivers.scanner.ouster_head import beam_points as ouster_points
-from swath.drivers.scanner.ouster_head import read_head
-from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.drivers.scanner.ouster.head import beam_points as ouster_points
+from swath.drivers.scanner.ouster.head import read_head
+from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.records import RETURN_DTYPE
 from swath.sim.errors import PlanError
 from swath.sim.plan_tables import ScannerTable

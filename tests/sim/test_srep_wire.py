@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
-from swath.drivers.scanner.srep_layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
+from swath.drivers.scanner.srep.layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
 from swath.sim.clocks import Oscillator, PulsePerSecond
 from swath.sim.errors import PlanError
 from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
-from swath.drivers.core.parser import DeviceSettings
+from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points
-from swath.drivers.scanner.velodyne import VelodyneParser
-from swath.drivers.scanner.velodyne_heads import VLP16
+from swath.drivers.scanner.velodyne.heads import VLP16
+from swath.drivers.scanner.velodyne.parser import VelodyneParser
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,

@@ -27,7 +27,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.config import load_config
 from swath.daemon.processing.live_points import POINT_DTYPE
 from swath.daemon.sim_wire import CAN_GROUP, free_ports
-from swath.drivers.transports.uri import parse_transport
+from swath.drivers.transports.spec import parse_transport
 from swath.sim.companions import companion_files, config_text
 from swath.sim.fly import VirtualFlight
 from swath.sim.plan import parse_plan

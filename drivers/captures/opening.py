@@ -1,0 +1,31 @@
+"""Readers of recordings others made: pcap and pcapng, ``candump -L`` text, serial bytes with arrival times.
+
+Each gives the units that went over the wire, with the recorder's time, in the file's order; gzip is seen by its
+magic. For import, replaying, demonstrations and tests. A file that is not what it should be raises `TransportError`
+with one line, after the units before the bad place were given; a reader that is given a `CaptureTally` counts instead.
+"""
+
+from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning
+from swath.drivers.captures.candump import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
+from swath.drivers.captures.pcap import is_pcap, read_pcap
+from swath.drivers.captures.serial import BareTime, chunk_table, read_bare, read_serial, read_tagged
+
+__all__ = [
+    "Address",
+    "BareTime",
+    "CaptureTally",
+    "CapturedUnit",
+    "candump_line",
+    "chunk_table",
+    "held_by_line",
+    "is_candump",
+    "is_pcap",
+    "is_shown_candump",
+    "open_capture",
+    "read_bare",
+    "read_beginning",
+    "read_candump",
+    "read_pcap",
+    "read_serial",
+    "read_tagged",
+]

@@ -1,0 +1,243 @@
+"""Reader of pcap and pcapng: the UDP datagrams of a capture, with its stamps to the nanosecond. Nothing is read whole.
+
+Layouts: https://datatracker.ietf.org/doc/draft-ietf-opsawg-pcap/ (4, 5) and …/draft-ietf-opsawg-pcapng/ (3, 4).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BufferedIOBase
+from pathlib import Path
+
+from swath.drivers.captures.base import (
+    LATEST_NS,
+    CaptureDamageError,
+    CapturedUnit,
+    CaptureTally,
+    open_capture,
+    read_bytes,
+    report,
+    until_damage,
+)
+from swath.drivers.transports.base import TransportError
+from swath.drivers.transports.ip_packets import IpPackets, UnknownLinkError, ip_packet
+
+# pcap file header, magic as read little-endian: byte order of what follows, nanoseconds of one fraction
+_PCAP_KINDS = {
+    0xA1B2C3D4: ("<", 1000),
+    0xA1B23C4D: ("<", 1),
+    0xD4C3B2A1: (">", 1000),
+    0x4D3CB2A1: (">", 1),
+}
+_FILE_HEADER_BYTES = 24
+_MAX_PACKET_BYTES = 262_144  # libpcap's MAXIMUM_SNAPLEN; more means that the file is damaged
+
+_SECTION, _INTERFACE, _OLD_PACKET, _SIMPLE_PACKET, _ENHANCED_PACKET = 0x0A0D0D0A, 1, 2, 3, 6
+_BYTE_ORDER_MAGIC = 0x1A2B3C4D
+_IF_TSRESOL, _IF_TSOFFSET = 9, 14
+_MAX_BLOCK_BYTES = 16 << 20  # blocks of other kinds, such as keys and names, may be larger than packets
+
+Packet = tuple[int, int, bytes]  # time in ns, link type, frame
+
+
+def is_pcap(head: bytes) -> bool:
+    """Whether a file that begins so is a pcap or pcapng file."""
+    magic = int.from_bytes(head[:4], "little") if len(head) >= 4 else 0
+    return magic == _SECTION or magic in _PCAP_KINDS
+
+
+def read_pcap(
+    path: Path | str, port: int | None = None, tally: CaptureTally | None = None, *, drop_copies: bool = False
+) -> Iterator[CapturedUnit]:
+    """UDP datagrams of a pcap or pcapng file, IP fragments put together; other packets are passed over.
+
+    A datagram in fragments has the time of the one that completes it.
+
+    Args:
+        path: the file, possibly gzipped.
+        port: only datagrams to this port.
+        tally: counts what is damaged or passed over; where None, damage is raised.
+        drop_copies: see `IpPackets`.
+
+    Raises:
+        TransportError: no capture; without tally also: of an unknown link layer, cut short, or recorded with payloads
+            cut off.
+    """
+    return until_damage(_datagrams(Path(path), port, tally, drop_copies), tally)
+
+
+def _datagrams(path: Path, port: int | None, tally: CaptureTally | None, drop_copies: bool) -> Iterator[CapturedUnit]:
+    packets = IpPackets(drop_copies=drop_copies)
+    try:
+        with open_capture(path) as stream:
+            for time_ns, link, frame in _packets(stream, path, tally):
+                unit = _unit(packets, time_ns, link, frame, path, tally)
+                if unit is not None and (port is None or (unit.destination and unit.destination[1] == port)):
+                    yield unit
+    finally:
+        if tally is not None:
+            _tell(packets, path, tally)
+
+
+def _tell(packets: IpPackets, path: Path, tally: CaptureTally) -> None:
+    tally.passed.update({"packets captured twice": packets.copies, "packets without UDP": packets.others})
+    missing = packets.incomplete + packets.waiting
+    if missing:
+        tally.damaged(f"{path}: {missing} datagrams are not whole, fragments of them are missing")
+
+
+def _unit(
+    packets: IpPackets, time_ns: int, link: int, frame: bytes, path: Path, tally: CaptureTally | None
+) -> CapturedUnit | None:
+    cut_before = packets.cut
+    try:
+        found = packets.add(ip_packet(link, frame), time_ns)
+    except UnknownLinkError as error:
+        report(tally, f"{path}: {error}")
+        return None
+    length = 0
+    if found is not None and len(found[2]) >= 8:
+        from_port, to_port, length = struct.unpack_from(">HHH", found[2])
+    if packets.cut > cut_before or (found is not None and length > len(found[2])):
+        report(tally, f"{path}: payloads were cut off when recording; record with snap length 0")
+        return None
+    if found is None:
+        return None
+    if length < 8 or not 0 <= time_ns <= LATEST_NS:
+        if tally is not None:
+            tally.passed["packets that are no datagram"] += 1
+        return None
+    source, destination, segment = found
+    return CapturedUnit(time_ns, segment[8:length], "udp", (source, from_port), (destination, to_port))
+
+
+def _packets(stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> Iterator[Packet]:
+    """Time, link type and bytes of each packet."""
+    head = read_bytes(stream, 4, path)
+    magic = struct.unpack("<I", head)[0] if len(head) == 4 else 0
+    if magic == _SECTION:
+        yield from _PcapngReader(stream, path, tally).packets()
+        return
+    if magic not in _PCAP_KINDS:
+        raise TransportError(f"{path}: neither pcap nor pcapng")
+    order, fraction_ns = _PCAP_KINDS[magic]
+    rest = read_bytes(stream, _FILE_HEADER_BYTES - 4, path)
+    if len(rest) < _FILE_HEADER_BYTES - 4:
+        raise CaptureDamageError(f"{path}: ends in its header")
+    link = struct.unpack(f"{order}I", rest[-4:])[0] & 0xFFFF  # above: of the frame check sequence, and reserved
+    record = struct.Struct(f"{order}IIII")
+    at = _FILE_HEADER_BYTES
+    while head := read_bytes(stream, record.size, path):
+        if len(head) < record.size:
+            raise CaptureDamageError(f"{path}: ends in a record header at byte {at}")
+        seconds, fraction, captured, _ = record.unpack(head)
+        packet = read_bytes(stream, captured, path) if captured <= _MAX_PACKET_BYTES else b""
+        if len(packet) < captured:
+            raise CaptureDamageError(f"{path}: ends in a packet, or is damaged, at byte {at}")
+        yield seconds * 1_000_000_000 + fraction * fraction_ns, link, packet
+        at += record.size + captured
+
+
+@dataclass(frozen=True, slots=True)
+class _Interface:
+    """What an interface description block says of stamps: ``per_s`` counts a second, from ``offset_s`` on."""
+
+    link: int
+    per_s: int = 1_000_000
+    offset_s: int = 0
+
+    def time_ns(self, count: int) -> int:
+        return self.offset_s * 1_000_000_000 + count * 1_000_000_000 // self.per_s
+
+
+class _PcapngReader:
+    """The packets of a pcapng file of which the first block's type has been read."""
+
+    def __init__(self, stream: BufferedIOBase, path: Path, tally: CaptureTally | None) -> None:
+        self._stream = stream
+        self._path = path
+        self._tally = tally
+        self._order = "<"
+        self._interfaces: list[_Interface] = []
+        self._at = 0
+
+    def packets(self) -> Iterator[Packet]:
+        """Time, link type and bytes of each packet."""
+        kind = _SECTION
+        while True:
+            body = self._block(kind)
+            try:
+                packet = self._take(kind, body)
+            except (struct.error, IndexError) as error:
+                raise self._damage("a block that does not hold what it should") from error
+            if packet is not None:
+                yield packet
+            head = read_bytes(self._stream, 4, self._path)
+            if not head:
+                return
+            if len(head) < 4:
+                raise self._damage("ends in a block")
+            kind = struct.unpack(f"{self._order}I", head)[0]
+
+    def _damage(self, what: str) -> CaptureDamageError:
+        return CaptureDamageError(f"{self._path}: damaged pcapng: {what} at byte {self._at}")
+
+    def _read(self, count: int) -> bytes:
+        data = read_bytes(self._stream, count, self._path)
+        if len(data) < count:
+            raise self._damage("ends in a block")
+        return data
+
+    def _block(self, kind: int) -> bytes:
+        """A block's body; the byte order of a new section is learned before its length can be read."""
+        head = self._read(4)
+        start = b""
+        if kind == _SECTION:
+            start = self._read(4)
+            self._order = "<" if int.from_bytes(start, "little") == _BYTE_ORDER_MAGIC else ">"
+            if struct.unpack(f"{self._order}I", start)[0] != _BYTE_ORDER_MAGIC:
+                raise self._damage("a section without byte order")
+            self._interfaces = []
+        length = struct.unpack(f"{self._order}I", head)[0]
+        if length < 12 + len(start) or length % 4 or length > _MAX_BLOCK_BYTES:
+            raise self._damage(f"a block of {length} bytes")
+        body = start + self._read(length - 12 - len(start))
+        if self._read(4) != head:
+            raise self._damage("a block whose two lengths differ")
+        self._at += length
+        return body
+
+    def _take(self, kind: int, body: bytes) -> Packet | None:
+        if kind == _INTERFACE:
+            self._interfaces.append(self._interface(body))
+        elif kind == _ENHANCED_PACKET:
+            number, high, low, captured, _ = struct.unpack_from(f"{self._order}IIIII", body)
+            return self._packet(number, high, low, captured, body)
+        elif kind == _OLD_PACKET:
+            number, _, high, low, captured, _ = struct.unpack_from(f"{self._order}HHIIII", body)
+            return self._packet(number, high, low, captured, body)
+        elif kind == _SIMPLE_PACKET and self._tally is not None:
+            self._tally.passed["packets without a time"] += 1
+        return None
+
+    def _packet(self, number: int, high: int, low: int, captured: int, body: bytes) -> Packet:
+        if captured > len(body) - 20:
+            raise self._damage("a packet longer than its block")
+        interface = self._interfaces[number]
+        return interface.time_ns(high << 32 | low), interface.link, body[20 : 20 + captured]
+
+    def _interface(self, body: bytes) -> _Interface:
+        link, per_s, offset_s, at = struct.unpack_from(f"{self._order}H", body)[0], 1_000_000, 0, 8
+        while at + 4 <= len(body):
+            code, length = struct.unpack_from(f"{self._order}HH", body, at)
+            value = body[at + 4 : at + 4 + length]
+            if code == _IF_TSRESOL:
+                per_s = 2 ** (value[0] & 0x7F) if value[0] & 0x80 else 10 ** value[0]
+            elif code == _IF_TSOFFSET:
+                offset_s = struct.unpack(f"{self._order}q", value)[0]
+            elif code == 0:
+                break
+            at += 4 + (length + 3) // 4 * 4
+        return _Interface(link, per_s, offset_s)

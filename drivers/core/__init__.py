@@ -1,1 +1,0 @@
-"""Framing, checksums and the parser contract that every protocol file shares."""

@@ -1,0 +1,272 @@
+"""NMEA 0183: GGA, GNS, RMC, ZDA, VTG, GST and HDT of any talker (v4.11; u-blox and NovAtel manuals agree).
+
+Time: RMC and ZDA name the previous PPS edge, in UTC. RMC vouches for its time by status A; ZDA says nothing itself and
+is believed while the stream's latest GGA, GNS or RMC has a fix, or where it has none of them. A tag off the whole
+second does not vote.
+
+Fix: the sentences of one time of day make one `GnssFix` (`swath.drivers.gnss.epochs`): position and quality of GGA,
+else of GNS, else of RMC; date of RMC or ZDA of the same time; velocity of RMC, else of VTG, which carries no time and
+so belongs to the epoch it comes in; sigmas of GST. Height is the altitude plus the geoid separation of GGA or GNS, None
+where the receiver leaves either empty. No vertical velocity. Empty fields are a receiver without a fix, not an error.
+GNS has a mode for each constellation; the best of them is the fix's, as one position is made of all. Where a receiver
+adds a GNS for each constellation, these have no mode and tell satellites only: they are not taken.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.kinds import GNSS_KINDS
+from swath.drivers.gnss.date_floor import ReceiverDates
+from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.nmea.sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
+from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.georef.records import (
+    Chunk,
+    FixType,
+    GnssFix,
+    GnssHeading,
+    NamesEdge,
+    Record,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+
+# GGA field 6, quality; 9 is NovAtel's SBAS
+FIX_TYPE_BY_QUALITY = {
+    0: FixType.NONE,
+    1: FixType.SINGLE,
+    2: FixType.DIFFERENTIAL,
+    3: FixType.SINGLE,
+    4: FixType.RTK_FIXED,
+    5: FixType.RTK_FLOAT,
+    6: FixType.DEAD_RECKONING,
+    7: FixType.MANUAL,
+    8: FixType.SIMULATED,
+    9: FixType.DIFFERENTIAL,
+}
+# mode indicator, RMC field 12, VTG field 9 and, of each constellation, GNS field 6; before NMEA 2.3 there was none
+FIX_TYPE_BY_MODE = {
+    "": FixType.SINGLE,
+    "A": FixType.SINGLE,
+    "D": FixType.DIFFERENTIAL,
+    "P": FixType.SINGLE,
+    "F": FixType.RTK_FLOAT,
+    "R": FixType.RTK_FIXED,
+    "E": FixType.DEAD_RECKONING,
+    "M": FixType.MANUAL,
+    "S": FixType.SIMULATED,
+    "N": FixType.NONE,
+}
+MODES_BEST_FIRST = "RFDPAEMS"
+POSITION_SENTENCES = ("GGA", "GNS", "RMC")  # the first that is there says position and quality
+VOUCHED = frozenset(
+    {FixType.SINGLE, FixType.DIFFERENTIAL, FixType.RTK_FLOAT, FixType.RTK_FIXED}  # satellites, not a guess
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What one sentence says of its epoch."""
+
+    host_time_ns: int
+    time_ns: int | None
+    fix_type: FixType | None = None
+    position_rad: tuple[float, float] | None = None
+    height_m: float | None = None
+    satellites: int | None = None
+    velocity_l: tuple[float, float, float] | None = None
+    position_cov_l: NDArray[np.float64] | None = None
+    date: dt.date | None = None
+    undulation_m: float | None = None
+
+
+class NmeaParser(StreamParser):
+    """Sentences to records; UBX and RTCM3 on the same port are framed and counted.
+
+    Args:
+        settings: ``date_floor`` is the oldest date believed, ``add_weeks`` is added to all.
+        time_only: time messages only, the same ones.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
+        super().__init__()
+        self._dates = ReceiverDates(settings)
+        self._framer = Framer(GNSS_KINDS, self.counters)
+        self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
+        self._time_only = time_only
+        self._has_fix: bool | None = None  # by the latest GGA, GNS or RMC
+        self._decoders: dict[bytes, Callable[[int, Sentence], list[Record]]] = {
+            b"GGA": self._gga,
+            b"GNS": self._gns,
+            b"RMC": self._rmc,
+            b"ZDA": self._zda,
+        }
+        if not time_only:
+            self._decoders |= {b"VTG": self._vtg, b"GST": self._gst, b"HDT": self._hdt}
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one read."""
+        return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def close(self) -> list[Record]:
+        """Release the tail and the last epoch."""
+        records = self._decode(self._framer.close())
+        return records + self._fixes(self._epochs.end())
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's dates."""
+        return self._dates.remarks()
+
+    def _decode(self, frames: list[Frame]) -> list[Record]:
+        records: list[Record] = []
+        for kind, host_time_ns, data in frames:
+            decoder = self._decoders.get(data[3:6])
+            if decoder is None or kind != "nmea" or data[6:7] != b"," or data[1:2] == b"P":
+                continue
+            try:
+                records += decoder(host_time_ns, Sentence(data[3:6].decode(), data))
+            except FieldError:
+                self.counters.bad_messages += 1
+        return records
+
+    # --- sentences ---
+
+    def _gga(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        quality = sentence.number("gps_qual")
+        fix_type = FIX_TYPE_BY_QUALITY.get(int(quality), FixType.NONE) if quality is not None else FixType.NONE
+        return self._solution(host_time_ns, sentence, fix_type, "GGA")
+
+    def _gns(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        modes = sentence.text("mode_indicator")
+        if not modes:
+            return []
+        mode = next((mode for mode in MODES_BEST_FIRST if mode in modes), "N")
+        return self._solution(host_time_ns, sentence, FIX_TYPE_BY_MODE[mode], "GNS")
+
+    def _solution(self, host_time_ns: int, sentence: Sentence, fix_type: FixType, name: str) -> list[Record]:
+        time_ns, position = sentence.time_ns(), sentence.position_rad()
+        altitude, separation = sentence.number("altitude"), sentence.number("geo_sep")
+        satellites = sentence.number("num_sats")
+        self._has_fix = fix_type in VOUCHED
+        part = Part(
+            host_time_ns,
+            time_ns,
+            fix_type,
+            position,
+            altitude + separation if altitude is not None and separation is not None else None,
+            int(satellites) if satellites is not None else None,
+            undulation_m=separation,
+        )
+        return self._add(name, part)
+
+    def _rmc(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ddmmyy(), host_time_ns)
+        position, speed = sentence.position_rad(), sentence.number("spd_over_grnd")
+        velocity = velocity_from_course(None if speed is None else speed * MPS_PER_KNOT, sentence.number("true_course"))
+        fix_type = FIX_TYPE_BY_MODE.get(sentence.text("mode_indicator"), FixType.NONE)
+        if sentence.text("status") != "A":
+            fix_type = FixType.NONE
+        self._has_fix = fix_type in VOUCHED
+        records = self._time_message(host_time_ns, time_ns, date, self._has_fix, "RMC")
+        part = Part(host_time_ns, time_ns, fix_type, position, velocity_l=velocity, date=self._believed(date))
+        return records + self._add("RMC", part)
+
+    def _zda(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ymd(), host_time_ns)
+        records = self._time_message(host_time_ns, time_ns, date, self._has_fix is not False, "ZDA")
+        return records + self._add("ZDA", Part(host_time_ns, time_ns, date=self._believed(date)))
+
+    def _vtg(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        knots, kmph = sentence.number("spd_over_grnd_kts"), sentence.number("spd_over_grnd_kmph")
+        speed = knots * MPS_PER_KNOT if knots is not None else None if kmph is None else kmph * MPS_PER_KMPH
+        velocity = velocity_from_course(speed, sentence.number("true_track"))
+        return self._add("VTG", Part(host_time_ns, self._epochs.key, velocity_l=velocity))
+
+    def _gst(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        sigmas = [sentence.number(f"std_dev_{axis}") for axis in ("latitude", "longitude", "altitude")]
+        known = [sigma for sigma in sigmas if sigma is not None]
+        covariance = np.diag(np.square(np.array(known))) if len(known) == 3 else None
+        return self._add("GST", Part(host_time_ns, sentence.time_ns(), position_cov_l=covariance))
+
+    def _hdt(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
+        heading = sentence.number("heading")
+        if heading is None:
+            return []
+        return [GnssHeading(host_time_ns, time=None, heading_rad=math.radians(heading), message="HDT")]
+
+    # --- time and epochs ---
+
+    def _time_message(
+        self, host_time_ns: int, time_ns: int | None, date: dt.date | None, vouched: bool, name: str
+    ) -> list[Record]:
+        """The previous edge's second; a date before the floor is a week rolled over, and counted."""
+        if time_ns is None:
+            return []
+        if date is not None and date < self._dates.floor:
+            self.counters.errors["date_before_floor"] += 1
+        tag = TimeTag(TimeScale.UTC, time_ns, date=date)
+        valid = vouched and self._believed(date) is not None
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
+
+    def _believed(self, date: dt.date | None) -> dt.date | None:
+        return date if date is not None and date >= self._dates.floor else None
+
+    def _meant(self, date: dt.date | None, host_time_ns: int) -> dt.date | None:
+        return None if date is None else self._dates.date(date, host_time_ns)
+
+    def _add(self, name: str, part: Part) -> list[Record]:
+        if part.time_ns is None or self._time_only:
+            return []
+        return self._fixes(self._epochs.add(part.time_ns, name, part))
+
+    def _fixes(self, epochs: list[dict[str, Part]]) -> list[Record]:
+        return [fix for parts in epochs if (fix := merge_epoch(parts)) is not None]
+
+
+def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
+    """One fix of an epoch's sentences; None where none that says a position is among them."""
+    message = next((name for name in POSITION_SENTENCES if name in parts), "")
+    solution = parts.get(message)
+    if solution is None or solution.fix_type is None or solution.time_ns is None:
+        return None
+    others = [parts[name] for name in ("RMC", "VTG", "ZDA", "GST") if name in parts]
+    velocity = next((part.velocity_l for part in others if part.velocity_l is not None), None)
+    date = next((part.date for part in others if part.date is not None), None)
+    lat_rad, lon_rad = solution.position_rad or (None, None)
+    return GnssFix(
+        host_time_ns=solution.host_time_ns,
+        time=TimeTag(TimeScale.UTC, solution.time_ns, date=date),
+        lat_rad=lat_rad,
+        lon_rad=lon_rad,
+        height_m=solution.height_m,
+        velocity_l=velocity,
+        position_cov_l=parts["GST"].position_cov_l if "GST" in parts else None,
+        fix_type=solution.fix_type,
+        satellites=solution.satellites,
+        valid=solution.fix_type in VOUCHED and lat_rad is not None,
+        message=message,
+        undulation_m=solution.undulation_m,
+    )
+
+
+DRIVERS = (
+    Driver(
+        protocol="nmea",
+        kind="gnss",
+        transports=("serial",),
+        yields=(TimeMessage, GnssFix, GnssHeading),
+        summary="NMEA 0183 sentences of any receiver (GGA GNS RMC ZDA VTG GST HDT)",
+        make_parser=NmeaParser,
+        make_time_parser=lambda settings: NmeaParser(settings, time_only=True),
+        names_edge=NamesEdge.PREVIOUS,
+    ),
+)

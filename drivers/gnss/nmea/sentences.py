@@ -1,0 +1,218 @@
+"""NMEA 0183 sentences: fields read by pynmea2's tables, times and numbers strictly; and an encoder for each.
+
+pynmea2 says which field is where and turns coordinates into degrees. Times are read here: second 60 of a leap second
+must pass and fractions stay exact, which ``datetime.time`` allows neither.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+import re
+from typing import Any
+
+import pynmea2
+
+from swath.drivers.framing.checksums import nmea_xor
+
+SECOND_NS = 1_000_000_000
+DAY_NS = 86_400 * SECOND_NS
+MPS_PER_KNOT = 1852.0 / 3600.0
+MPS_PER_KMPH = 1.0 / 3.6
+
+TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d*))?")
+NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d*)?|\.\d+)")
+DEGREES_MINUTES = re.compile(r"(\d{1,3})([0-5]\d(?:\.\d*)?)")
+DATE_DDMMYY = re.compile(r"\d{6}")
+
+
+class FieldError(ValueError):
+    """A field that cannot be read; the sentence is counted as bad."""
+
+
+class Sentence:
+    """One sentence's fields by pynmea2's names.
+
+    Args:
+        kind: ``GGA``; a type pynmea2 knows.
+        frame: the whole sentence, its checksum known to be good.
+    """
+
+    def __init__(self, kind: str, frame: bytes) -> None:
+        fields = frame[1 : frame.rindex(b"*")].decode("ascii").split(",")
+        self._message: Any = pynmea2.TalkerSentence.sentence_types[kind](fields[0][:-3], kind, fields[1:])
+
+    def text(self, name: str) -> str:
+        """The field as it came; empty where the sentence is shorter."""
+        place: int = self._message.name_to_idx[name]
+        data: list[str] = self._message.data
+        return data[place] if place < len(data) else ""
+
+    def number(self, name: str) -> float | None:
+        """A number; None where the field is empty."""
+        text = self.text(name)
+        if not text:
+            return None
+        if not NUMBER.fullmatch(text):
+            raise FieldError(f"{name}: {text!r}")
+        return float(text)
+
+    def time_ns(self) -> int | None:
+        """Nanoseconds of the UTC day, 86 400 s and above in a leap second; None where the receiver has no time."""
+        text = self.text("timestamp")
+        if not text:
+            return None
+        match = TIME.fullmatch(text)
+        if not match:
+            raise FieldError(f"time {text!r}")
+        hours, minutes, seconds = (int(part) for part in match.group(1, 2, 3))
+        if seconds == 60 and (hours, minutes) != (23, 59):
+            raise FieldError(f"time {text!r}")
+        fraction = ((match.group(4) or "") + "000000000")[:9]
+        return (hours * 3600 + minutes * 60 + seconds) * SECOND_NS + int(fraction)
+
+    def position_rad(self) -> tuple[float, float] | None:
+        """Latitude and longitude; None where empty."""
+        if not (self.text("lat") and self.text("lon")):
+            return None
+        if self.text("lat_dir") not in ("N", "S") or self.text("lon_dir") not in ("E", "W"):
+            raise FieldError("hemisphere")
+        latitude, longitude = self._degrees("lat", 90.0), self._degrees("lon", 180.0)
+        south, west = self.text("lat_dir") == "S", self.text("lon_dir") == "W"
+        return math.radians(-latitude if south else latitude), math.radians(-longitude if west else longitude)
+
+    def _degrees(self, name: str, most: float) -> float:
+        """Of degrees and minutes; point and digits behind it may be missing (NMEA 0183)."""
+        text = self.text(name)
+        match = DEGREES_MINUTES.fullmatch(text)
+        if match is None or (degrees := float(match[1]) + float(match[2]) / 60.0) > most:
+            raise FieldError(f"{name} {text!r}")
+        return degrees
+
+    def date_ddmmyy(self) -> dt.date | None:
+        """RMC's date; two digits of the year are 1980 to 2079."""
+        text = self.text("datestamp")
+        if not text:
+            return None
+        if not DATE_DDMMYY.fullmatch(text):
+            raise FieldError(f"date {text!r}")
+        year = int(text[4:6])
+        return checked_date(year + (1900 if year >= 80 else 2000), int(text[2:4]), int(text[:2]))
+
+    def date_ymd(self) -> dt.date | None:
+        """ZDA's date."""
+        texts = [self.text(name) for name in ("year", "month", "day")]
+        if not any(texts):
+            return None
+        if not all(text.isdecimal() for text in texts):
+            raise FieldError(f"date {texts}")
+        return checked_date(*(int(text) for text in texts))
+
+
+def checked_date(year: int, month: int, day: int) -> dt.date:
+    """A date of the calendar.
+
+    Raises:
+        FieldError: it is not on the calendar.
+    """
+    try:
+        return dt.date(year, month, day)
+    except (ValueError, OverflowError):
+        raise FieldError(f"date {year}-{month}-{day}") from None
+
+
+def velocity_from_course(speed_mps: float | None, course_deg: float | None) -> tuple[float, float, float] | None:
+    """North, east and an unsaid down component; None where speed or course is empty."""
+    if speed_mps is None or course_deg is None:
+        return None
+    course = math.radians(course_deg)
+    return speed_mps * math.cos(course), speed_mps * math.sin(course), math.nan
+
+
+# --- encoders -------------------------------------------------------------------------------------------------------
+
+
+def encode_sentence(body: str) -> bytes:
+    """``$body*hh`` and the line end."""
+    raw = body.encode("ascii")
+    return b"$%s*%02X\r\n" % (raw, nmea_xor(raw))
+
+
+def _time_text(time_ns: int) -> str:
+    """hhmmss.ss of nanoseconds of the UTC day, 235960 in a leap second."""
+    centiseconds = time_ns // 10_000_000
+    seconds, hundredths = divmod(centiseconds, 100)
+    leap = max(0, seconds - 86_399)
+    minutes, second = divmod(seconds - leap, 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours:02d}{minute:02d}{second + leap:02d}.{hundredths:02d}"
+
+
+def _angle_text(angle_rad: float, degree_digits: int, letters: str) -> str:
+    """ddmm.mmmmmmmm and the hemisphere's letter."""
+    scaled = round(abs(math.degrees(angle_rad)) * 60e8)
+    degrees, minutes = divmod(scaled, 60 * 10**8)
+    whole, fraction = divmod(minutes, 10**8)
+    return f"{degrees:0{degree_digits}d}{whole:02d}.{fraction:08d},{letters[angle_rad < 0]}"
+
+
+def _position_text(lat_rad: float, lon_rad: float) -> str:
+    return f"{_angle_text(lat_rad, 2, 'NS')},{_angle_text(lon_rad, 3, 'EW')}"
+
+
+def encode_gga(
+    time_ns: int,
+    lat_rad: float,
+    lon_rad: float,
+    altitude_m: float,
+    separation_m: float,
+    *,
+    quality: int = 1,
+    satellites: int = 12,
+    talker: str = "GN",
+) -> bytes:
+    """Altitude above the receiver's geoid and the geoid's height above the ellipsoid; time of the UTC day."""
+    return encode_sentence(
+        f"{talker}GGA,{_time_text(time_ns)},{_position_text(lat_rad, lon_rad)},{quality},{satellites:02d},0.80,"
+        f"{altitude_m:.4f},M,{separation_m:.4f},M,,"
+    )
+
+
+def encode_rmc(
+    time_ns: int,
+    date: dt.date,
+    lat_rad: float,
+    lon_rad: float,
+    speed_mps: float,
+    course_rad: float,
+    *,
+    valid: bool = True,
+    talker: str = "GN",
+) -> bytes:
+    """Position, speed over ground and course; ``valid=False`` is status V, mode N."""
+    return encode_sentence(
+        f"{talker}RMC,{_time_text(time_ns)},{'A' if valid else 'V'},{_position_text(lat_rad, lon_rad)},"
+        f"{speed_mps / MPS_PER_KNOT:.4f},{math.degrees(course_rad) % 360.0:.4f},{date:%d%m%y},,,{'A' if valid else 'N'}"
+    )
+
+
+def encode_zda(time_ns: int, date: dt.date, *, talker: str = "GN") -> bytes:
+    """UTC time and date, local zone 0."""
+    return encode_sentence(f"{talker}ZDA,{_time_text(time_ns)},{date:%d,%m,%Y},00,00")
+
+
+def encode_gst(time_ns: int, sigma_n_m: float, sigma_e_m: float, sigma_d_m: float, *, talker: str = "GN") -> bytes:
+    """Sigmas of latitude, longitude and height; the error ellipse is left empty."""
+    return encode_sentence(f"{talker}GST,{_time_text(time_ns)},,,,,{sigma_n_m:.4f},{sigma_e_m:.4f},{sigma_d_m:.4f}")
+
+
+def encode_vtg(speed_mps: float, course_rad: float, *, talker: str = "GN") -> bytes:
+    """Course over ground and speed."""
+    course = math.degrees(course_rad) % 360.0
+    knots, kmph = speed_mps / MPS_PER_KNOT, speed_mps / MPS_PER_KMPH
+    return encode_sentence(f"{talker}VTG,{course:.4f},T,,M,{knots:.4f},N,{kmph:.4f},K,A")
+
+
+def encode_hdt(heading_rad: float, *, talker: str = "GN") -> bytes:
+    """True heading."""
+    return encode_sentence(f"{talker}HDT,{math.degrees(heading_rad) % 360.0:.4f},T")

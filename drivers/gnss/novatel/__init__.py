@@ -1,0 +1,1 @@
+"""NovAtel OEM logs, binary and ASCII."""

@@ -1,0 +1,68 @@
+"""Start-up messages of NovAtel receivers: commands in abbreviated ASCII (OEM7 Commands and Logs).
+
+LOG without a port logs to the port the command came by. A receiver answers ``<OK`` or ``<ERROR:…`` on a line of its
+own and then its prompt (``[COM1]``); recordings in ``fixtures/novatel`` hold the former. The logs' triggers are those
+of NovAtel's own ROS driver (novatel_oem7_driver, ``std_init_commands.yaml``); of MARKxTIME, the LOG command's page.
+"""
+
+from __future__ import annotations
+
+import re
+
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.startup import PhraseListener, StartupMessage, StartupWish, read_setup
+
+ACCEPTED = re.compile(rb"<OK\r?\n")
+REFUSED = re.compile(rb"<ERROR:?([^\r\n]*)\r?\n")
+
+PULSE = "PPSCONTROL ENABLE_FINETIME POSITIVE 1.0 1000"  # no pulse before FINE; period s, width as from the factory
+EVENT_LOGS = ("MARK1TIMEB ONNEW", "MARK2TIMEB ONNEW")
+HEADING_LOGS = ("HEADING2B ONNEW",)
+RAW_LOGS = (
+    "RANGEB ONTIME 1",
+    "RAWEPHEMB ONNEW",
+    "GLOEPHEMERISB ONNEW",
+    "GALINAVEPHEMERISB ONNEW",
+    "GALFNAVEPHEMERISB ONNEW",
+    "BDSEPHEMERISB ONNEW",
+)
+# INSPVAS has no sigmas, INSPVAX says them once a second; georeferencing that takes the INS's attitude as it is logged
+# interpolates between epochs, so they are 20 ms apart
+IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVASB ONTIME 0.02", "INSPVAXB ONTIME 1", "INSCONFIGB ONCHANGED")
+SAVE = "SAVECONFIG"
+
+
+def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+    """Baud rate where it changes, PPS, logs of time, position, events and raw measurements.
+
+    Raises:
+        DriverSettingsError: a port is named, which a NovAtel needs not.
+    """
+    setup = read_setup(settings)
+    if setup.port is not None:
+        raise DriverSettingsError(f"setup.port: got {setup.port!r}; novatel logs to the port that it is asked by")
+    period_s = f"{1 / setup.rate_hz:g}"
+    logs = ["TIMEB ONTIME 1", f"BESTPOSB ONTIME {period_s}", f"BESTVELB ONTIME {period_s}", *EVENT_LOGS]
+    if settings.config.get("secondary_lever_arm_m") is not None:
+        logs += HEADING_LOGS
+    if setup.raw:
+        logs += RAW_LOGS
+    messages = [_command(PULSE), *(_command(f"LOG {log}") for log in logs)]
+    if wish.baud is not None:
+        # break detection off: bytes at another rate may look like a break, which sets the port back to 9600
+        messages.insert(0, _command(f"SERIALCONFIG THISPORT {wish.baud} N 8 1 N OFF", baud=wish.baud))
+    return (*messages, *_saving(wish))
+
+
+def imu_startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+    """Logs of the IMU and INS in a receiver's stream."""
+    return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(wish))
+
+
+def _saving(wish: StartupWish) -> tuple[StartupMessage, ...]:
+    return (_command(SAVE, last=True),) if wish.save else ()
+
+
+def _command(text: str, *, baud: int | None = None, last: bool = False) -> StartupMessage:
+    data = text.encode("ascii") + b"\r\n"
+    return StartupMessage((text,), data, lambda: PhraseListener(ACCEPTED, REFUSED), baud=baud, last=last)

@@ -1,0 +1,1 @@
+"""Septentrio Binary Format."""

@@ -1,0 +1,366 @@
+"""u-blox UBX: NAV-PVT, NAV-HPPOSLLH, NAV-COV, NAV-TIMEGPS, NAV-TIMEUTC, NAV-TIMELS, NAV-SOL, NAV-EOE, TIM-TP, TIM-TM2.
+
+RXM-RAWX gives its time where no other message of the stream gives one: a log of raw measurements for post-processing.
+Everything else, RTCM3 and NMEA on the same port included, is framed, checked and counted.
+
+Time: NAV-TIMEGPS and NAV-SOL carry GPS week and time of week in one message, NAV-PVT the UTC date; they name the
+previous PPS edge, and so does NAV-TIMEUTC. TIM-TP names the next and is bound to it; its quantisation is the edge's own
+error, edge = true second − qErr (u-blox states no sign; a counter started by a reference and stopped by an F9T's pulse
+needed + qErr, anderswallin.net 2019/10). The epoch is a whole millisecond of iTOW by definition: a time message's tag
+is rounded to it, a fix's is not.
+
+An iTOW is joined with a week of the same message or of the same iTOW only, so that a week's roll-over cannot put a
+fix of the new week into the old. NAV-PVT and NAV-TIMEUTC carry UTC and iTOW: their difference is the leap count that
+the receiver's UTC goes by, right or stale, and the second is iTOW's. Where NAV-TIMELS or NAV-TIMEGPS, valid bit set,
+vouch for another count, UTC is set right by theirs (``utc_contradicts_leap``). A UTC that is no whole number of
+seconds, up to 60, off its iTOW is not valid (``utc_contradicts_itow``).
+
+Fix: the NAV messages of one iTOW make one `GnssFix` (`swath.drivers.gnss.epochs`), complete at NAV-EOE at the latest:
+NAV-PVT, refined by NAV-HPPOSLLH, with the covariances of NAV-COV or else of the accuracies, and NAV-TIMEGPS's week.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.kinds import GNSS_KINDS
+from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.ubx import messages as ubx
+from swath.drivers.gnss.ubx.fix import NavMessage, merge_epoch
+from swath.drivers.gnss.ubx.startup import startup_messages
+from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.georef.records import (
+    Chunk,
+    EventMark,
+    GnssFix,
+    NamesEdge,
+    Record,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+
+MS_NS = 1_000_000
+DAY_NS = 86_400_000_000_000
+DAY_MS = 86_400_000
+WEEK_MS = 604_800_000
+
+
+class _HasItow(Protocol):
+    @property
+    def itow_ms(self) -> int: ...
+
+
+_AnyT = TypeVar("_AnyT")
+_NavT = TypeVar("_NavT", bound=_HasItow)
+
+
+class MessageError(ValueError):
+    """A message with a good checksum whose content cannot be; counted as bad."""
+
+
+class UbxParser(StreamParser):
+    """Frames to records.
+
+    Args:
+        settings: ``date_floor`` is the oldest date (or week) believed, ``add_weeks`` is added to all.
+        time_only: time messages only, the same ones.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
+        super().__init__()
+        self._dates = ReceiverDates(settings)
+        self._framer = Framer(GNSS_KINDS, self.counters)
+        self._epochs: EpochGatherer[tuple[int, NavMessage]] = EpochGatherer(self.counters)
+        self._gathers = not time_only
+        self._leap_seconds: int | None = None  # as NAV-TIMELS or NAV-TIMEGPS last vouched for
+        self._vouched: bool | None = None  # by the latest navigation message that carries time
+        self._decoders: dict[bytes, Callable[[int, bytes], list[Record]]] = {
+            ubx.NAV_PVT.key: self._nav_pvt,
+            ubx.NAV_TIMEGPS.key: self._nav_timegps,
+            ubx.NAV_TIMEUTC.key: self._nav_timeutc,
+            ubx.NAV_TIMELS.key: self._nav_timels,
+            ubx.NAV_SOL.key: self._nav_sol,
+            ubx.TIM_TP.key: self._tim_tp,
+            ubx.RXM_RAWX.key: self._rxm_rawx,
+        }
+        if not time_only:
+            self._decoders |= {
+                ubx.NAV_HPPOSLLH.key: self._nav_hpposllh,
+                ubx.NAV_COV.key: self._nav_cov,
+                ubx.NAV_EOE.key: self._nav_eoe,
+                ubx.TIM_TM2.key: self._tim_tm2,
+            }
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one read."""
+        return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def close(self) -> list[Record]:
+        """Release the tail and the last epoch."""
+        records = self._decode(self._framer.close())
+        return records + self._fixes(self._epochs.end())
+
+    def remarks(self) -> list[str]:
+        """Return what is to be said of the receiver's dates."""
+        return self._dates.remarks()
+
+    def _decode(self, frames: list[Frame]) -> list[Record]:
+        records: list[Record] = []
+        for kind, host_time_ns, data in frames:
+            decoder = self._decoders.get(data[2:4])
+            if decoder is None or kind != "ubx":
+                continue
+            try:
+                records += decoder(host_time_ns, data)
+            except MessageError:
+                self.counters.bad_messages += 1
+        return records
+
+    # --- navigation messages ---
+
+    def _nav_pvt(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_PVT.decode(frame))
+        if len(frame) < ubx.PVT_FLAGS3_FRAME_BYTES:
+            message = message._replace(flags3=0)
+        has_date = message.valid & ubx.PVT_VALID_DATE != 0
+        has_time = message.valid & ubx.PVT_VALID_TIME != 0
+        records: list[Record] = []
+        self._vouched = has_date and has_time and message.valid & ubx.PVT_FULLY_RESOLVED != 0
+        if has_time:
+            records += self._utc_message(host_time_ns, message, has_date, self._vouched, "NAV-PVT")
+        return records + self._add(host_time_ns, "NAV-PVT", message)
+
+    def _nav_timeutc(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_TIMEUTC.decode(frame))
+        vouched = message.valid & ubx.TIMEUTC_ALL == ubx.TIMEUTC_ALL
+        has_date = message.valid & ubx.TIMEUTC_UTC != 0
+        return self._utc_message(host_time_ns, message, has_date, vouched, "NAV-TIMEUTC") if has_date else []
+
+    def _utc_message(
+        self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool, vouched: bool, name: str
+    ) -> list[Record]:
+        """The previous edge's second in UTC, if it agrees with the message's own iTOW."""
+        tag = self._utc_tag(host_time_ns, message, has_date)
+        agrees = tag.date is None or tag.leap_seconds is not None
+        if not agrees:
+            self.counters.errors["utc_contradicts_itow"] += 1
+        believed = tag.date is not None and self._date_believed(tag.date)
+        valid = vouched and believed and agrees
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
+
+    def _utc_tag(self, host_time_ns: int, message: ubx.NavPvt | ubx.NavTimeutc, has_date: bool) -> TimeTag:
+        """Return UTC of a message to the millisecond, with the leap seconds that its own iTOW implies.
+
+        Where the receiver vouches for another count than its UTC goes by, UTC is set right by it: the second is iTOW's.
+        """
+        if message.hour > 23 or message.minute > 59 or message.second > 60 or abs(message.nano_ns) > 1_000_000_000:
+            raise MessageError("time of day")
+        second = message.hour * 3600 + message.minute * 60 + message.second
+        milliseconds = second * 1000 + round(message.nano_ns / MS_NS)
+        if not has_date:
+            return TimeTag(TimeScale.UTC, milliseconds * MS_NS)
+        try:
+            date = dt.date(message.year, message.month, message.day)
+        except ValueError:
+            raise MessageError("date") from None
+        leap, said = leap_seconds_of(date, milliseconds, message.itow_ms), self._leap_seconds
+        date = self._dates.date(date, host_time_ns)
+        if leap is not None and said is not None and said != leap:
+            self.counters.errors["utc_contradicts_leap"] += 1
+            milliseconds, leap = milliseconds + (leap - said) * 1000, said
+        if milliseconds < 0 and date > dt.date.min:
+            date, milliseconds = date - dt.timedelta(days=1), milliseconds + DAY_MS
+        elif milliseconds >= DAY_MS + 1000 and date < dt.date.max:
+            date, milliseconds = date + dt.timedelta(days=1), milliseconds - DAY_MS
+        return TimeTag(TimeScale.UTC, milliseconds * MS_NS, date=date, leap_seconds=leap)
+
+    def _nav_timegps(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_TIMEGPS.decode(frame))
+        message = message._replace(week=self._dates.week(message.week, host_time_ns))
+        has_leap = message.valid & ubx.TIMEGPS_LEAP != 0
+        has_week = message.valid & ubx.TIMEGPS_WEEK != 0
+        vouched = has_week and message.valid & ubx.TIMEGPS_TOW != 0
+        if has_leap:
+            self._leap_seconds = message.leap_seconds
+        leap = message.leap_seconds if has_leap else None
+        records = self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-TIMEGPS", leap)
+        return records + self._add(host_time_ns, "NAV-TIMEGPS", message)
+
+    def _nav_sol(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_SOL.decode(frame))
+        message = message._replace(week=self._dates.week(message.week, host_time_ns))
+        has_week = message.flags & ubx.SOL_WEEK != 0
+        vouched = has_week and message.flags & ubx.SOL_TOW != 0
+        return self._gps_message(host_time_ns, message.itow_ms, message.week, has_week, vouched, "NAV-SOL")
+
+    def _gps_message(
+        self,
+        host_time_ns: int,
+        itow_ms: int,
+        week: int,
+        has_week: bool,
+        vouched: bool,
+        name: str,
+        leap_seconds: int | None = None,
+    ) -> list[Record]:
+        """The previous edge's second by week and time of week of one message."""
+        self._vouched = vouched
+        tag = TimeTag(TimeScale.GPS, itow_ms * MS_NS, week=week if has_week else None, leap_seconds=leap_seconds)
+        valid = vouched and self._week_believed(week)
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message=name)]
+
+    def _nav_timels(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_TIMELS.decode(frame))
+        if not message.valid & ubx.TIMELS_CURRENT:
+            return []
+        self._leap_seconds = message.current
+        tag = TimeTag(TimeScale.GPS, message.itow_ms * MS_NS, leap_seconds=message.current)
+        # its own flag is of the leap seconds alone
+        valid = self._vouched is not False
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="NAV-TIMELS")]
+
+    def _nav_hpposllh(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        return self._add(host_time_ns, "NAV-HPPOSLLH", _checked(ubx.NAV_HPPOSLLH.decode(frame)))
+
+    def _nav_cov(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_COV.decode(frame))
+        if not all(map(math.isfinite, message)):
+            raise MessageError("covariance")
+        return self._add(host_time_ns, "NAV-COV", message)
+
+    def _nav_eoe(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _checked(ubx.NAV_EOE.decode(frame))
+        return self._fixes(self._epochs.end()) if message.itow_ms == self._epochs.key else []
+
+    def _rxm_rawx(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        """Name the second of raw measurements; of no use beside navigation messages, which do not come so late."""
+        if self._vouched is not None:
+            return []
+        message = _present(ubx.RXM_RAWX.decode(frame))
+        if not 0.0 <= message.receiver_tow_s < WEEK_MS / 1000:
+            raise MessageError("time of week")
+        known = message.status & ubx.RAWX_LEAP_KNOWN != 0
+        leap = message.leap_seconds if known else None
+        time_ns = round(message.receiver_tow_s * 1000) * MS_NS % (WEEK_MS * MS_NS)
+        tag = TimeTag(TimeScale.GPS, time_ns, week=message.week, leap_seconds=leap)
+        valid = known and self._week_believed(message.week)
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="RXM-RAWX")]
+
+    # --- pulse and event messages ---
+
+    def _tim_tp(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _present(ubx.TIM_TP.decode(frame))
+        if message.tow_ms >= WEEK_MS:
+            raise MessageError("time of week")
+        utc = message.flags & ubx.TP_UTC_BASE != 0
+        gps = message.reference & ubx.TP_REFERENCE_MASK == ubx.TP_REFERENCE_GPS
+        if not utc and not gps:
+            self.counters.errors["tim_tp_time_base"] += 1  # GLONASS, BeiDou, Galileo time: another second or week
+        week = self._dates.week(message.week, host_time_ns)
+        time_ns = message.tow_ms * MS_NS + round(message.tow_sub_ms * MS_NS / 2**32)
+        known = message.flags & ubx.TP_UTC_AVAILABLE != 0 if utc else gps
+        locked = not message.flags & ubx.TP_NOT_LOCKED and self._vouched is not False
+        quantised = not message.flags & ubx.TP_QUANTISATION_INVALID
+        return [
+            TimeMessage(
+                host_time_ns,
+                self._week_tag(week, time_ns, utc),
+                NamesEdge.NEXT,
+                bound=True,
+                valid=known and locked and self._week_believed(week),
+                quantisation_ns=-message.quantisation_ps / 1000.0 if quantised else 0.0,
+                message="TIM-TP",
+            )
+        ]
+
+    def _tim_tm2(self, host_time_ns: int, frame: bytes) -> list[Record]:
+        message = _present(ubx.TIM_TM2.decode(frame))
+        base = message.flags >> ubx.TM2_BASE_SHIFT & ubx.TM2_BASE_MASK
+        valid = message.flags & ubx.TM2_TIME_VALID != 0 and base != ubx.TM2_BASE_RECEIVER
+        edges = (
+            (ubx.TM2_NEW_RISING, True, message.week_rising, message.tow_rising_ms, message.tow_rising_sub_ns),
+            (ubx.TM2_NEW_FALLING, False, message.week_falling, message.tow_falling_ms, message.tow_falling_sub_ns),
+        )
+        records: list[Record] = []
+        for flag, rising, week, tow_ms, sub_ns in edges:
+            if not message.flags & flag:
+                continue
+            if tow_ms >= WEEK_MS:
+                raise MessageError("time of week")
+            week = self._dates.week(week, host_time_ns)
+            records.append(
+                EventMark(
+                    host_time_ns,
+                    self._week_tag(week, tow_ms * MS_NS + sub_ns, base == ubx.TM2_BASE_UTC),
+                    channel=f"EXTINT{message.channel}",
+                    rising=rising,
+                    count=message.rising_count if rising else None,
+                    sigma_s=message.accuracy_ns / 1e9,
+                    valid=valid,
+                    message="TIM-TM2",
+                )
+            )
+        return records
+
+    @staticmethod
+    def _week_tag(week: int, time_ns: int, utc: bool) -> TimeTag:
+        """Week and time of week in GPS time, or in UTC as a date and time of day."""
+        if not utc:
+            return TimeTag(TimeScale.GPS, time_ns, week=week)
+        days, time_of_day_ns = divmod(time_ns, DAY_NS)
+        return TimeTag(TimeScale.UTC, time_of_day_ns, date=GPS_EPOCH + dt.timedelta(days=week * 7 + days))
+
+    # --- belief and epochs ---
+
+    def _week_believed(self, week: int) -> bool:
+        if week < self._dates.floor_week:
+            self.counters.errors["date_before_floor"] += 1
+            return False
+        return True
+
+    def _date_believed(self, date: dt.date) -> bool:
+        if date < self._dates.floor:
+            self.counters.errors["date_before_floor"] += 1
+            return False
+        return True
+
+    def _add(self, host_time_ns: int, name: str, message: NavMessage) -> list[Record]:
+        return self._fixes(self._epochs.add(message.itow_ms, name, (host_time_ns, message))) if self._gathers else []
+
+    def _fixes(self, epochs: list[dict[str, tuple[int, NavMessage]]]) -> list[Record]:
+        floor_week = self._dates.floor_week
+        return [fix for parts in epochs if (fix := merge_epoch(parts, floor_week)) is not None]
+
+
+def _present(message: _AnyT | None) -> _AnyT:
+    """The message, unless its length is not that of its kind."""
+    if message is None:
+        raise MessageError("length")
+    return message
+
+
+def _checked(message: _NavT | None) -> _NavT:
+    """The message, unless its length is not that of its kind or its iTOW is beyond the week."""
+    if message is None or message.itow_ms >= WEEK_MS:
+        raise MessageError("length or iTOW")
+    return message
+
+
+DRIVERS = (
+    Driver(
+        protocol="ubx",
+        kind="gnss",
+        transports=("serial",),
+        yields=(TimeMessage, GnssFix, EventMark),
+        summary="u-blox binary (NAV-PVT HPPOSLLH COV TIMEGPS TIMELS, TIM-TP TM2), NMEA and RTCM3 beside it",
+        make_parser=UbxParser,
+        make_time_parser=lambda settings: UbxParser(settings, time_only=True),
+        startup=startup_messages,
+    ),
+)

@@ -1,0 +1,1 @@
+"""CAN signals that a DBC file describes."""

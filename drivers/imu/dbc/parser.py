@@ -1,0 +1,292 @@
+"""Any inertial unit on CAN, by its DBC file and a map of its signals (protocol ``dbc``).
+
+The configuration names the signals (``[imu.NAME.signals]``, docs/configuration.md); the DBC says where they lie and
+in which unit. Frames are decoded in batches; the frames of one sample are put together by `SampleGrouper`, counters
+made continuous by `CounterUnwrapper`. Specific force and angular rate are those of the device's own axes: the
+configuration's rotation_b_imu, sample and stamp are applied where the samples are used, except that increments
+(sample = "increment") are divided by the nominal interval here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.drivers.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
+from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
+from swath.drivers.imu.dbc.groups import (
+    Frames,
+    GroupRule,
+    SampleGrouper,
+    Samples,
+    closing_part,
+    has_evidence,
+    no_frames,
+)
+from swath.drivers.imu.dbc.settings import MappedSignal, Part, SignalMap, map_signals
+from swath.drivers.parser import DeviceSettings, Driver, PacketParser
+from swath.georef.records import (
+    DEVICE_CLOCK_DTYPE,
+    IMU_DTYPE,
+    ByteRows,
+    DeviceClockSamples,
+    ImuSamples,
+    Int64Array,
+    Record,
+    StructArray,
+)
+
+
+class SideSignal:
+    """A signal of a message beside the samples: its value holds from its frame to the next."""
+
+    def __init__(self, signal: MappedSignal) -> None:
+        self._signal = signal
+        self._last = np.uint64(0)
+        self._known = False
+        self._where = np.empty(0, np.intp)
+        self._bits = np.empty(0, np.uint64)
+
+    def take(self, frames: Frames) -> None:
+        """Read it from the frames of one call."""
+        if len(self._bits):
+            self._last, self._known = self._bits[-1], True
+        self._where = np.flatnonzero(frames.part == self._signal.part)
+        self._bits = self._signal.layout.bits(frames.data[self._where])
+
+    def before(self, position: NDArray[np.intp]) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+        """Its bits as of positions (m,) among this call's frames, and whether there were any yet."""
+        place = np.searchsorted(self._where, position, side="left")
+        bits = np.concatenate([[self._last], self._bits])[place]
+        return bits, (place > 0) | self._known
+
+
+class DbcParser(PacketParser):
+    """Decodes CAN units to `ImuSamples`, and `DeviceClockSamples` where the device latches PPS."""
+
+    def __init__(
+        self, settings: DeviceSettings, *, clock_only: bool = False, signal_map: SignalMap | None = None
+    ) -> None:
+        """Read the DBC and find the signals.
+
+        Args:
+            settings: the device's table and the DBC's bytes (``files["dbc"]``).
+            clock_only: give `DeviceClockSamples` only, for the recorder.
+            signal_map: what a profile has found already; None: found here.
+
+        Raises:
+            DriverSettingsError: naming the key or signal and what would be right.
+        """
+        super().__init__()
+        self._map = signal_map or map_signals(settings)
+        self._clock_only = clock_only
+        self._width = 8 if all(part.needs_bytes <= 8 for part in self._map.parts) else 64
+        self._rule_is_open = not self._map.rule_is_said
+        self._unread = no_frames(self._width)  # frames that wait for the rule
+        self._grouper = self._grouper_of(self._map.rule, self._map.key_part)
+        ticks, latch = self._map.sample_ticks, self._map.pps_ticks
+        self._unwrapper = CounterUnwrapper(ticks.layout.length, float(self._map.tick_hz)) if ticks else None
+        self._latch = LatchTracker(latch.layout.length) if latch else None
+        packets = self._map.packet_counter
+        self._gaps = GapCounter(packets.layout.length) if packets else None
+        optional = (latch, self._map.temperature, self._map.status)
+        self._side = {
+            signal.layout.name: SideSignal(signal) for signal in optional if signal and signal.part >= self._map.grouped
+        }
+
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Decode CAN frames, (n, 16) or (n, 72)."""
+        self.counters.bytes += units.size
+        frames = self._configured_frames(host_time_ns, units)
+        self._count_gaps(frames)
+        if self._rule_is_open:
+            frames = self._unread = frames.after(self._unread)
+            if not has_evidence(frames.part[frames.part < self._map.grouped], self._map.grouped):
+                return []
+            self._settle_rule()
+        return self._samples_of(frames) if len(frames.part) else []
+
+    def close(self) -> list[Record]:
+        """The last sample of rule "first", which only the end of the stream completes."""
+        frames = self._unread
+        if self._rule_is_open:
+            self._settle_rule()
+        return self._samples_of(frames, at_end=True)
+
+    def _grouper_of(self, rule: GroupRule, key_part: int) -> SampleGrouper:
+        return SampleGrouper(self._map.grouped, rule, key_part, self._width)
+
+    def _settle_rule(self) -> None:
+        """Take the rule that the spacing of the first frames shows; where they come evenly, doubt the usual one."""
+        grouped = self._unread.part < self._map.grouped
+        last = closing_part(self._unread.part[grouped], self._unread.host_time_ns[grouped], self._map.grouped)
+        if last is not None:
+            self._grouper = self._grouper_of("last", last)
+        elif grouped.any():
+            names = " and ".join(dict.fromkeys(part.message for part in self._map.parts[: self._map.grouped]))
+            self.doubts = (
+                f"the frames of {names} come evenly, so that which of them are one sample is not certain: specific "
+                'force and angular rate may be a sample apart; say group = "last" or "first"',
+            )
+        self._rule_is_open, self._unread = False, no_frames(self._width)
+
+    # -- frames
+
+    def _configured_frames(self, host_time_ns: Int64Array, units: ByteRows) -> Frames:
+        """The data frames of configured parts; other identifiers are other devices' traffic."""
+        table = decode_can_frames(units)
+        if table is None:
+            self._count_bad(len(units))
+            return no_frames(self._width)
+        can_id = table["can_id"]
+        self._count_flagged(can_id)
+        part = np.full(len(can_id), -1, np.int8)
+        for number, kind in enumerate(self._map.parts):
+            part[self._frames_of(kind, table, can_id)] = number
+        mine = np.flatnonzero(part >= 0)
+        data = np.zeros((len(mine), self._width), np.uint8)
+        carried = min(self._width, table["data"].shape[1])
+        data[:, :carried] = table["data"][mine, :carried]
+        return Frames(part[mine], np.asarray(host_time_ns, np.int64)[mine], data)
+
+    def _frames_of(self, kind: Part, table: StructArray, can_id: NDArray[np.uint32]) -> NDArray[np.intp]:
+        """Indices of the frames of a kind that are whole; short ones are counted."""
+        where = np.flatnonzero(can_id == np.uint32(kind.can_id))
+        if kind.selector is not None:
+            data = _padded(table["data"][where], self._width)
+            value = kind.selector.bits(data)
+            where = where[np.isin(value, np.array(sorted(kind.selector_values), dtype=np.uint64))]
+        whole = table["length"][where] >= kind.needs_bytes
+        if not whole.all():
+            self._count_bad(int(np.count_nonzero(~whole)))
+            where = where[whole]
+        if len(where):
+            self.counters.messages[kind.message] += len(where)
+        return where
+
+    def _count_bad(self, frames: int) -> None:
+        self.counters.bad_messages += frames
+        self.counters.errors["bad_length"] += frames
+
+    def _count_gaps(self, frames: Frames) -> None:
+        """Count what the device's own counter says was sent and is not there."""
+        packets = self._map.packet_counter
+        if packets is not None and self._gaps is not None:
+            missing = self._gaps.missing(packets.layout.bits(frames.data[frames.part == packets.part]))
+            if missing:
+                self.counters.errors["packet_gap"] += missing
+
+    def _count_flagged(self, can_id: NDArray[np.uint32]) -> None:
+        """Count error frames and remote requests; their identifiers match no message."""
+        flagged = can_id[can_id & np.uint32(CAN_ERR_FLAG | CAN_RTR_FLAG) != 0]
+        if len(flagged):
+            errors = int(np.count_nonzero(flagged & np.uint32(CAN_ERR_FLAG)))
+            self.counters.errors["error_frame"] += errors
+            self.counters.errors["rtr_frame"] += len(flagged) - errors
+
+    # -- samples
+
+    def _samples_of(self, frames: Frames, *, at_end: bool = False) -> list[Record]:
+        """Group frames to samples and decode them."""
+        grouped = np.flatnonzero(frames.part < self._map.grouped)
+        samples = self._grouper.split(frames.take(grouped), at_end=at_end)
+        for code, count in (("sample_incomplete", samples.incomplete), ("sample_duplicate", samples.duplicate)):
+            if count:
+                self.counters.errors[code] += count
+        for side in self._side.values():
+            side.take(frames)
+        if not samples.index.shape[1]:
+            return []
+        earlier = len(samples.frames.part) - len(grouped)
+        place = np.concatenate([np.full(earlier, -1, np.intp), grouped, [len(frames.part)]])
+        return self._records(samples, place[samples.closed_at])
+
+    def _records(self, samples: Samples, position: NDArray[np.intp]) -> list[Record]:
+        """Rows of good samples; ``position``: where each was closed among this call's frames."""
+        rows = np.zeros(samples.index.shape[1], IMU_DTYPE)
+        rows["host_time_ns"] = samples.frames.host_time_ns[samples.index.max(axis=0)]
+        data = [samples.frames.data[index] for index in samples.index]
+        self._fill_times(rows, data, position)
+        records: list[Record] = []
+        if self._latch is not None:
+            records.append(DeviceClockSamples(_clock_rows(rows)))
+        if not self._clock_only:
+            self._fill_values(rows, data, position)
+            records.append(ImuSamples(rows))
+        return records
+
+    def _fill_times(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
+        """Device time and time of the latest PPS edge on its scale; −1 where the device has none."""
+        rows["device_time_ns"] = -1
+        rows["pps_time_ns"] = -1
+        rows["gps_week"] = -1
+        ticks, latch = self._map.sample_ticks, self._map.pps_ticks
+        if ticks is None or self._unwrapper is None:
+            return
+        counts, restart = self._unwrapper.unwrap(ticks.layout.bits(data[ticks.part]), rows["host_time_ns"].copy())
+        if restart.any():
+            self.counters.errors["restart"] += int(restart.sum())
+        rows["device_time_ns"] = nanoseconds(counts, self._map.tick_hz)
+        if latch is not None and self._latch is not None:
+            latched = self._latch.track(*self._bits_of(latch, data, position), counts, restart)
+            rows["pps_time_ns"] = np.where(latched >= 0, nanoseconds(latched, self._map.tick_hz), -1)
+
+    def _fill_values(self, rows: StructArray, data: list[ByteRows], position: NDArray[np.intp]) -> None:
+        """Specific force, angular rate, temperature and status (its low 32 bits)."""
+        for number, signal in enumerate(self._map.vectors):
+            values = signal.layout.values(signal.layout.bits(data[signal.part]))
+            field = "specific_force_b" if number < 3 else "angular_rate_b"
+            np.multiply(values, signal.factor, out=rows[field][:, number % 3])
+        rows["temperature_c"] = np.nan
+        temperature = self._map.temperature
+        if temperature is not None:
+            bits, known = self._bits_of(temperature, data, position)
+            rows["temperature_c"][known] = temperature.layout.values(bits[known])
+        if self._map.status is not None:
+            bits, known = self._bits_of(self._map.status, data, position)
+            rows["status"] = np.where(known, bits & np.uint64(0xFFFF_FFFF), 0)
+
+    def _bits_of(
+        self, signal: MappedSignal, data: list[ByteRows], position: NDArray[np.intp]
+    ) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+        """Bits of an optional signal for each sample, from its own frames or from the message beside them."""
+        if signal.part < self._map.grouped:
+            bits = signal.layout.bits(data[signal.part])
+            return bits, np.ones(len(bits), np.bool_)
+        return self._side[signal.layout.name].before(position)
+
+
+def _padded(data: ByteRows, width: int) -> ByteRows:
+    """Data bytes cut or filled up with zeros to the width signals are read from."""
+    if data.shape[1] >= width:
+        return data[:, :width]
+    return np.pad(data, ((0, 0), (0, width - data.shape[1])))
+
+
+def _clock_rows(rows: StructArray) -> StructArray:
+    """What the samples say of the device's clock."""
+    clock = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
+    for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
+        clock[name] = rows[name]
+    clock["pps_count"] = -1
+    clock["locked"] = -1
+    return clock
+
+
+def make_clock_parser(settings: DeviceSettings) -> DbcParser:
+    """The recorder's parser: the device's clock only."""
+    return DbcParser(settings, clock_only=True)
+
+
+DRIVERS = (
+    Driver(
+        protocol="dbc",
+        kind="imu",
+        transports=("can",),
+        yields=(ImuSamples, DeviceClockSamples),
+        summary="any IMU on CAN, by its DBC file and a map of its signals",
+        make_parser=DbcParser,
+        make_time_parser=make_clock_parser,
+        needs=("dbc", "signals"),
+    ),
+)

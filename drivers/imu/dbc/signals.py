@@ -1,0 +1,220 @@
+"""Signals of a DBC file, found by name and cut out of whole batches of frames.
+
+A DBC signal is a run of bits in a frame's data (start bit, length, byte order), read as unsigned, two's complement or
+IEEE 754, times scale plus offset. Little-endian ("Intel", ``@1``): the start bit is the lowest one, bits count up
+through the bytes. Big-endian ("Motorola", ``@0``): the start bit is the highest one, as ``byte * 8 + bit in byte``,
+and bits go on downwards into the next byte.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.drivers.can_frames import frame_id
+from swath.drivers.parser import DriverSettingsError
+from swath.georef.records import ByteRows
+from swath.georef.text_encoding import decoded
+
+UInt64Array = NDArray[np.uint64]
+Float64Array = NDArray[np.float64]
+WORD_BITS = 64
+FLOAT_TYPES: dict[int, tuple[type[np.unsignedinteger[Any]], str]] = {
+    16: (np.uint16, "<f2"),
+    32: (np.uint32, "<f4"),
+    64: (np.uint64, "<f8"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SignalLayout:
+    """Where a signal lies and what its number means.
+
+    Attributes:
+        name: ``MESSAGE.signal``.
+        first_byte: of the 64-bit word it is cut from.
+        shift: bits below it in that word; negative where it reaches into a ninth byte.
+        length: bits.
+        big_endian, signed, is_float: how its bits are read.
+        scale, offset: physical = raw · scale + offset.
+        unit: as the DBC says it.
+        needs_bytes: data bytes a frame must have to hold it.
+    """
+
+    name: str
+    first_byte: int
+    shift: int
+    length: int
+    big_endian: bool
+    signed: bool
+    is_float: bool
+    scale: float
+    offset: float
+    unit: str
+    needs_bytes: int
+
+    def bits(self, data: ByteRows) -> UInt64Array:
+        """The signal's bits of each row of (n, 8 or 64) data, right-aligned and unsigned."""
+        word = np.ascontiguousarray(data[:, self.first_byte : self.first_byte + 8]).view("<u8").reshape(-1)
+        if self.big_endian:
+            word = word.byteswap()
+        mask = np.uint64((1 << self.length) - 1)
+        if self.shift >= 0:
+            return (word >> np.uint64(self.shift)) & mask
+        return self._with_ninth_byte(data, word) & mask
+
+    def _with_ninth_byte(self, data: ByteRows, word: UInt64Array) -> UInt64Array:
+        """The same for a signal that begins inside one byte and ends in the ninth."""
+        ninth = data[:, self.first_byte + 8].astype(np.uint64)
+        over = -self.shift
+        if self.big_endian:
+            return (word << np.uint64(over)) | (ninth >> np.uint64(8 - over))
+        low = WORD_BITS - (self.length - over)
+        return (word >> np.uint64(low)) | (ninth << np.uint64(WORD_BITS - low))
+
+    @np.errstate(invalid="ignore", over="ignore")
+    def values(self, bits: UInt64Array) -> Float64Array:
+        """Physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
+        if self.is_float:
+            unsigned, floating = FLOAT_TYPES[self.length]
+            raw = bits.astype(unsigned).view(floating).astype(np.float64)
+        elif self.signed:
+            up = np.uint64(WORD_BITS - self.length)
+            raw = ((bits << up).view(np.int64) >> np.int64(up)).astype(np.float64)
+        else:
+            raw = bits.astype(np.float64)
+        if self.scale != 1.0:
+            raw *= self.scale
+        if self.offset != 0.0:
+            raw += self.offset
+        return raw
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSignal:
+    """A configured signal: its layout and the frames that carry it.
+
+    Attributes:
+        layout: where and what.
+        can_id: ``can_id`` word of its message, extended flag included.
+        message: the message's name.
+        selector: layout of the multiplexer that decides whether a frame carries it; None: every frame does.
+        selector_values: the multiplexer's values that do.
+    """
+
+    layout: SignalLayout
+    can_id: int
+    message: str
+    selector: SignalLayout | None = None
+    selector_values: frozenset[int] = frozenset()
+
+
+def signal_layout(message: Any, signal: Any) -> SignalLayout:
+    """Layout of a cantools signal.
+
+    Raises:
+        DriverSettingsError: no such float, or longer than 64 bits.
+    """
+    name = f"{message.name}.{signal.name}"
+    length = int(signal.length)
+    if length > WORD_BITS:
+        raise DriverSettingsError(f"signal {name} has {length} bits; 64 are the most that can be read")
+    if signal.is_float and length not in FLOAT_TYPES:
+        raise DriverSettingsError(f"signal {name} is a float of {length} bits; 16, 32 and 64 are right")
+    big_endian = signal.byte_order == "big_endian"
+    start = int(signal.start)
+    if big_endian:  # bits counted from the highest bit of byte 0
+        first_bit = start // 8 * 8 + 7 - start % 8
+    else:
+        first_bit = start
+    last_byte = (first_bit + length - 1) // 8
+    first_byte = first_bit // 8 if last_byte >= 8 else 0
+    first_byte = min(first_byte, 56)
+    inside = first_bit - first_byte * 8
+    past = inside + length - WORD_BITS  # bits that reach into a ninth byte
+    shift = -past if big_endian or past > 0 else inside
+    return SignalLayout(
+        name=name,
+        first_byte=first_byte,
+        shift=shift,
+        length=length,
+        big_endian=big_endian,
+        signed=bool(signal.is_signed),
+        is_float=bool(signal.is_float),
+        scale=float(signal.scale),
+        offset=float(signal.offset),
+        unit=signal.unit or "",
+        needs_bytes=last_byte + 1,
+    )
+
+
+def load_database(contents: bytes, key: str = "dbc") -> Any:
+    """The cantools database of a DBC file's bytes (UTF-8, UTF-16 by its mark, else Windows-1252, the format's own).
+
+    Raises:
+        DriverSettingsError: it is no DBC file.
+    """
+    import cantools.database as dbc  # heavy, and needed only where a DBC is
+    from cantools.database import errors
+
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # of a message there twice `find_signal` tells, if it matters
+    try:
+        text = decoded(contents)
+    except UnicodeDecodeError:
+        text = contents.decode("cp1252", errors="replace")
+    try:
+        return dbc.load_string(text, database_format="dbc", strict=False)
+    except (errors.Error, ValueError) as error:
+        raise DriverSettingsError(f"{key}: not a DBC file ({' '.join(str(error).split())})") from error
+
+
+def find_signal(database: Any, path: str, file_name: str) -> FoundSignal:
+    """Find ``MESSAGE.signal`` in a database.
+
+    Raises:
+        DriverSettingsError: naming what there is instead.
+    """
+    message_name, dot, signal_name = path.partition(".")
+    if not dot or not signal_name:
+        raise DriverSettingsError(f"signal {path!r} is not of the form MESSAGE.signal")
+    messages = {message.name: message for message in database.messages}
+    if sum(message.name == message_name for message in database.messages) > 1:
+        raise DriverSettingsError(f"message {message_name} stands in {file_name} more than once; want it once")
+    if message_name not in messages:
+        raise DriverSettingsError(f"no message {message_name} in {file_name}{_instead(message_name, messages, 'it')}")
+    message = messages[message_name]
+    signals = {signal.name: signal for signal in message.signals}
+    if signal_name not in signals:
+        there = _instead(signal_name, signals, f"message {message_name}")
+        raise DriverSettingsError(f"no signal {path} in {file_name}{there}")
+    selector, selector_values = _multiplexing(message, signals, signals[signal_name])
+    return FoundSignal(
+        layout=signal_layout(message, signals[signal_name]),
+        can_id=frame_id(message.frame_id, extended=message.is_extended_frame),
+        message=message_name,
+        selector=selector,
+        selector_values=selector_values,
+    )
+
+
+def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[SignalLayout | None, frozenset[int]]:
+    """The multiplexer that decides on a signal; one level is read, deeper ones are refused."""
+    if not signal.multiplexer_ids:
+        return None, frozenset()
+    selector = signals[signal.multiplexer_signal]
+    if selector.multiplexer_ids:
+        raise DriverSettingsError(f"signal {message.name}.{signal.name}: nested multiplexing is not supported")
+    return signal_layout(message, selector), frozenset(int(value) for value in signal.multiplexer_ids)
+
+
+def _instead(wanted: str, names: dict[str, Any], owner: str) -> str:
+    """``; did you mean …?`` or what there is."""
+    close = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
+    listed = ", ".join(list(names)[:12]) + (", …" if len(names) > 12 else "")
+    meant = f"; did you mean {' or '.join(close)}?" if close else ""
+    return f"{meant}; {owner} has: {listed}" if names else f"; {owner} has none"

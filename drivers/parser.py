@@ -1,0 +1,199 @@
+"""The contract of every protocol file: bytes in, records out, no I/O, no clock, no logging.
+
+What the wire says never raises: it is counted in `ParserCounters` and skipped. A programming mistake of the caller
+(wrong settings) raises `DriverSettingsError` when the parser is made, never later.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from swath.georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+
+if TYPE_CHECKING:
+    from swath.drivers.startup import StartupMessage, StartupWish
+
+DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
+TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
+
+
+class DriverSettingsError(ValueError):
+    """A setting the driver cannot work with; the text names the key and what would be right."""
+
+
+@dataclass(slots=True)
+class ParserCounters:
+    """What a parser saw, so that nothing is dropped silently.
+
+    Attributes:
+        bytes: all bytes fed.
+        messages: complete messages with a good checksum, by name (``GGA``, ``NAV-PVT``, ``BESTPOS``, ``frame``).
+        bad_checksums: frames whose checksum failed.
+        bad_messages: frames with a good checksum that could not be decoded (length, content).
+        bytes_skipped: bytes that belong to no frame.
+        errors: specific errors by code, for example ``bad_length``, ``sequence_gap``.
+        bytes_framed: bytes of frames with a good checksum. Of a stream, after `Parser.close`:
+            ``bytes == bytes_framed + bytes_skipped``.
+    """
+
+    bytes: int = 0
+    messages: Counter[str] = field(default_factory=Counter)
+    bad_checksums: int = 0
+    bad_messages: int = 0
+    bytes_skipped: int = 0
+    errors: Counter[str] = field(default_factory=Counter)
+    bytes_framed: int = 0
+
+
+class Parser(ABC):
+    """Feeds on units of one channel in the order of their arrival.
+
+    ``feed``, ``feed_batch`` and ``feed_batches`` give the same records for the same bytes however they are cut. `close`
+    gives what was still held back and counts an unfinished tail in ``counters.bytes_skipped``.
+    """
+
+    def __init__(self) -> None:
+        self.counters = ParserCounters()
+
+    @abstractmethod
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one unit; return the records it completed, in order."""
+
+    @abstractmethod
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Take consecutive units of equal length; return the records they completed, in order."""
+
+    def feed_batches(self, batches: Sequence[ChunkBatch]) -> list[Record]:
+        """Take consecutive batches of one channel, of any lengths; return the records they completed, in order.
+
+        Neighbours of equal length go to `feed_batch` as one: a call of it costs as much as many units.
+        """
+        records: list[Record] = []
+        for _, equal in groupby(batches, key=lambda batch: batch.units.shape[1]):
+            records += self.feed_batch(_joined(list(equal)))
+        return records
+
+    def close(self) -> list[Record]:
+        """Release the tail at the end of a stream."""
+        return []
+
+    def remarks(self) -> list[str]:
+        """Return lines for the user, with the source: what was taken otherwise than said or refused, and the remedy."""
+        return []
+
+
+def _joined(batches: list[ChunkBatch]) -> ChunkBatch:
+    """Batches of units of one length as one."""
+    if len(batches) == 1:
+        return batches[0]
+    times = np.concatenate([batch.host_time_ns for batch in batches])
+    return ChunkBatch(batches[0].source, times, np.concatenate([batch.units for batch in batches]))
+
+
+class StreamParser(Parser):
+    """For byte streams, whose units end anywhere: `feed` is written, `feed_batch` follows."""
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Feed the rows one by one; stream units are few."""
+        records: list[Record] = []
+        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
+            records += self.feed(Chunk(batch.source, host_time_ns, unit.tobytes()))
+        return records
+
+
+class PacketParser(Parser):
+    """For datagrams and CAN frames, whose units are whole: `parse_units` is written, both feeds follow.
+
+    Attributes:
+        doubts: what the units leave uncertain, a line for the user each.
+    """
+
+    doubts: tuple[str, ...] = ()
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """One unit is a batch of one row."""
+        units = np.frombuffer(chunk.data, dtype=np.uint8).reshape(1, -1)
+        return self.parse_units(np.array([chunk.host_time_ns], dtype=np.int64), units)
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Hand the rows to `parse_units` whole."""
+        return self.parse_units(batch.host_time_ns, batch.units)
+
+    @abstractmethod
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Decode units of equal length, vectorised.
+
+        Args:
+            host_time_ns: (n,) host time of each unit.
+            units: (n, length) uint8, one row a unit, possibly strided.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceSettings:
+    """All a parser may know of its configuration.
+
+    Attributes:
+        source: ``kind/name``.
+        config: the device's table of the configuration, defaults filled in.
+        files: contents of the files it names, by key (``dbc``, ``geometry``), from disk or from a log's attachments.
+        compiled: returns are decoded by compiled loops, which want numba (``swath[process]``): the same rows, faster
+            where there are millions.
+    """
+
+    source: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    compiled: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """What a protocol file declares in its ``DRIVERS`` tuple.
+
+    Attributes:
+        protocol: the name in the configuration.
+        kind: gnss, imu, scanner or corrections.
+        transports: kinds of transport it can come by.
+        yields: record types it gives.
+        summary: one line for ``swath devices``.
+        make_parser: builds the parser of everything.
+        make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
+            where the device says no time.
+        make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
+            defaults; it is asked when another protocol was configured.
+        names_edge: which edge its time messages name by default; None where mixed or none.
+        tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
+        needs: configuration keys without which it cannot work.
+        line_scanner: of a scanner: one beam, which goes as the configuration's ``geometry`` declares. The parser of any
+            other has ``beams``, a `swath.drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
+        wavelength_nm: of a scanner's light, by its maker's data sheet; None: 1064, as of most airborne ones.
+        eight_bit_intensity: whether a scanner's intensities are 0 to 255.
+        past_hour: whether a scanner's device time is that past the full hour of UTC.
+        startup: builds the messages a device needs before a survey, in the order they are sent, and raises
+            `DriverSettingsError`; None where there are none.
+    """
+
+    protocol: str
+    kind: DeviceKind
+    transports: tuple[TransportKind, ...]
+    yields: tuple[type, ...]
+    summary: str
+    make_parser: Callable[[DeviceSettings], Parser]
+    make_time_parser: Callable[[DeviceSettings], Parser] | None = None
+    make_probe: Callable[[DeviceSettings], Parser] | None = None
+    names_edge: NamesEdge | None = None
+    tells_pps: bool = True
+    needs: tuple[str, ...] = ()
+    line_scanner: bool = False
+    wavelength_nm: float | None = None
+    eight_bit_intensity: bool = False
+    past_hour: bool = False
+    startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None

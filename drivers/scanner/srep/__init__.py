@@ -1,0 +1,1 @@
+"""SREP, the project's own protocol of ranges and encoder readings."""

@@ -1,0 +1,327 @@
+"""NTRIP client, versions 1 and 2 (RTCM 10410.1): a caster's stream of corrections; a unit is the bytes of one read.
+
+Of a version 2 caster that sends in chunks (RFC 9112, 7.1) the chunks' contents are the units. The kernel gives no
+stamps here.
+"""
+
+from __future__ import annotations
+
+import base64
+import errno
+import math
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import numpy as np
+
+from swath.drivers.framing.checksums import nmea_xor
+from swath.drivers.transports.base import TransportError, UnitBlock
+from swath.drivers.transports.descriptor import DescriptorTransport, Gate, wait_writable
+from swath.drivers.transports.spec import TransportSpec, ntrip_position
+
+CONNECT_S = 8.0  # for each address of the caster, and again for its answer
+SLICE_S = 0.1
+OPEN_S = 18.0  # for all of it: name, connection, answer; the watchdog takes 20 s of opening for stuck
+SILENT_S = 60.0  # then the connection is taken for dead
+READ_BYTES = 65536
+MOST_HEADER_BYTES = 16384
+MOST_TABLE_BYTES = 1 << 18
+MOST_NAMED = 8  # mountpoints, of a table that has not the one asked for
+GGA_S = 10.0
+SEND_TIMEOUT_S = 2.0
+_STATUS = re.compile(r"[0-9]{3}")  # RFC 9112, 4
+_CHUNK_LENGTH = re.compile(rb"[0-9A-Fa-f]{1,16}")  # RFC 9112, 7.1; more than 64 bits nobody sends
+_KEEPALIVE = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
+_REFUSALS = {
+    401: "the caster refuses user or password",
+    403: "the caster does not let this user have the mountpoint",
+    404: "the caster has no such mountpoint",
+    503: "the caster has no data for the mountpoint at present",
+}
+
+
+class NtripTransport(DescriptorTransport):
+    """One mountpoint of one caster.
+
+    Args:
+        spec: ``ntrip:<host>:<port>/<mountpoint>``; options user, password_env (the variable that holds the password),
+            version, position (latitude, longitude, height, sent as GGA for casters that make a station near it).
+        stopped: whether nobody waits any more for the connection.
+    """
+
+    def __init__(self, spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(f"ntrip:{spec.address}")
+        self._stopped = stopped
+        self._spec = spec
+        self._sock: socket.socket | None = None
+        self._chunks: _Chunks | None = None
+        self._first = b""
+        self._heard_s = self._told_s = 0.0
+
+    def _open_device(self) -> int:
+        attempt, limit_s = _Attempt(self._connect), time.monotonic() + OPEN_S
+        while not attempt.wait(SLICE_S):
+            if self._stopped() and not attempt.wait(0.0):
+                attempt.leave()
+                raise TransportError(f"{self.name}: not connected in the time")
+            if time.monotonic() > limit_s:
+                attempt.leave()
+                raise TransportError(f"{self.name}: no connection within {OPEN_S:g} s; is the network there?")
+        self._sock = attempt.result()
+        self._heard_s = time.monotonic()
+        self._told_s = -math.inf
+        return self._sock.fileno()
+
+    def _connect(self) -> socket.socket:
+        """A connection on which data comes."""
+        request = self._request()
+        try:
+            sock = socket.create_connection((self._spec.ntrip_host, self._spec.ntrip_port), CONNECT_S)
+        except (OSError, UnicodeError) as error:  # the latter of a name that cannot be encoded for the resolver
+            raise TransportError(self._why(error)) from error
+        try:
+            self._converse(sock, request)
+        except OSError as error:
+            sock.close()
+            raise error if isinstance(error, TransportError) else TransportError(self._why(error)) from error
+        return sock
+
+    def _converse(self, sock: socket.socket, request: bytes) -> None:
+        """Ask, read the answer's head, and keep what of the data came with it."""
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in _KEEPALIVE:
+            sock.setsockopt(socket.IPPROTO_TCP, option, value)
+        sock.sendall(request)
+        head, self._first = self._head(sock, time.monotonic() + CONNECT_S)
+        lines = head.decode("latin-1").split("\r\n")
+        fields = {name.strip().lower(): value.strip().lower() for name, _, value in (x.partition(":") for x in lines)}
+        words = lines[0].split(maxsplit=2)
+        code = int(words[1]) if len(words) > 1 and _STATUS.fullmatch(words[1]) else 0
+        if words[:1] == ["SOURCETABLE"] or (code == 200 and "sourcetable" in fields.get("content-type", "")):
+            raise TransportError(f"{self.name}: {self._not_in_table(sock)}")
+        if code in _REFUSALS:
+            raise TransportError(f"{self.name}: {_REFUSALS[code]}")
+        if (
+            code != 200
+            or not words[0].startswith(("ICY", "HTTP/"))
+            or fields.get("content-type", "").startswith("text/")
+        ):
+            raise TransportError(f"{self.name}: answers {_printable(lines[0])}; is it an NTRIP caster?")
+        self._chunks = _Chunks() if "chunked" in fields.get("transfer-encoding", "") else None
+        sock.setblocking(False)
+
+    def _request(self) -> bytes:
+        spec = self._spec
+        host = f"{spec.ntrip_host}:{spec.ntrip_port}"
+        second = spec.options.get("version", "2") == "2"
+        lines = [f"GET /{spec.mountpoint} HTTP/1.{1 if second else 0}", f"Host: {host}"]
+        lines += ["Ntrip-Version: Ntrip/2.0", "Connection: close"] if second else []
+        lines.append("User-Agent: NTRIP swath")
+        user, variable = spec.options.get("user"), spec.options.get("password_env")
+        if variable is not None and variable not in os.environ:
+            raise TransportError(f"{self.name}: password_env={variable}: there is no such environment variable")
+        if user is not None:
+            secret = f"{user}:{os.environ[variable] if variable else ''}".encode()
+            lines.append(f"Authorization: Basic {base64.b64encode(secret).decode()}")
+        return "\r\n".join([*lines, "", ""]).encode()
+
+    def _head(self, sock: socket.socket, deadline_s: float) -> tuple[bytes, bytes]:
+        """The answer up to its empty line; of ICY 200 OK, which some casters send alone, its first line."""
+        data = b""
+        while len(data) < MOST_HEADER_BYTES:
+            line, found, rest = data.partition(b"\r\n")
+            if found and line.startswith(b"ICY 200"):
+                return line, rest.removeprefix(b"\r\n")
+            head, found, rest = data.partition(b"\r\n\r\n")
+            if found:
+                return head, rest
+            sock.settimeout(max(0.01, deadline_s - time.monotonic()))
+            more = sock.recv(READ_BYTES)
+            if not more:
+                if found := data.partition(b"\r\n")[1]:
+                    return data.partition(b"\r\n")[0], data.partition(b"\r\n")[2]
+                raise TransportError(f"{self.name}: the caster closed the connection without an answer")
+            data += more
+        raise TransportError(f"{self.name}: answers without an end; is it an NTRIP caster?")
+
+    def _not_in_table(self, sock: socket.socket) -> str:
+        """What a source table that came in place of data says."""
+        table, deadline_s = self._first, time.monotonic() + CONNECT_S
+        try:
+            while b"ENDSOURCETABLE" not in table and len(table) < MOST_TABLE_BYTES and time.monotonic() < deadline_s:
+                sock.settimeout(max(0.01, deadline_s - time.monotonic()))
+                if not (data := sock.recv(READ_BYTES)):
+                    break
+                table += data
+        except OSError:
+            pass  # what came is told
+        rows = (row.split(";") for row in table.decode("latin-1").splitlines())
+        names = [_printable(row[1]) for row in rows if row[0] == "STR" and len(row) > 1]
+        shown = ", ".join(names[:MOST_NAMED]) or "none"
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        if self._spec.mountpoint in names:
+            return "the caster sends its table in place of this mountpoint's data: may this user have it?"
+        return f"the caster has no mountpoint {self._spec.mountpoint}; it has: {shown}{more}"
+
+    def _why(self, error: OSError | UnicodeError) -> str:
+        host, port = self._spec.ntrip_host, self._spec.ntrip_port
+        if isinstance(error, UnicodeError):
+            return f"{self.name}: {host} is no name that can be looked up"
+        if isinstance(error, socket.gaierror):
+            return f"{self.name}: the name {host} is not known; is there a network?"
+        if isinstance(error, TimeoutError):
+            return f"{self.name}: no answer from {host} port {port} in {CONNECT_S:g} s"
+        if error.errno == errno.ECONNREFUSED:
+            return f"{self.name}: {host} has nothing on port {port}; casters are mostly on 2101"
+        if error.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
+            return f"{self.name}: no way to {host}; is there a network?"
+        return f"{self.name}: cannot connect: {error.strerror or error}"
+
+    def _close_device(self) -> None:
+        sock, self._sock = self._sock, None
+        if sock is not None:
+            sock.close()
+
+    def _receive(self, gate: Gate, timeout_s: float) -> list[UnitBlock]:
+        assert self._sock is not None
+        self._tell_position()
+        first, self._first = self._first, b""
+        if first:
+            return self._units(first)
+        if not gate.wait(timeout_s):
+            if time.monotonic() - self._heard_s > SILENT_S:
+                raise TransportError(f"{self.name}: no data for {SILENT_S:g} s")
+            return []
+        try:
+            data = self._sock.recv(READ_BYTES)
+        except BlockingIOError:
+            return []
+        except OSError as error:
+            raise TransportError(f"{self.name}: the connection broke: {error.strerror or error}") from error
+        if not data:
+            raise TransportError(f"{self.name}: the caster closed the connection")
+        self._heard_s = time.monotonic()
+        return self._units(data)
+
+    def _units(self, data: bytes) -> list[UnitBlock]:
+        if self._chunks is not None:
+            try:
+                data = self._chunks.feed(data)
+            except ValueError as error:
+                raise TransportError(f"{self.name}: {error}") from None
+        return [UnitBlock(np.frombuffer(data, np.uint8)[np.newaxis, :])] if data else []
+
+    def _tell_position(self) -> None:
+        position = self._spec.options.get("position")
+        if position is None or time.monotonic() - self._told_s < GGA_S:
+            return
+        self._told_s = time.monotonic()
+        self._send(gga_sentence(*ntrip_position(position), datetime.now(UTC)))
+
+    def _send(self, data: bytes) -> None:
+        assert self._sock is not None
+        deadline_s = time.monotonic() + SEND_TIMEOUT_S
+        rest = memoryview(data)
+        while rest:
+            if not wait_writable(self._sock.fileno(), deadline_s):
+                raise TransportError(f"{self.name}: the caster takes no data")
+            try:
+                rest = rest[self._sock.send(rest) :]
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise TransportError(f"{self.name}: the connection broke: {error.strerror or error}") from error
+
+
+class _Attempt(threading.Thread):
+    """Connects, however long a resolver takes; who waits for it may leave before."""
+
+    def __init__(self, connect: Callable[[], socket.socket]) -> None:
+        super().__init__(name="ntrip connect", daemon=True)
+        self._connect = connect
+        self._lock = threading.Lock()
+        self._left = False
+        self._sock: socket.socket | None = None
+        self._error = TransportError("not connected")
+        self.start()
+
+    def run(self) -> None:
+        try:
+            sock = self._connect()
+        except TransportError as error:
+            self._error = error
+            return
+        with self._lock:
+            if self._left:
+                sock.close()
+            else:
+                self._sock = sock
+
+    def wait(self, seconds: float) -> bool:
+        """Whether it has an end."""
+        self.join(seconds)
+        return not self.is_alive()
+
+    def leave(self) -> None:
+        """Nobody wants the connection any more."""
+        with self._lock:
+            self._left = True
+            if self._sock is not None:
+                self._sock.close()
+
+    def result(self) -> socket.socket:
+        """The connection; raises TransportError."""
+        if self._sock is None:
+            raise self._error
+        return self._sock
+
+
+def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime) -> bytes:
+    """A GGA of a position, as casters want it (NMEA 0183): fix 1, ten satellites, no geoid separation."""
+    parts = []
+    for value, digits, letters in ((lat_deg, 2, "NS"), (lon_deg, 3, "EW")):
+        minutes = round(abs(value) * 60.0, 4)
+        whole = int(minutes // 60.0)
+        parts += [f"{whole:0{digits}d}{minutes - 60.0 * whole:07.4f}", letters[value < 0.0]]
+    body = f"GPGGA,{now:%H%M%S}.00,{','.join(parts)},1,10,1.0,{height_m:.1f},M,0.0,M,,".encode()
+    return b"$%s*%02X\r\n" % (body, nmea_xor(body))
+
+
+class _Chunks:
+    """Takes the chunked transfer coding away."""
+
+    def __init__(self) -> None:
+        self._held = b""
+        self._left = 0  # bytes of the chunk still to come, its line end included
+
+    def feed(self, data: bytes) -> bytes:
+        """The contents; ValueError where it is none."""
+        held, out = self._held + data, []
+        while held:
+            if self._left > 2:
+                part = held[: self._left - 2]
+                out.append(part)
+                held, self._left = held[len(part) :], self._left - len(part)
+            elif self._left:
+                skipped = min(self._left, len(held))
+                held, self._left = held[skipped:], self._left - skipped
+            else:
+                line, found, rest = held.partition(b"\r\n")
+                if not found and len(held) < 64:
+                    break
+                length = _CHUNK_LENGTH.fullmatch(line.split(b";")[0].strip())
+                if length is None:
+                    raise ValueError(f"a chunk's length is {_printable(line[:20].decode('latin-1'))}")
+                self._left, held = int(length[0], 16) + 2, rest
+        self._held = held
+        return b"".join(out)
+
+
+def _printable(text: str) -> str:
+    """A foreign line, short and without control characters."""
+    return "".join(letter if letter.isprintable() else "·" for letter in text[:60]) or "nothing"

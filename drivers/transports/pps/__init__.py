@@ -1,0 +1,1 @@
+"""Edges of pulse-per-second signals: the kernel's PPS API, a serial line's DCD, a fixed schedule."""

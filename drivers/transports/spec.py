@@ -1,0 +1,367 @@
+"""Transport and PPS strings of the configuration: text to `TransportSpec`, and that to a transport.
+
+serial:<path>?baud=921600&bytesize=8&parity=N&stopbits=1&rtscts=no&xonxoff=no&dsrdtr=no
+udp:<host>:<port>?group=239.1.2.3&source=192.168.1.201&interface=eth1&buffer_mb=32
+can:<interface>:<channel>?<keyword>=<value>…
+gnss:<name>
+ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from swath.drivers.transports.base import PpsSource, Transport
+
+FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
+PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
+MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
+MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
+
+_TRUE = {"1", "true", "yes", "on"}
+_FALSE = {"0", "false", "no", "off"}
+
+
+@dataclass(frozen=True, slots=True)
+class TransportSpec:
+    """One transport of the configuration, checked.
+
+    Attributes:
+        kind: "serial", "udp", "can", "ntrip" or "gnss" (inside another device's stream: no transport of its own).
+        address: what stands between the kind and the options.
+        options: keyword to value, as text.
+        text: the whole, as configured.
+    """
+
+    kind: str
+    address: str
+    options: dict[str, str] = field(default_factory=dict)
+    text: str = ""
+
+    @property
+    def host(self) -> str:
+        """Local address of a UDP port."""
+        return self.address.rpartition(":")[0]
+
+    @property
+    def port(self) -> int:
+        """Port number of a UDP port."""
+        return int(self.address.rpartition(":")[2])
+
+    @property
+    def interface(self) -> str:
+        """python-can's name of the kind of CAN interface (socketcan, slcan, …)."""
+        return self.address.partition(":")[0]
+
+    @property
+    def channel(self) -> str:
+        """CAN channel (can0, /dev/ttyUSB0, 239.74.163.2)."""
+        return self.address.partition(":")[2]
+
+    @property
+    def ntrip_host(self) -> str:
+        """A caster's name or address."""
+        return self.address.partition("/")[0].rpartition(":")[0].strip("[]")
+
+    @property
+    def ntrip_port(self) -> int:
+        """A caster's port number."""
+        return int(self.address.partition("/")[0].rpartition(":")[2])
+
+    @property
+    def mountpoint(self) -> str:
+        """Of a caster."""
+        return self.address.partition("/")[2]
+
+    @property
+    def device(self) -> str:
+        """What only one source can have: equal for two texts that mean the same port, bus or device."""
+        if self.kind == "serial":
+            return f"serial:{os.path.realpath(self.address)}"
+        if self.kind == "udp":
+            return f"udp:{self.options.get('group', self.host)}:{self.port}"
+        return f"{self.kind}:{self.address}"
+
+    def flag(self, key: str, default: bool = False) -> bool:
+        """An option that is yes or no."""
+        return _boolean(self.options[key]) if key in self.options else default
+
+
+def parse_transport(text: str) -> TransportSpec:
+    """Read a transport string.
+
+    Raises:
+        ValueError: one line naming what is wrong and what would be right.
+    """
+    _refuse_unprintable("transport", text)
+    kind, colon, rest = text.partition(":")
+    if kind not in _CHECKS or not colon:
+        raise ValueError(f"transport {text!r}: want {FORMS}")
+    address, question, query = rest.partition("?")
+    options = _parse_options(text, query) if question else {}
+    spec = TransportSpec(kind, address, options, text)
+    _CHECKS[kind](spec)
+    return spec
+
+
+def _refuse_unprintable(what: str, text: str) -> None:
+    """No path, name or address has any, and the system takes none with a zero in it."""
+    if not text.isprintable():
+        raise ValueError(f"{what} {text!r}: has an unprintable character in it; want a path, name or address")
+
+
+def _parse_options(text: str, query: str) -> dict[str, str]:
+    options: dict[str, str] = {}
+    for item in query.split("&"):
+        key, equals, value = item.partition("=")
+        if not key or not equals or not value:
+            raise ValueError(f"transport {text!r}: option {item!r} should be <keyword>=<value>, joined by '&'")
+        if key in options:
+            raise ValueError(f"transport {text!r}: option {key!r} stands twice")
+        options[key] = value
+    return options
+
+
+def _boolean(value: str) -> bool:
+    if value.lower() in _TRUE:
+        return True
+    if value.lower() in _FALSE:
+        return False
+    raise ValueError(f"{value!r} is neither yes nor no")
+
+
+def _ipv4(value: str) -> bool:
+    ipaddress.IPv4Address(value)
+    return True
+
+
+def _positive(value: str) -> bool:
+    if not value.isascii() or not value.isdecimal() or int(value) == 0:
+        raise ValueError("not a positive whole number")
+    return True
+
+
+def _one_of(*values: str) -> Callable[[str], bool]:
+    def check(value: str) -> bool:
+        if value not in values:
+            raise ValueError(f"not one of {values}")
+        return True
+
+    return check
+
+
+def _multicast(value: str) -> bool:
+    if not ipaddress.IPv4Address(value).is_multicast:
+        raise ValueError("not multicast")
+    return True
+
+
+def _buffer_mb(value: str) -> bool:
+    if _positive(value) and int(value) > MAX_BUFFER_MB:
+        raise ValueError("too large")
+    return True
+
+
+def _baud(value: str) -> bool:
+    if _positive(value) and int(value) > MAX_BAUD:
+        raise ValueError("too fast")
+    return True
+
+
+def ntrip_position(value: str) -> tuple[float, float, float]:
+    """Latitude, longitude, degrees, height, m, of ``47.5,8.7,500``; ValueError where it is none."""
+    lat, lon, height = (float(part) for part in value.split(","))
+    if not (abs(lat) <= 90.0 and abs(lon) <= 180.0 and abs(height) <= 10_000.0):
+        raise ValueError("not on earth")
+    return lat, lon, height
+
+
+def _printable(value: str) -> bool:
+    if not value.isprintable() or ":" in value:
+        raise ValueError("not printable")
+    return True
+
+
+def _variable(value: str) -> bool:
+    if not value.isidentifier():
+        raise ValueError("not a variable's name")
+    return True
+
+
+_Option = tuple[Callable[[str], object], str]
+
+# option: (check, what would be right)
+SERIAL_OPTIONS: dict[str, _Option] = {
+    "baud": (_baud, f"a whole number, 1 to {MAX_BAUD}, such as 921600"),
+    "bytesize": (_one_of("5", "6", "7", "8"), "5, 6, 7 or 8"),
+    "parity": (_one_of("N", "E", "O", "M", "S"), "N, E, O, M or S"),
+    "stopbits": (_one_of("1", "1.5", "2"), "1, 1.5 or 2"),
+    "rtscts": (_boolean, "yes or no"),
+    "xonxoff": (_boolean, "yes or no"),
+    "dsrdtr": (_boolean, "yes or no"),
+}
+UDP_OPTIONS: dict[str, _Option] = {
+    "group": (_multicast, "an IPv4 multicast address such as 239.1.2.3"),
+    "source": (_ipv4, "the sender's IPv4 address such as 192.168.1.201"),
+    "interface": (bool, "an interface such as eth1"),
+    "buffer_mb": (_buffer_mb, f"whole mebibytes, 1 to {MAX_BUFFER_MB}"),
+}
+SOCKETCAN_OPTIONS: dict[str, _Option] = {
+    "bitrate": (_positive, "bits per second such as 1000000"),
+    "data_bitrate": (_positive, "bits per second such as 4000000"),
+    "fd": (_boolean, "yes or no"),
+    "buffer_mb": (_buffer_mb, f"whole mebibytes, 1 to {MAX_BUFFER_MB}"),
+}
+
+
+NTRIP_OPTIONS: dict[str, _Option] = {
+    "user": (_printable, "a user's name, without a colon"),
+    "password_env": (_variable, "the name of the environment variable that holds the password"),
+    "version": (_one_of("1", "2"), "1 or 2"),
+    "position": (ntrip_position, "latitude,longitude,height in degrees and metres, such as 47.5,8.7,500"),
+}
+
+
+def _check_options(spec: TransportSpec, table: dict[str, _Option]) -> None:
+    for key, value in spec.options.items():
+        if key not in table:
+            known = ", ".join(table) or "none"
+            raise ValueError(f"transport {spec.text!r}: unknown option {key!r}; {spec.kind} knows: {known}")
+        check, want = table[key]
+        try:
+            check(value)
+        except ValueError:
+            raise ValueError(f"transport {spec.text!r}: {key}={value} should be {want}") from None
+
+
+def _check_serial(spec: TransportSpec) -> None:
+    if not spec.address:
+        raise ValueError(f"transport {spec.text!r}: want serial:<path>, such as serial:/dev/ttyUSB0?baud=921600")
+    _check_options(spec, SERIAL_OPTIONS)
+
+
+def _check_udp(spec: TransportSpec) -> None:
+    host, colon, port = spec.address.rpartition(":")
+    try:
+        valid = bool(colon) and _ipv4(host)
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ValueError(f"transport {spec.text!r}: want udp:<IPv4 address>:<port>, such as udp:0.0.0.0:2368")
+    if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535")
+    _check_options(spec, UDP_OPTIONS)
+
+
+def _check_can(spec: TransportSpec) -> None:
+    if not spec.interface or not spec.channel:
+        raise ValueError(f"transport {spec.text!r}: want can:<interface>:<channel>, such as can:socketcan:can0")
+    if spec.interface == "socketcan":
+        _check_options(spec, SOCKETCAN_OPTIONS)
+        return
+    from can.interfaces import VALID_INTERFACES
+
+    if spec.interface not in VALID_INTERFACES:
+        known = ", ".join(sorted(VALID_INTERFACES))
+        raise ValueError(f"transport {spec.text!r}: unknown CAN interface {spec.interface!r}; python-can has: {known}")
+    if taken := [key for key in ("interface", "channel", "ignore_config") if key in spec.options]:
+        raise ValueError(f"transport {spec.text!r}: {taken[0]} is no option; want can:<interface>:<channel>?…")
+
+
+def _check_gnss(spec: TransportSpec) -> None:
+    if not spec.address or spec.options:
+        raise ValueError(f"transport {spec.text!r}: want gnss:<name> of a [gnss.<name>] section, without options")
+
+
+def _can_be_asked_for(host: str) -> bool:
+    """Whether the resolver takes a name: it encodes it first, as Python does here."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return True
+
+
+def _check_ntrip(spec: TransportSpec) -> None:
+    place, _, mountpoint = spec.address.partition("/")
+    host, _, port = place.rpartition(":")
+    if not host or not mountpoint or not all(letter.isprintable() and letter != " " for letter in spec.address):
+        raise ValueError(
+            f"transport {spec.text!r}: want ntrip:<host>:<port>/<mountpoint>, such as ntrip:caster.example:2101/ZIMM0"
+        )
+    if not port.isascii() or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ValueError(f"transport {spec.text!r}: port {port!r} should be 1 to 65535, such as 2101")
+    if not _can_be_asked_for(spec.ntrip_host):
+        raise ValueError(
+            f"transport {spec.text!r}: host {spec.ntrip_host!r} is no name that can be looked up: "
+            "want 1 to 63 letters between its dots"
+        )
+    _check_options(spec, NTRIP_OPTIONS)
+    if "password_env" in spec.options and "user" not in spec.options:
+        raise ValueError(f"transport {spec.text!r}: password_env needs user=<name> too")
+
+
+_CHECKS: dict[str, Callable[[TransportSpec], None]] = {
+    "serial": _check_serial,
+    "udp": _check_udp,
+    "can": _check_can,
+    "gnss": _check_gnss,
+    "ntrip": _check_ntrip,
+}
+
+
+def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
+    """The transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant computer.
+
+    Raises:
+        ValueError: the kind has no transport of its own (gnss).
+    """
+    if spec.kind == "udp":
+        from swath.drivers.transports.udp_socket import UdpTransport
+
+        return UdpTransport(spec)
+    if spec.kind == "serial":
+        from swath.drivers.transports.serial_port import SerialTransport
+
+        return SerialTransport(spec)
+    if spec.kind == "can":
+        return _open_can(spec)
+    if spec.kind == "ntrip":
+        from swath.drivers.transports.ntrip import NtripTransport
+
+        return NtripTransport(spec, stopped)
+    raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
+
+
+def _open_can(spec: TransportSpec) -> Transport:
+    if spec.interface == "socketcan":
+        from swath.drivers.transports.can_socketcan import SocketCanTransport
+
+        return SocketCanTransport(spec)
+    from swath.drivers.transports.can_adapter import PythonCanTransport
+
+    return PythonCanTransport(spec)
+
+
+def parse_pps(text: str, edge: str = "assert") -> PpsSource:
+    """The PPS source for ``text``, not yet opened.
+
+    Raises:
+        ValueError: one line naming what is wrong and what would be right.
+    """
+    from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
+
+    _refuse_unprintable("PPS source", text)
+    if edge not in ("assert", "clear"):
+        raise ValueError(f"PPS edge {edge!r}: want assert or clear")
+    kind, colon, path = text.partition(":")
+    if text.startswith("/"):
+        return KernelPps(text, edge)
+    if kind == "serial-dcd" and path.startswith("/"):
+        return SerialDcdPps(path, edge)
+    if kind == "fixed" and colon and path:
+        return FixedPps(path, edge)
+    raise ValueError(f"PPS source {text!r}: want {PPS_FORMS}")
