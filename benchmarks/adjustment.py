@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.adjust import adjust
+from swath.calib.equations.rows import Rows
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import Wish, unknowns
-from swath.calib.rows import Rows
-from swath.calib.trajectory_errors import Taus, gauss_markov
 from swath.daemon.memory import keep_freed_memory
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry

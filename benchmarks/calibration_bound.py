@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.daemon.processing.calibrate_run import prior_of
 from swath.daemon.processing.calibration_flight import read_flight
 from swath.daemon.processing.flights import Wish as Logs

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.adjust import adjust
+from swath.calib.equations.normals import NormalError, TrajectoryWeight
+from swath.calib.equations.rows import Rows
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import ControlPoint, Features
-from swath.calib.normals import NormalError, TrajectoryWeight
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import INSTALLED, MODELS, Wish, unknowns
-from swath.calib.rows import Rows
-from swath.calib.solve import Settings
-from swath.calib.trajectory_errors import Taus, gauss_markov
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 from tests.calib.test_rows import shifted

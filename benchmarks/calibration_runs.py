@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
 from swath.calib.adjust import adjust
-from swath.calib.control import control_planes, in_t, read_control
+from swath.calib.control.points import control_planes, in_t, read_control
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.trajectory_prior import Knots, TrajectoryPrior, apply, from_smoother, knots_of
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Swath
 from swath.calib.parameters import MODELS, Wish
-from swath.calib.plane_returns import thinned
-from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneSettings
-from swath.calib.solve import Settings
-from swath.calib.trajectory_errors import Knots, TrajectoryPrior, apply, from_smoother, knots_of
+from swath.calib.planes.returns import thinned
+from swath.calib.planes.search import find_planes
 from swath.daemon.processing.calibration_flight import KNOT_S, read_flight, replaced
 from swath.daemon.processing.flights import Wish as Logs
 from swath.daemon.processing.flown import TrajectoryWish

@@ -25,12 +25,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.effects import NAMES, SeenFrom
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, apply, draw
 from swath.calib.flight import Flight
-from swath.calib.signatures import signatures
-from swath.calib.strip_cells import StripRules
-from swath.calib.strips import differences
-from swath.calib.trajectory_errors import TrajectoryPrior, apply, draw
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import NAMES, SeenFrom
+from swath.calib.strips.signatures import signatures
 from swath.daemon.processing.calibration_flight import read_flight, smoothed_prior
 from swath.daemon.processing.flights import Wish
 from swath.daemon.processing.flown import TrajectoryWish

@@ -8,7 +8,7 @@ which is nothing where a row knows little of it, and sigmas where the trajectory
 
 The trajectory's errors are unknowns too, with what is known of them beforehand as their prior: correlated in time, they
 are the same for thousands of returns, and a calibration that takes them as noise of each return believes itself far
-too much. What this flight does not determine is held, and said (`swath.calib.observability`).
+too much. What this flight does not determine is held, and said (`swath.calib.equations.observability`).
 
 A held parameter is wrong by something, too. With N the reduced normal matrix of the estimated ones, B their part with
 the held ones and S what is plausible of these, the covariance is N⁻¹ + N⁻¹ B S Bᵀ N⁻¹, and −N⁻¹ B S between the two
@@ -23,16 +23,16 @@ from dataclasses import astuple, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.observability import spectrum
+from swath.calib.equations.quality import Solution, trajectory_fit
+from swath.calib.equations.robust import global_test
+from swath.calib.equations.solve import Block, HeldEffects, Settings, Solved, determined, settled
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Features
 from swath.calib.flight import Flight
-from swath.calib.normals import NormalError
-from swath.calib.observability import spectrum
 from swath.calib.outcome import Adjusted, Considered
 from swath.calib.parameters import Unknowns, Wish, unknowns
-from swath.calib.quality import Solution, trajectory_fit
-from swath.calib.robust import global_test
-from swath.calib.solve import Block, HeldEffects, Settings, Solved, determined, settled
-from swath.calib.trajectory_errors import TrajectoryPrior
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from swath.calib.history import BORESIGHT, History
+from swath.calib.validation.history import BORESIGHT, History
 
 INK, MUTED, COLOURS = "#1d242b", "#5d6770", ("#0072b2", "#d55e00", "#009e73")
 DPI, DAY_S = 140, 86_400.0

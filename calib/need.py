@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.effects import SeenFrom, effect_columns
 from swath.calib.flight import Flight, Swath
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ANGLES
+from swath.calib.strips.effects import SeenFrom, effect_columns
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from swath.calib import adjust as adjustment
 from swath.calib.adjust import AS_USUAL
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
 from swath.calib.outcome import Held
 from swath.calib.parameters import Wish
-from swath.calib.plane_cells import CELL_SHORT_M, CELL_SIZES_M
-from swath.calib.plane_returns import RIM_M
 from swath.calib.plane_settings import PlaneSettings
-from swath.calib.solve import Settings
-from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.calib.planes.cells import CELL_SHORT_M, CELL_SIZES_M
+from swath.calib.planes.returns import RIM_M
 from swath.georef.geodesy.rotations import boresight, rot_from_quaternion
 from swath.georef.records import RETURN_DTYPE, Int64Array
 from swath.georef.scanner.calibration import Calibration
@@ -188,7 +188,7 @@ def planned(
 
 
 def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
-    """Metres a cell of the plane search would have on such a line, as `swath.calib.plane_cells.cell_size` chooses."""
+    """Metres a cell of the plane search would have on such a line, as `swath.calib.planes.cells.cell_size` chooses."""
     if not len(per_m2):
         return _PLANES.cell_m
     middling = float(np.median(per_m2))

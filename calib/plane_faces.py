@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from swath.calib.plane_cells import Segments
 from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.cells import Segments
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, sensor_t
-from swath.calib.plane_cells import CELLS_LEAST, Segments, cell_middles
 from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.cells import CELLS_LEAST, Segments, cell_middles
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

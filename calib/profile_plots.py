@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from swath.calib.profiles import Profile, Section
+from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.report_canvas import INK, MUTED
 
 PAGE_IN = (9.6, 4.6)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Residuals
-from swath.calib.record_values import Matrix
+from swath.calib.record.values import Matrix
 from swath.georef.geodesy.earth import geodetic_from_e, prime_vertical_radius_m, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.records import Int64Array

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from html import escape
 
 from swath.calib.report_canvas import NARROW, WIDE, Picture
-from swath.calib.report_input import Difference, DifferenceMap, PairDifference, Profile, ReportInput
 from swath.calib.report_pdf import pdf_of
 from swath.calib.report_sections import Block, Notes, Words, blocks_of, cards_of, identity_rows
 from swath.calib.report_style import STYLE
 from swath.calib.report_tables import Table
-from swath.calib.report_verdict import Verdict, judge
+from swath.calib.summary import Difference, DifferenceMap, PairDifference, Profile, ReportInput
+from swath.calib.verdict import Verdict, judge
 
 __all__ = ["Difference", "DifferenceMap", "PairDifference", "Profile", "ReportInput", "html", "judge", "pdf"]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from swath.calib.features import Plane
 from swath.calib.flight import Flight
 from swath.calib.report_canvas import INK, MUTED, Canvas, Format, Panels, Picture, colour_of
-from swath.calib.report_input import ReportInput
+from swath.calib.summary import ReportInput
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 

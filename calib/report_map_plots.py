@@ -27,7 +27,7 @@ from swath.calib.report_canvas import (
     class_words,
     colour_of,
 )
-from swath.calib.report_input import DifferenceMap, ReportInput
+from swath.calib.summary import DifferenceMap, ReportInput
 
 FloatArray = NDArray[np.float64]
 

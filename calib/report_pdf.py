@@ -18,10 +18,10 @@ from matplotlib.image import imread
 from matplotlib.patches import Rectangle
 
 from swath.calib.report_canvas import AFTER, BAD, GOOD, INK, MUTED, PAPER, SETTINGS, Canvas, Picture
-from swath.calib.report_input import Profile
 from swath.calib.report_sections import Block, Notes, Words
 from swath.calib.report_tables import Table
-from swath.calib.report_verdict import Level, Verdict
+from swath.calib.summary import Profile
+from swath.calib.verdict import Level, Verdict
 
 PAGE_IN, MARGIN_IN = (8.27, 11.69), 0.585
 TOP_IN, FOOT_IN = 0.6, 0.65

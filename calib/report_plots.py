@@ -14,10 +14,10 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
+from swath.calib.labels import number, unknown
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.report_canvas import AFTER, BAD, BEFORE, INK, MUTED, SERIES, Canvas, Format, Panels, Picture, colour_of
-from swath.calib.report_input import Pair, ReportInput
-from swath.calib.report_words import number, unknown
+from swath.calib.summary import Pair, ReportInput
 from swath.georef.timescales.gps_time import SECOND_NS
 
 FloatArray = NDArray[np.float64]

@@ -11,14 +11,14 @@ import numpy as np
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.calib.profile_check import Check, Comparison
-from swath.calib.profile_measure import Ground
+from swath.calib.labels import decimals_of, number, unknown
 from swath.calib.profile_plots import draw, svg
-from swath.calib.profile_sections import Corridor, fit_pieces
-from swath.calib.profiles import Profile, Section
-from swath.calib.report_input import Profile as Picture
+from swath.calib.profiles.check import Check, Comparison
+from swath.calib.profiles.measure import Ground
+from swath.calib.profiles.sections import Corridor, fit_pieces
+from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.report_tables import Table
-from swath.calib.report_words import decimals_of, number, unknown
+from swath.calib.summary import Profile as Picture
 
 MOST_DRAWN = 6
 MOST_RETURNS = 8000

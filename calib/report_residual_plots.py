@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from swath.calib.outcome import Residuals
 from swath.calib.report_canvas import BAD, INK, MUTED, SERIES, Canvas, Format, Panels, Picture
-from swath.calib.report_input import ReportInput
+from swath.calib.summary import ReportInput
 from swath.georef.records import Int64Array
 
 FloatArray = NDArray[np.float64]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from swath.calib.labels import degrees, is_undetermined, length, number, plain, thousands, words_of
 from swath.calib.report_canvas import Picture
 from swath.calib.report_cut_plots import cut_picture
-from swath.calib.report_input import Profile, ReportInput
 from swath.calib.report_map_plots import difference_picture, map_picture
 from swath.calib.report_plots import (
     control_picture,
@@ -31,8 +31,8 @@ from swath.calib.report_tables import (
     refused_table,
     strips_table,
 )
-from swath.calib.report_verdict import BORESIGHT, DEG, Verdict, overall_rms_m, sigma_of
-from swath.calib.report_words import degrees, is_undetermined, length, number, plain, thousands, words_of
+from swath.calib.summary import Profile, ReportInput
+from swath.calib.verdict import BORESIGHT, DEG, Verdict, overall_rms_m, sigma_of
 
 
 @dataclass(frozen=True, slots=True)

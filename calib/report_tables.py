@@ -9,11 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.outcome import Held, Residuals
-from swath.calib.report_input import ReportInput
-from swath.calib.report_plots import SUSPECT
-from swath.calib.report_verdict import held_words
-from swath.calib.report_words import (
+from swath.calib.labels import (
     Unknown,
     decimals_of,
     is_undetermined,
@@ -25,6 +21,10 @@ from swath.calib.report_words import (
     unknown,
     words_of,
 )
+from swath.calib.outcome import Held, Residuals
+from swath.calib.report_plots import SUSPECT
+from swath.calib.summary import ReportInput
+from swath.calib.verdict import held_words
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 MOST_ROWS = 25

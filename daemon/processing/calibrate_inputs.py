@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.control import in_t, read_control
-from swath.calib.control_doubts import doubts
+from swath.calib.control.doubts import doubts
+from swath.calib.control.points import in_t, read_control
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight
-from swath.calib.picked_points import picked_ties, read_picked
+from swath.calib.ties.picked import picked_ties, read_picked
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibration_flight import KeptFlight
 from swath.daemon.text_files import text_of
@@ -41,9 +41,9 @@ def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[t
     """Surveyed points in the flight's frame, and what is doubtful of them, a line each.
 
     Args:
-        path: CSV as of `swath.calib.control.read_control`.
+        path: CSV as of `swath.calib.control.points.read_control`.
         flight: with its points placed as well as is known.
-        suffered: kinds of doubts about the whole (`swath.calib.control_doubts.Doubt`) that are told only.
+        suffered: kinds of doubts about the whole (`swath.calib.control.doubts.Doubt`) that are told only.
 
     Raises:
         UserError: it cannot be read, or is doubtful as a whole; ControlError: it is no such file.

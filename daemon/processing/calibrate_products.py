@@ -16,18 +16,18 @@ import numpy as np
 
 from swath import __version__
 from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
-from swath.calib.effects import SeenFrom
 from swath.calib.need import POINT, Need, need_of
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES
-from swath.calib.profile_check import Check
-from swath.calib.record_values import Plain
-from swath.calib.report_input import Finding, ReportInput
-from swath.calib.report_verdict import DEG, Verdict, held_words, judge
-from swath.calib.signatures import signatures
-from swath.calib.strip_cells import StripRules
-from swath.calib.strips import differences
-from swath.calib.validation import Asked, validate
+from swath.calib.profiles.check import Check
+from swath.calib.record.values import Plain
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import SeenFrom
+from swath.calib.strips.signatures import signatures
+from swath.calib.summary import Finding, ReportInput
+from swath.calib.validation.methods import Asked, validate
+from swath.calib.verdict import DEG, Verdict, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibrate_model import in_words, key_of
 from swath.daemon.processing.calibrate_record import instruments_of
@@ -347,7 +347,7 @@ def _wanted(done: Calibrated) -> dict[str, float]:
 
 def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
     """The page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
-    from swath.calib.record import RecordInput, record_json, record_of, record_xml
+    from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
     from swath.calib.report import html, pdf
     from swath.calib.report_profiles import pictures
 

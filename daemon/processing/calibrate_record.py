@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.calib.record import RecordError, told_value
-from swath.calib.record_values import Plain, Value
+from swath.calib.record.record import RecordError, told_value
+from swath.calib.record.values import Plain, Value
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibration_flight import KeptFlight
 from swath.daemon.processing.navigate import Navigated

@@ -2,7 +2,7 @@
 
     returns of the strips as measured, and the trajectory's own joint covariance     calibration_flight
     coarse boresight, so that the same roof is found in every strip                  swath.calib.prealign
-    planes, tie points, control                                                      swath.calib.plane_search, …
+    planes, tie points, control                                                      swath.calib.planes.search, …
     adjustment, with correspondences found anew until they stay                      swath.calib.adjust
     height differences of strips, before and after; files, record, report            calibrate_products
 
@@ -18,27 +18,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from swath.calib.adjust import adjust
-from swath.calib.control import ControlError, control_planes, in_t, read_control
-from swath.calib.control_doubts import doubts
+from swath.calib.control.doubts import doubts
+from swath.calib.control.points import ControlError, control_planes, in_t, read_control
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
-from swath.calib.normals import NormalError
+from swath.calib.labels import number, unknown
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
 from swath.calib.parameters import Wish as Model
-from swath.calib.picked_points import PickedError
-from swath.calib.picked_points import carried as carried_points
-from swath.calib.plane_given import given_planes
-from swath.calib.plane_matching import rematch
-from swath.calib.plane_returns import limited
-from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneError, PlaneSettings
+from swath.calib.planes.given import given_planes
+from swath.calib.planes.matching import rematch
+from swath.calib.planes.returns import limited
+from swath.calib.planes.search import find_planes
 from swath.calib.prealign import PrealignError, PrealignSettings, prealigned
-from swath.calib.profile_check import Check, check
-from swath.calib.record_values import Plain
-from swath.calib.report_input import Finding
-from swath.calib.report_words import number, unknown
-from swath.calib.trajectory_errors import TrajectoryPrior, gauss_markov
+from swath.calib.profiles.check import Check, check
+from swath.calib.record.values import Plain
+from swath.calib.summary import Finding
+from swath.calib.ties.picked import PickedError
+from swath.calib.ties.picked import carried as carried_points
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibrate_inputs import PolygonError, rings_of, ties_of
 from swath.daemon.processing.calibration_flight import (
@@ -342,13 +342,13 @@ def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Seq
     """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
     found = [planes]
     if "ties" in wish.observe:
-        from swath.calib.tie_points import find_ties
+        from swath.calib.ties.intersections import find_ties
 
         found = [find_ties(flight, planes)]
     if points:
         found.append(control_planes(flight, points))
     if "markings" in wish.observe:
-        from swath.calib.markings import find_markings
+        from swath.calib.ties.markings import find_markings
 
         found.append(find_markings(flight))
     return Features.joined(found)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, from_smoother, knots_of
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.errors import UserError

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.observability import RULES_OF_ALL
+from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError, Head, Tangent
-from swath.calib.normals import NormalError
-from swath.calib.observability import RULES_OF_ALL
 from swath.calib.outcome import Held
 from swath.calib.parameters import ParameterError, Wish
 from swath.calib.plan import Line, Predicted, Scan, Surface, planned, predict
-from swath.calib.trajectory_errors import gauss_markov
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibrate_model import of_parameters, tables_in_words
 from swath.daemon.processing.calibrate_run import EVERY, PLANES

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.calib.control_doubts import geoid_undulation
+from swath.calib.control.doubts import geoid_undulation
 from swath.daemon.errors import UserError
 from swath.daemon.processing.navigation_log import NavigationLog
 from swath.daemon.processing.navigation_observations import Observed

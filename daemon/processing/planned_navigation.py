@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, from_smoother, knots_of
 from swath.calib.flight import Flight
-from swath.calib.trajectory_errors import TrajectoryPrior, from_smoother, knots_of
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.processing.navigation_observations import heading_observations
 from swath.daemon.processing.navigation_sources import filter_setup, noise_of

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 
-from swath.calib.accuracy_standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
 from swath.daemon.processing.quicklook import Look
 from swath.daemon.processing.quicklook_maps import (
     draw_density,

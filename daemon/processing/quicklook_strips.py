@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.strips import single_return_sigma_m
+from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.processing.quicklook_grids import Frame, inner
 from swath.daemon.processing.quicklook_read import Block
 from swath.georef.compiled import kept

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath import __version__
-from swath.calib.strip_functions import StripChoice
+from swath.calib.strips.corrections import StripChoice
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibrate_products import Told, strips_entry
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry

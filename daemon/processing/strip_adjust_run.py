@@ -1,9 +1,9 @@
 """`swath strips --adjust`: corrections of the trajectory, strip by strip, while the calibration is held.
 
 returns of the strips, placed with the calibration               calibration_flight
-planes, control                                                  swath.calib.plane_search, swath.calib.control
-corrections; planes found anew with them; corrections again      swath.calib.strip_functions
-height differences of strips, before and after                   swath.calib.strips
+planes, control                                                  swath.calib.planes.search, swath.calib.control.points
+corrections; planes found anew with them; corrections again      swath.calib.strips.corrections
+height differences of strips, before and after                   swath.calib.strips.differences
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from swath.calib.control import ControlError, control_planes
-from swath.calib.effects import SeenFrom
+from swath.calib.control.points import ControlError, control_planes
+from swath.calib.equations.normals import NormalError
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
-from swath.calib.normals import NormalError
-from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneError
-from swath.calib.signatures import signatures
-from swath.calib.strip_cells import StripRules
-from swath.calib.strip_functions import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
-from swath.calib.strips import differences
+from swath.calib.planes.search import find_planes
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.corrections import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import SeenFrom
+from swath.calib.strips.signatures import signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.places import nearest_there
 from swath.daemon.processing.calibrate_inputs import control_of
@@ -72,7 +72,7 @@ class AdjustWish:
         logs: what is read and how; what it says of products does not count.
         output: folder for the corrected trajectories and the record.
         control: CSV of surveyed points; None: none.
-        model: that all strips get, of `swath.calib.strip_functions.MODELS`; ``auto``: each what its returns ask for.
+        model: that all strips get, of `swath.calib.strips.corrections.MODELS`; ``auto``: each what its returns ask for.
         overwrite: files of an earlier run are replaced.
     """
 

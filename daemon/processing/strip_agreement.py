@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.accuracy_standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
 from swath.calib.flight import Flight
-from swath.calib.report_input import DifferenceMap, PairDifference
+from swath.calib.strips.standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
+from swath.calib.summary import DifferenceMap, PairDifference
 from swath.daemon.processing.quicklook_read import Block
 from swath.daemon.processing.quicklook_strips import (
     FEWEST_CELLS,

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.calib.effects import SeenFrom
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.flight import Flight, Tangent
-from swath.calib.strip_cells import (
+from swath.calib.strips.cells import (
     Cells,
     FlightStrip,
     Gathered,
@@ -26,7 +26,7 @@ from swath.calib.strip_cells import (
     overlap_cells,
     thinned,
 )
-from swath.calib.trajectory_errors import TrajectoryPrior
+from swath.calib.strips.effects import SeenFrom
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.point_times import PointClock

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from swath.calib.flight import FlightError
-from swath.calib.signatures import Signatures, record_of, signatures
-from swath.calib.strip_cells import StripRules
-from swath.calib.strips import Numbers, PairReport, StripReport, report_of
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import Numbers, PairReport, StripReport, report_of
+from swath.calib.strips.signatures import Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration_flight import read_flight, smoothed_prior
 from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from swath.calib.record import Document, RecordError, document_json, document_xml, read_document, with_told
-from swath.calib.record_values import Plain
-from swath.calib.validation import Validation
+from swath.calib.record.record import Document, RecordError, document_json, document_xml, read_document, with_told
+from swath.calib.record.values import Plain
+from swath.calib.validation.methods import Validation
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.text_files import text_of
 from swath.georef.scanner.calibration import Calibration

@@ -11,17 +11,26 @@ from typing import Any
 import numpy as np
 
 from swath.calib.adjust import adjust
-from swath.calib.control import ControlError, control_planes
+from swath.calib.control.points import ControlError, control_planes
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
-from swath.calib.history import History, HistoryError, history
-from swath.calib.normals import NormalError
 from swath.calib.parameters import Wish as Model
-from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneError
-from swath.calib.record import Document
-from swath.calib.trajectory_errors import TrajectoryPrior
-from swath.calib.validation import SIGMAS_DEG, SIGMAS_M, Asked, Method, Validation, same_logs, validate, with_sigmas
+from swath.calib.planes.search import find_planes
+from swath.calib.record.record import Document
+from swath.calib.validation.history import History, HistoryError, history
+from swath.calib.validation.methods import (
+    SIGMAS_DEG,
+    SIGMAS_M,
+    Asked,
+    Method,
+    Validation,
+    same_logs,
+    validate,
+    with_sigmas,
+)
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibrate_inputs import control_of
 from swath.daemon.processing.calibrate_run import PLANES, prior_of

@@ -7,11 +7,11 @@ import contextlib
 import numpy as np
 
 from swath.calib.adjust import adjust
+from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.parameters import Wish
-from swath.calib.plane_matching import rematch
-from swath.calib.plane_search import find_planes
-from swath.calib.trajectory_errors import gauss_markov
+from swath.calib.planes.matching import rematch
+from swath.calib.planes.search import find_planes
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry

@@ -17,7 +17,7 @@ from swath.calib.calibration_file import Header
 from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
-from swath.calib.report_input import DifferenceMap, PairDifference, Profile, ReportInput
+from swath.calib.summary import DifferenceMap, PairDifference, Profile, ReportInput
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry

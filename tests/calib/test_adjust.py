@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.adjust import adjust, predict
+from swath.calib.equations.normals import NormalError, TrajectoryWeight, moved, normals
+from swath.calib.equations.rows import Rows, State
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.tie_rows import Ties
+from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, gauss_markov
 from swath.calib.features import ControlPoint, Features, Sighting, TiePoint
 from swath.calib.flight import Flight
 from swath.calib.intensity_curve import STEPS, at_knots, curve_by_knots
-from swath.calib.normals import NormalError, TrajectoryWeight, moved, normals
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import MODELS, Wish, unknowns
-from swath.calib.rows import Rows, State
-from swath.calib.solve import Settings
-from swath.calib.tie_rows import Ties
-from swath.calib.trajectory_errors import Taus, TrajectoryPrior, gauss_markov
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed

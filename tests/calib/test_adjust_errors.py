@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 
 from swath.calib.adjust import adjust
-from swath.calib.normals import TrajectoryWeight
+from swath.calib.equations.normals import TrajectoryWeight
+from swath.calib.equations.rows import Rows
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.parameters import Wish, unknowns
-from swath.calib.rows import Rows
-from swath.calib.solve import Settings
-from swath.calib.trajectory_errors import Taus, gauss_markov
 from tests.calib.roofs import LINES, made, trajectory
 from tests.calib.test_rows import shifted
 

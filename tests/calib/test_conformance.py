@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from swath.calib.record import Record, RecordInput, record_of
-from swath.calib.record_tables import BY_KEY, LIDAR, OPTICAL, ROWS
+from swath.calib.record.dictionary import BY_KEY, LIDAR, OPTICAL, ROWS
+from swath.calib.record.record import Record, RecordInput, record_of
 from tests.calib.made_outcome import made_outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from swath.calib.control import HEADER, ControlError, ControlRules, control_planes, in_t, read_control
-from swath.calib.control_doubts import Doubt, doubts
+from swath.calib.control.doubts import Doubt, doubts
+from swath.calib.control.points import HEADER, ControlError, ControlRules, control_planes, in_t, read_control
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.calib.local_plane import PlaneRules, is_inside, robust_plane
+from swath.calib.planes.local import PlaneRules, is_inside, robust_plane
 from tests.calib.surface_flight import FRAME, surface_flight, swath_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks.calibration_designs import LIMIT, Case, flight_of, normalised, run
 from swath.calib.adjust import adjust
+from swath.calib.equations.solve import Settings
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.parameters import Wish
-from swath.calib.solve import Settings
-from swath.calib.trajectory_errors import Taus, gauss_markov
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 

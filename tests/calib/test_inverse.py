@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swath.calib.inverse import inverted
-from swath.calib.normals import TrajectoryWeight
+from swath.calib.equations.inverse import inverted
+from swath.calib.equations.normals import TrajectoryWeight
+from swath.calib.equations.rows import Rows
+from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.parameters import Wish, unknowns
-from swath.calib.rows import Rows
-from swath.calib.trajectory_errors import gauss_markov
 from tests.calib.roofs import LINES, made
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from swath.calib.flight import Flight
-from swath.calib.markings import Image, MarkingSettings, Shift, find_markings, shifted
+from swath.calib.ties.markings import Image, MarkingSettings, Shift, find_markings, shifted
 from tests.calib.analytic_scene import Line, Scanner, fly, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

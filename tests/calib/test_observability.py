@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.calib.observability import RULES, Rules, decide, kind_of, spectrum
+from swath.calib.equations.observability import RULES, Rules, decide, kind_of, spectrum
 from swath.calib.outcome import Held
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from swath.calib.equations.normals import TrajectoryWeight, normals
+from swath.calib.equations.rows import Rows
+from swath.calib.equations.tie_rows import Ties
+from swath.calib.equations.trajectory_prior import apply, draw, gauss_markov
 from swath.calib.features import ControlPoint
 from swath.calib.flight import FlightError
-from swath.calib.normals import TrajectoryWeight, normals
 from swath.calib.parameters import Wish, unknowns
 from swath.calib.plan import MOST_MADE, Scan, planned, predict, search_cell_m
-from swath.calib.rows import Rows
-from swath.calib.tie_rows import Ties
-from swath.calib.trajectory_errors import apply, draw, gauss_markov
 from tests.calib.planned_flight import (
     FRAME,
     NOISE,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight
-from swath.calib.plane_matching import LOST, rematch
-from swath.calib.plane_returns import limited
-from swath.calib.plane_search import find_planes
+from swath.calib.planes.matching import LOST, rematch
+from swath.calib.planes.returns import limited
+from swath.calib.planes.search import find_planes
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight
-from swath.calib.plane_fit import fit_sight
-from swath.calib.plane_kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
-from swath.calib.plane_search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
+from swath.calib.planes.fit import fit_sight
+from swath.calib.planes.kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
+from swath.calib.planes.search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
 from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
 from tests.calib.cast_flight import Cast, Line, cast_flight
 

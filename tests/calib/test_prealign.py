@@ -9,8 +9,8 @@ import pytest
 
 from swath.calib.flight import Flight
 from swath.calib.height_grids import Lattice, surface
-from swath.calib.plane_search import find_planes
 from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.search import find_planes
 from swath.calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
 from swath.calib.scale import scale_of
 from swath.georef.scanner.calibration import Calibration

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from swath.calib.adjust import adjust
+from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, apply, draw, gauss_markov
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import Wish
-from swath.calib.plane_search import find_planes
-from swath.calib.profile_check import CHECK, check, compare
-from swath.calib.profile_influence import influence
-from swath.calib.profile_measure import KINDS, PARAMETER
-from swath.calib.profiles import Given, Profile, survey
+from swath.calib.planes.search import find_planes
+from swath.calib.profiles.check import CHECK, check, compare
+from swath.calib.profiles.influence import influence
+from swath.calib.profiles.measure import KINDS, PARAMETER
+from swath.calib.profiles.stepwise import Given, Profile, survey
 from swath.calib.report_profiles import comparison_table, pictures, profiles_table
-from swath.calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, gauss_markov
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables
 from tests.calib.roofs import exactly_known
 

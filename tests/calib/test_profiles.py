@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.calib.profile_check import Check
-from swath.calib.profile_measure import Settings
 from swath.calib.profile_plots import draw, svg
-from swath.calib.profiles import (
+from swath.calib.profiles.check import Check
+from swath.calib.profiles.measure import Settings
+from swath.calib.profiles.stepwise import (
     Given,
     Profile,
     formula,

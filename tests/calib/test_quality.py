@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.adjust import adjust
+from swath.calib.equations.normals import extras
+from swath.calib.equations.robust import HUBER, least_detectable, least_shift, w_critical
+from swath.calib.equations.rows import Rows, State
+from swath.calib.equations.solve import Block, Settings, solved
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
-from swath.calib.normals import extras
 from swath.calib.parameters import Wish, unknowns
-from swath.calib.robust import HUBER, least_detectable, least_shift, w_critical
-from swath.calib.rows import Rows, State
-from swath.calib.solve import Block, Settings, solved
-from swath.calib.trajectory_errors import Taus, gauss_markov
 from swath.georef.records import Int64Array
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made

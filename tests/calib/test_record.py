@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swath.calib.record import (
+from swath.calib.record.dictionary import BY_KEY, CLASSES, ROWS
+from swath.calib.record.record import (
     NAMESPACE,
     RecordError,
     RecordInput,
@@ -25,8 +26,7 @@ from swath.calib.record import (
     record_xml,
     with_told,
 )
-from swath.calib.record_tables import BY_KEY, CLASSES, ROWS
-from swath.calib.record_values import Matrix, Plain, utc_text
+from swath.calib.record.values import Matrix, Plain, utc_text
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import INDEX
 from swath.georef.scanner.sensor_model import SensorModel

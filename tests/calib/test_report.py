@@ -16,19 +16,19 @@ import pytest
 from matplotlib.figure import Figure
 
 from swath.calib.features import Features
+from swath.calib.labels import decimals_of, degrees, length, number, plain, share, unknown
 from swath.calib.need import Need
 from swath.calib.outcome import Adjusted, Considered, ControlFit, GroupFit, Held
-from swath.calib.profile_check import Check, Comparison
+from swath.calib.profiles.check import Check, Comparison
 from swath.calib.report import PairDifference, Profile, ReportInput, html, judge, pdf
 from swath.calib.report_canvas import NARROW, PAPER
 from swath.calib.report_cut_plots import cuts_of
-from swath.calib.report_input import Finding
 from swath.calib.report_map_plots import plane_rms_cm
 from swath.calib.report_pdf import width_in, wrapped
 from swath.calib.report_residual_plots import residual_picture, seen_of
 from swath.calib.report_tables import entries_table, held_table, parameter_tables
-from swath.calib.report_verdict import Level, held_words
-from swath.calib.report_words import decimals_of, degrees, length, number, plain, share, unknown
+from swath.calib.summary import Finding
+from swath.calib.verdict import Level, held_words
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.calib.equations.rows import Rows, State
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
 from swath.calib.parameters import Unknowns, Wish, unknowns
-from swath.calib.rows import Rows, State
-from swath.calib.trajectory_errors import TrajectoryPrior
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from swath.calib.effects import NAMES, SeenFrom, effect_columns
+from swath.calib.equations.trajectory_prior import Taus, apply, draw, gauss_markov
 from swath.calib.flight import Flight
-from swath.calib.signatures import Signature, record_of, signatures
-from swath.calib.strip_cells import StripRules
-from swath.calib.strips import differences
-from swath.calib.trajectory_errors import Taus, apply, draw, gauss_markov
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import NAMES, SeenFrom, effect_columns
+from swath.calib.strips.signatures import Signature, record_of, signatures
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.geodesy.rotations import rot_x

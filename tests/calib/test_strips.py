@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from swath.calib.accuracy_standards import ASPRS_2014, USGS, best_of, judge
 from swath.calib.flight import Flight
-from swath.calib.local_plane import plane_through
-from swath.calib.strip_cells import Cells, FlightStrip, Gathered, StripRules, numbers_of, overlap_cells, thinned
-from swath.calib.strips import Numbers, StripReport, differences, report_of
+from swath.calib.planes.local import plane_through
+from swath.calib.strips.cells import Cells, FlightStrip, Gathered, StripRules, numbers_of, overlap_cells, thinned
+from swath.calib.strips.differences import Numbers, StripReport, differences, report_of
+from swath.calib.strips.standards import ASPRS_2014, USGS, best_of, judge
 from tests.calib.surface_flight import FRAME, surface_flight, swath_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from swath.calib.features import Features, Patch, Plane, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.calib.picked_points import PickedError, PickedSettings, carried, picked_ties, read_picked
-from swath.calib.tie_points import TieSettings, find_ties, fit_patch, meet
+from swath.calib.ties.intersections import TieSettings, find_ties, fit_patch, meet
+from swath.calib.ties.picked import PickedError, PickedSettings, carried, picked_ties, read_picked
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
@@ -145,7 +145,7 @@ def test_far_from_the_patch_it_is_less_certain() -> None:
     ],
 )
 def test_what_is_no_ridge_is_counted(change: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("swath.calib.tie_points.SPACINGS", 0.0)
+    monkeypatch.setattr("swath.calib.ties.intersections.SPACINGS", 0.0)
     flight, planes = roof(1, SHIFTS)
     found = find_ties(flight, planes, replace(TieSettings(), **change))
     assert found.refused[f"ridge: {reason}"] == 3

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
-from swath.calib.trajectory_errors import (
+from swath.calib.equations.trajectory_prior import (
     Taus,
     TrajectoryPrior,
     apply,
@@ -21,6 +20,7 @@ from swath.calib.trajectory_errors import (
     knots_of,
     positive,
 )
+from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain

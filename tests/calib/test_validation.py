@@ -10,11 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from swath.calib.effects import EFFECTS
+from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, apply, draw, gauss_markov
 from swath.calib.features import ControlPoint, Features, Patch, Plane
-from swath.calib.local_plane import plane_through
-from swath.calib.trajectory_errors import Taus, TrajectoryPrior, apply, draw, gauss_markov
-from swath.calib.validation import (
+from swath.calib.planes.local import plane_through
+from swath.calib.strips.effects import EFFECTS
+from swath.calib.validation.distances import FLOOR_M, HALF, Rows, estimated_floor_m, plane_rows
+from swath.calib.validation.methods import (
     ALPHA,
     CODES,
     POWER,
@@ -25,7 +26,6 @@ from swath.calib.validation import (
     smallest_errors,
     validate,
 )
-from swath.calib.validation_rows import FLOOR_M, HALF, Rows, estimated_floor_m, plane_rows
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.calib.profile_check import Check, Comparison
+from swath.calib.profiles.check import Check, Comparison
 from swath.daemon.processing.calibrate_model import model_of
 from swath.daemon.processing.calibrate_products import strips_say, validation_says, write_products
 from swath.daemon.processing.calibrate_run import Calibrated, CalibrateWish, calibrate

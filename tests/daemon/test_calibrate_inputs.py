@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.calib.picked_points import PickedError
+from swath.calib.ties.picked import PickedError
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibrate_inputs import PolygonError, read_polygons, rings_of, ties_of
 from swath.daemon.processing.calibration_flight import refuse_without_noise

@@ -11,13 +11,13 @@ import pytest
 
 from swath.calib.adjust import adjust
 from swath.calib.calibration_file import Header, calibration_text
+from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Considered
 from swath.calib.parameters import Wish
-from swath.calib.plane_search import find_planes
-from swath.calib.report_input import Finding
-from swath.calib.trajectory_errors import Taus, gauss_markov
+from swath.calib.planes.search import find_planes
+from swath.calib.summary import Finding
 from swath.daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from swath.calib.need import POINT, need_of
-from swath.calib.report_verdict import Level as CalibrationLevel
-from swath.calib.report_verdict import judge, wanted_of
+from swath.calib.verdict import Level as CalibrationLevel
+from swath.calib.verdict import judge, wanted_of
 from swath.daemon.config import parse_config
 from swath.daemon.processing.calibrate_products import _header, _wanted, trajectory_says
 from swath.daemon.processing.calibrate_run import Calibrated

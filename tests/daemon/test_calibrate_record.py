@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.calib.record import told_value
+from swath.calib.record.record import told_value
 from swath.daemon.processing.calibrate_record import instruments_of
 from swath.daemon.processing.calibration_flight import read_flight
 from swath.daemon.processing.flights import Wish

@@ -13,7 +13,7 @@ import typer
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from swath.calib.strips import single_return_sigma_m
+from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.cli import strips, view
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.quicklook import Look, look_at

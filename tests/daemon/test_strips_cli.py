@@ -15,8 +15,8 @@ import typer
 from pyproj import CRS
 
 from swath.calib.flight import Flight
-from swath.calib.report_verdict import overall_rms_m
-from swath.calib.strip_cells import StripRules
+from swath.calib.strips.cells import StripRules
+from swath.calib.verdict import overall_rms_m
 from swath.daemon.cli import strips
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibrate_products import level_words, strips_entry

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.calib.control import HEADER, read_control
+from swath.calib.control.points import HEADER, read_control
 from swath.daemon.config import load_config
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.text_files import text_of

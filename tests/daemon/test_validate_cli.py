@@ -15,8 +15,8 @@ import pytest
 import typer
 
 from swath.calib.calibration_file import Header, calibration_text
-from swath.calib.record import NAMESPACE, Record, record_json
-from swath.calib.record_values import Value
+from swath.calib.record.record import NAMESPACE, Record, record_json
+from swath.calib.record.values import Value
 from swath.daemon.cli import validate
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing import validate_run

@@ -14,12 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
-from swath.calib.control import HEADER, ControlError, in_t, read_control
+from swath.calib.control.points import HEADER, ControlError, in_t, read_control
 from swath.calib.flight import Tangent
-from swath.calib.history import HistoryError, history
-from swath.calib.picked_points import PickedError, read_picked
-from swath.calib.record import Record, RecordError, document_json, document_xml, read_document, record_json, with_told
-from swath.calib.record_values import Matrix, Value
+from swath.calib.record.record import (
+    Record,
+    RecordError,
+    document_json,
+    document_xml,
+    read_document,
+    record_json,
+    with_told,
+)
+from swath.calib.record.values import Matrix, Value
+from swath.calib.ties.picked import PickedError, read_picked
+from swath.calib.validation.history import HistoryError, history
 from swath.daemon.processing.calibrate_inputs import PolygonError, read_polygons
 from swath.daemon.processing.calibrate_record import facts_of
 from swath.daemon.processing.flights import _given_strips

@@ -13,7 +13,7 @@ import laspy
 import numpy as np
 from pyproj import CRS
 
-from swath.calib.strip_cells import StripRules
+from swath.calib.strips.cells import StripRules
 from swath.daemon.processing.outside_positions import outside_observations
 from swath.daemon.processing.quicklook_sidecar import rows_of, warnings_in
 from swath.daemon.processing.strips_inputs import strips_of_files

@@ -1,0 +1,1 @@
+"""Control points and their judgement."""

@@ -1,0 +1,334 @@
+"""Ground control: surveyed points as text, the planes of the swaths' returns that they lie on, and what speaks against
+them.
+
+A surveyed point is worth as much as the ground around it is plane: of each swath the returns around it are taken, a
+plane is drawn through them, and the point must lie within them. Nothing is interpolated beyond returns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from swath.calib.features import ControlPoint, Features, Patch, Plane
+from swath.calib.flight import Flight, Swath, Tangent
+from swath.calib.planes.local import LocalPlane, PlaneRules, is_inside, robust_plane
+from swath.georef.geodesy.earth import e_from_geodetic
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS = ("name", "lat_deg", "lon_deg", "h_ellipsoidal_m", "sigma_m")
+HEADER = ",".join(COLUMNS)
+SMALLEST_SIGMA_M = 1e-6
+LIMITS = {"lat_deg": 90.0, "lon_deg": 360.0, "h_ellipsoidal_m": 9000.0, "sigma_m": 10.0}
+MOST_MISTAKES = 10
+SAME_PLACE_M = 0.01
+BLOCK = 1_000_000  # returns that are looked through at a time
+CELLS_A_SIDE = 4096  # at most, of the grid by which returns far from all points are seen
+
+
+class ControlError(ValueError):
+    """A file of control that cannot be used; its text has one line a mistake: file, line, what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surveyed:
+    """A surveyed point as its file says it: radians, metres above the ellipsoid, one sigma of each coordinate."""
+
+    name: str
+    lat_rad: float
+    lon_rad: float
+    height_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ControlRules:
+    """What ground around a control point must be like.
+
+    Attributes:
+        radius_m: how far around the point returns are taken, horizontally.
+        widest_m: how far where a swath has fewer than twice those that a plane needs.
+        plane: of the plane through them.
+        farthest_m: distance of the point from it; what lies farther is no matter of calibration.
+        together_m: how far swaths' planes may be from their median at the point: beyond, they are of other surfaces.
+        together_deg: likewise their directions.
+    """
+
+    radius_m: float = 1.5
+    widest_m: float = 4.0
+    plane: PlaneRules = field(default_factory=lambda: PlaneRules(roughest_m=0.08))
+    farthest_m: float = 10.0
+    together_m: float = 2.0
+    together_deg: float = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What one swath shows at a control point.
+
+    Attributes:
+        point, swath: indexes in the points and in ``flight.swaths``.
+        at: (n,) rising indexes of the returns of the plane.
+        plane: through them.
+        above_m: of the surveyed point above the plane, along up.
+    """
+
+    point: int
+    swath: int
+    at: NDArray[np.int64]
+    plane: LocalPlane
+    above_m: float
+
+
+def read_control(text: str, name: str) -> tuple[Surveyed, ...]:
+    """Read surveyed points (CONVENTIONS, "Trajectory and text files").
+
+    Args:
+        text: of the file, with the header `HEADER`; lines that are empty or begin with # say nothing.
+        name: of the file, for messages.
+
+    Raises:
+        ControlError: one line a mistake, the first `MOST_MISTAKES` of them.
+    """
+    lines = [(number, line.strip()) for number, line in enumerate(text.lstrip("\ufeff").splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    if not lines:
+        raise ControlError(f"{name}: is empty; want the header {HEADER} and a line a point")
+    number, header = lines[0]
+    if tuple(column.strip() for column in header.split(",")) != COLUMNS:
+        raise ControlError(f"{name}: line {number}: want the header {HEADER}{_other_header(header)}")
+    mistakes: list[str] = []
+    points = [(number, _point(line, number, mistakes)) for number, line in lines[1:]]
+    read = [(number, point) for number, point in points if point is not None]
+    mistakes += _twice(read)
+    if not points:
+        mistakes.append(f"line {number}: no points behind the header; want a line a point")
+    if mistakes:
+        raise ControlError("\n".join(f"{name}: {mistake}" for mistake in mistakes[:MOST_MISTAKES]))
+    return tuple(point for _, point in read)
+
+
+def _other_header(header: str) -> str:
+    """What seems to be meant by another one."""
+    if ";" in header or "\t" in header:
+        return ", columns apart by commas"
+    missing = [column for column in COLUMNS if column not in header]
+    return f"; {', '.join(missing)} not there" if len(missing) < len(COLUMNS) and missing else ""
+
+
+def _point(line: str, number: int, mistakes: list[str]) -> Surveyed | None:
+    fields = [field.strip() for field in line.split(",")]
+    if len(fields) != len(COLUMNS):
+        mistakes.append(f"line {number}: {len(fields)} fields, want {len(COLUMNS)}: {HEADER}")
+        return None
+    before = len(mistakes)
+    if not fields[0]:
+        mistakes.append(f"line {number}: the point has no name")
+    values = {
+        column: _number(field, column, number, mistakes) for column, field in zip(COLUMNS[1:], fields[1:], strict=True)
+    }
+    if len(mistakes) > before:
+        return None
+    lat, lon, height, sigma = values.values()
+    return Surveyed(fields[0], math.radians(lat), math.radians(lon), height, sigma)
+
+
+def _number(field: str, column: str, line: int, mistakes: list[str]) -> float:
+    try:
+        value = float(field)
+    except ValueError:
+        value = math.nan
+    least, most = (0.0 if column == "sigma_m" else -LIMITS[column]), LIMITS[column]
+    if not least <= value <= most or (column == "sigma_m" and value < SMALLEST_SIGMA_M):
+        unit = column.rpartition("_")[2].replace("deg", "degrees").replace("m", "metres", 1)
+        hint = "; are these metres of a map?" if column in ("lat_deg", "lon_deg") and abs(value) > 1000.0 else ""
+        want = f"{unit} above 0, at most {most:g}" if column == "sigma_m" else f"{unit} from {least:g} to {most:g}"
+        mistakes.append(f'line {line}: {column}: got "{field}", want {want}{hint}')
+    return value
+
+
+def _twice(read: Sequence[tuple[int, Surveyed]]) -> list[str]:
+    """The same name, or the same place under two names: it would count twice."""
+    mistakes: list[str] = []
+    names: dict[str, int] = {}
+    for line, point in read:
+        if point.name in names:
+            mistakes.append(
+                f"line {line}: {point.name} stands in line {names[point.name]} already; want each point once"
+            )
+        names.setdefault(point.name, line)
+    if len(read) > 1:
+        places = e_from_geodetic(*np.array([[p.lat_rad, p.lon_rad, p.height_m] for _, p in read]).T)
+        distance, nearest = cKDTree(places).query(places, k=2, distance_upper_bound=SAME_PLACE_M)
+        found = {tuple(sorted(pair)) for pair in nearest[np.isfinite(distance).all(axis=1)].tolist()}
+        for one_at, other_at in sorted(found):
+            (line, one), (other_line, other) = read[one_at], read[other_at]
+            if one.name != other.name:
+                mistakes.append(
+                    f"line {other_line}: {other.name} is where {one.name} of line {line} is; want each point once"
+                )
+    return mistakes
+
+
+def in_t(surveyed: Sequence[Surveyed], frame: Tangent) -> tuple[ControlPoint, ...]:
+    """The same in a flight's frame."""
+    if not surveyed:
+        return ()
+    geodetic = np.array([[point.lat_rad, point.lon_rad, point.height_m] for point in surveyed])
+    points_t = frame.t_from_e(e_from_geodetic(*geodetic.T))
+    return tuple(ControlPoint(one.name, place, one.sigma_m) for one, place in zip(surveyed, points_t, strict=True))
+
+
+def control_planes(flight: Flight, points: Sequence[ControlPoint], rules: ControlRules | None = None) -> Features:
+    """Planes that control lies on, one a point, with the returns of every swath that shows it.
+
+    Args:
+        flight: with its points placed as well as is known.
+        points: in the flight's frame.
+        rules: None: `ControlRules()`.
+
+    Returns:
+        planes of kind ``control``, named as their point; refused: swaths' patches by reason, and points that no swath
+        shows as ``control: no returns``.
+    """
+    rules = rules or ControlRules()
+    grounds, refused = grounds_at(flight, points, rules)
+    planes = []
+    for number, point in enumerate(points):
+        own = [one for one in grounds if one.point == number]
+        near = [one for one in own if abs(one.above_m) <= rules.farthest_m]
+        refused["control: far above or below"] += len(own) - len(near)
+        kept = _of_one_surface(near, rules)
+        refused["control: another surface"] += len(near) - len(kept)
+        if kept:
+            planes.append(_joined(flight, point, kept))
+    return Features(planes=tuple(planes), refused=+refused)
+
+
+def grounds_at(
+    flight: Flight, points: Sequence[ControlPoint], rules: ControlRules
+) -> tuple[list[Ground], Counter[str]]:
+    """What every swath shows at every point, in the points' order; and why others show nothing."""
+    found: list[Ground] = []
+    refused: Counter[str] = Counter()
+    seen = np.zeros(len(points), dtype=bool)
+    for number, swath in enumerate(flight.swaths):
+        for point, wide in _returns_around(swath, points, max(rules.radius_m, rules.widest_m)):
+            seen[point] = True
+            place = points[point].position_t
+            ground, reason = _ground(swath, number, point, place, _near(swath, place, wide, rules), rules)
+            if ground is None:
+                refused[f"control: {reason}"] += 1
+            else:
+                found.append(ground)
+    refused["control: no returns"] += int((~seen).sum())
+    return sorted(found, key=lambda one: one.point), +refused
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cells no smaller than a radius, and which of them or of their neighbours have one of some places.
+
+    Most returns are far from all control: that is seen by their cell, without asking for the nearest point.
+    """
+
+    corner: FloatArray
+    cell_m: float
+    taken: NDArray[np.bool_]
+
+    @classmethod
+    def around(cls, places: FloatArray, radius_m: float) -> _Cells:
+        """Of places (k, 2)."""
+        low, high = places.min(axis=0), places.max(axis=0)
+        cell_m = max(radius_m, float((high - low).max()) / CELLS_A_SIDE)
+        corner = low - cell_m
+        at = ((places - corner) / cell_m).astype(np.int64)
+        taken = np.zeros(at.max(axis=0) + 2, np.bool_)
+        for column in (-1, 0, 1):
+            for row in (-1, 0, 1):
+                taken[at[:, 0] + column, at[:, 1] + row] = True
+        return cls(corner, cell_m, taken)
+
+    def have(self, points: FloatArray) -> NDArray[np.int64]:
+        """Rising indexes of points (n, 2) in such cells; nan is in none."""
+        column, row = ((points[:, axis] - self.corner[axis]) / self.cell_m for axis in (0, 1))
+        columns, rows = self.taken.shape
+        inside = np.flatnonzero((column >= 0.0) & (row >= 0.0) & (column < columns) & (row < rows))
+        taken = self.taken[column[inside].astype(np.int64), row[inside].astype(np.int64)]
+        return np.asarray(inside[taken], np.int64)
+
+
+def _returns_around(
+    swath: Swath, points: Sequence[ControlPoint], radius_m: float
+) -> list[tuple[int, NDArray[np.int64]]]:
+    """Indexes of the points that have returns within a radius, and of those."""
+    if not points:
+        return []
+    places = np.array([point.position_t[:2] for point in points])
+    tree, cells = cKDTree(places), _Cells.around(places, radius_m)
+    near: list[NDArray[np.int64]] = []
+    for begin in range(0, len(swath), BLOCK):
+        block = np.asarray(swath.points_t[begin : begin + BLOCK, :2])
+        inside = cells.have(block)
+        close = tree.query(block[inside], distance_upper_bound=radius_m)[0] < radius_m
+        near.append(inside[close] + begin)
+    at = np.concatenate([*near, np.zeros(0, np.int64)])
+    if not len(at):
+        return []
+    around = cKDTree(swath.points_t[at, :2]).query_ball_point(places, radius_m, return_sorted=True)
+    return [(number, at[np.array(one, dtype=np.int64)]) for number, one in enumerate(around) if len(one)]
+
+
+def _near(swath: Swath, place_t: FloatArray, at: NDArray[np.int64], rules: ControlRules) -> NDArray[np.int64]:
+    """Of returns around a point those within the radius, or as many of the nearest as a plane needs twice over."""
+    away = np.hypot(*(swath.points_t[at, :2] - place_t[:2]).T)
+    wanted = min(2 * rules.plane.fewest, len(at))
+    farthest_m = max(rules.radius_m, float(np.partition(away, wanted - 1)[wanted - 1]))
+    return np.asarray(at[away <= farthest_m], np.int64)
+
+
+def _ground(
+    swath: Swath, number: int, point: int, place_t: FloatArray, at: NDArray[np.int64], rules: ControlRules
+) -> tuple[Ground | None, str]:
+    returns_t = np.asarray(swath.points_t[at])
+    plane, kept, reason = robust_plane(returns_t, rules.plane)
+    if plane is None:
+        return None, reason
+    if not is_inside(place_t[:2], returns_t[kept, :2]):
+        return None, "not within the returns"
+    return Ground(point, number, at[kept], plane, plane.above_m(place_t)), ""
+
+
+def _of_one_surface(grounds: list[Ground], rules: ControlRules) -> list[Ground]:
+    """Those that agree with the most of them."""
+    if len(grounds) < 2:
+        return grounds
+    above = np.array([one.above_m for one in grounds])
+    normals = np.array([one.plane.normal_t for one in grounds])
+    middle = int(np.argmin(np.abs(above - np.median(above))))
+    agree = (np.abs(above - above[middle]) <= rules.together_m) & (
+        normals @ normals[middle] >= math.cos(math.radians(rules.together_deg))
+    )
+    return [one for one, good in zip(grounds, agree, strict=True) if good]
+
+
+def _joined(flight: Flight, point: ControlPoint, grounds: list[Ground]) -> Plane:
+    points_t = np.concatenate([flight.swaths[one.swath].points_t[one.at] for one in grounds])
+    normal = np.sum([one.plane.normal_t * len(one.at) for one in grounds], axis=0)
+    rms_m = math.sqrt(sum(one.plane.rms_m**2 * len(one.at) for one in grounds) / sum(len(one.at) for one in grounds))
+    return Plane(
+        name=f"control {point.name}",
+        centre_t=points_t.mean(axis=0),
+        normal_t=normal / np.linalg.norm(normal),
+        patches=tuple(Patch(one.swath, one.at) for one in grounds),
+        rms_m=rms_m,
+        control=(point,),
+        kind="control",
+    )

@@ -1,0 +1,1 @@
+"""Rows, normal equations, their solution, and what these say of quality."""

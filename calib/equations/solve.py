@@ -1,0 +1,288 @@
+"""From observations to a solution: linearise, solve, move; robust first, then without what does not belong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.equations.normals import Normals, TrajectoryWeight, moved, normals
+from swath.calib.equations.observability import Rules, decide
+from swath.calib.equations.quality import Quality, Solution, examine
+from swath.calib.equations.robust import HUBER, w_critical
+from swath.calib.equations.rows import Rows, SingleArray, State
+from swath.calib.equations.tie_rows import Ties
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
+from swath.calib.features import Features
+from swath.calib.flight import Flight
+from swath.calib.outcome import Residuals
+from swath.calib.parameters import Unknowns
+from swath.georef.scanner.calibration import Calibration
+
+FloatArray = NDArray[np.float64]
+
+NOISE_TELLS = 1000.0  # redundancy from which on residuals say how much a scanner's returns scatter
+FEW = 1e-5  # of the rows: whether so many are rejected or not moves nothing
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an adjustment goes about it.
+
+    Attributes:
+        huber: misclosures above so many sigmas lose weight while blunders are looked for; 0: none does.
+        family: probability that any good observation is rejected; 0: nothing is.
+        tolerance: step at which it has converged, in sigmas, root of the mean square of parameters and states; the next
+            would be a hundredth of it.
+        iterations: at most, of each stage.
+        rounds: of rejecting and solving anew.
+        matchings: how often correspondences are found anew, at most.
+        test_level: of the global test.
+        thin_above: with more rows the first steps are made with a part of them.
+        rules: what is decided to be observable by.
+        own_noise: where returns on planes scatter less than their sigmas say, they are weighed by what they scatter.
+    """
+
+    huber: float = HUBER
+    family: float = 0.05
+    tolerance: float = 0.02
+    iterations: int = 15
+    rounds: int = 3
+    matchings: int = 3
+    test_level: float = 0.01
+    thin_above: int = 1_000_000
+    rules: Rules = field(default_factory=Rules)
+    own_noise: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Observations and unknowns of one adjustment."""
+
+    rows: Rows
+    ties: Ties
+    trajectory: TrajectoryWeight
+
+    @classmethod
+    def of(
+        cls,
+        flight: Flight,
+        features: Features,
+        asked: Unknowns,
+        prior: TrajectoryPrior | None,
+        placed_with: Mapping[str, Calibration] | None,
+    ) -> Block:
+        """Of what was observed; `NormalError` where the prior is none."""
+        rows = Rows(flight, features.planes, asked, prior)
+        return cls(rows, Ties(rows, features.ties, placed_with), TrajectoryWeight(rows))
+
+    def with_unknowns(self, asked: Unknowns) -> Block:
+        """The same observations."""
+        rows = Rows(self.rows.flight, self.rows.planes, asked, self.rows.prior)
+        return Block(rows, self.ties.of(rows), self.trajectory)
+
+    def weights(self) -> tuple[SingleArray, SingleArray]:
+        """Of rows and sightings, before anything is rejected."""
+        sightings = sum(len(tie.sightings) for tie in self.ties.ties)
+        return self.rows.weights(), np.ones(sightings, np.float32)
+
+    def part(self, most: int) -> tuple[Block, tuple[SingleArray, SingleArray]]:
+        """Every so many of the rows, each with the weight of those left out; itself where there are few."""
+        rows, sightings = self.weights()
+        if len(rows) <= most:
+            return self, (rows, sightings)
+        step = -(-4 * len(rows) // most)
+        less = self.rows.thinned(step)
+        return replace(self, rows=less), (step * less.weights(), sightings)
+
+    def with_noise(self, shares: FloatArray) -> Block:
+        """The same observations with shares (h,) of the noise that the heads are said to have."""
+        rows = self.rows.with_noise(shares)
+        return Block(rows, self.ties.of(rows), self.trajectory)
+
+    def normals(self, state: State, weights: tuple[SingleArray, SingleArray], huber: float = 0.0) -> Normals:
+        """At a state."""
+        return normals(self.rows, self.ties, self.trajectory, state, *weights, huber)
+
+    def start(self) -> State:
+        """Before the first step."""
+        return self.rows.start(len(self.ties.ties))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldEffects:
+    """Hold what parameters that are held do to an adjustment (Schmidt 1966: "consider" parameters).
+
+    Attributes:
+        by_unit: (u, c) change of each unknown per unit of each held parameter's error.
+        information: (c, c) of the observations about the held ones, unknowns, states and features eliminated.
+        score: (c,) gradient there: information · (what the observations would change them by), 0 at the optimum.
+    """
+
+    by_unit: FloatArray
+    information: FloatArray
+    score: FloatArray
+
+    @classmethod
+    def at(
+        cls, block: Block, state: State, weights: tuple[SingleArray, SingleArray], covariance: FloatArray
+    ) -> HeldEffects:
+        """Return them at a solution, whose parameters and states have this covariance (n, n)."""
+        asked = block.rows.unknowns
+        p, c = len(asked), len(asked.considered)
+        if not c:
+            return cls(np.zeros((p, 0)), np.zeros((0, 0)), np.zeros(0))
+        values = np.concatenate([state.values, [item.start for item in asked.considered]])
+        wider = block.with_unknowns(asked.complete()).normals(replace(state, values=values), weights)
+        held = np.arange(p, p + c)
+        own = np.delete(np.arange(len(wider.normal)), held)
+        mixed = wider.normal[np.ix_(own, held)]
+        gain = covariance @ mixed
+        information = wider.normal[np.ix_(held, held)] - mixed.T @ gain
+        score = -(wider.right[held] - gain.T @ wider.right[own])
+        return cls(-gain[:p], (information + information.T) / 2.0, score)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What came out of it, and how often it was linearised."""
+
+    solution: Solution
+    quality: Quality
+    iterations: int
+    converged: bool
+
+    def calibrations(self) -> dict[str, Calibration]:
+        """By scanner."""
+        return self.solution.rows.unknowns.calibrations(self.solution.state.values)
+
+
+def determined(block: Block, settings: Settings) -> Block:
+    """Without the unknowns that these observations, as they are expected to be, do not determine."""
+    part, weights = block.part(settings.thin_above)
+    return _without(block, part.normals(part.start(), weights), settings) or block
+
+
+def settled(block: Block, settings: Settings, before: Solved | None = None) -> Solved:
+    """Solved for what is determined, at the start and at the solution.
+
+    Args:
+        block: observations, and all unknowns that were asked for.
+        settings: how.
+        before: a solution with other correspondences, to start from.
+
+    Raises:
+        NormalError: an unknown is not determined after all.
+    """
+    less: Block | None = determined(block, settings)
+    while less is not None:
+        block = less
+        state = block.start() if before is None else _carried(before.solution, block)
+        found = solved(block, settings, state)
+        less, before = _without(block, found.solution.normals, settings), found
+    return found
+
+
+def solved(block: Block, settings: Settings, state: State) -> Solved:
+    """Robust until it stands still, then plainly without what the w-test rejects, until that is always the same.
+
+    Where rows are many, the robust steps are made with a part of them.
+    """
+    part, taken = block.part(settings.thin_above)
+    state, huber = moved(state, part.normals(state, taken).step()), settings.huber
+    state, equations, count, converged = _iterated(part, settings, state, taken, huber)
+    weights = block.weights()
+    solution, quality = _examined(block, state, equations, weights)
+    if settings.own_noise:
+        shares = noise_shares(quality.residuals, block.rows.flight)
+        if (shares < 1.0).any():
+            block = block.with_noise(shares)
+    for _ in range(settings.rounds):
+        chosen = _kept(quality.residuals, weights, settings)
+        changed = sum(int((new != old).sum()) for new, old in zip(chosen, weights, strict=True))
+        if changed <= FEW * block.rows.count and huber == 0.0 and part is block:
+            break
+        weights, huber, part = chosen, 0.0, block
+        del solution, quality  # a third of a gigabyte of ten million rows, of which those to come need another
+        state, equations, more, converged = _iterated(block, settings, state, weights, 0.0)
+        solution, quality = _examined(block, state, equations, weights)
+        count += more
+    return Solved(solution, quality, count + 1, converged)
+
+
+def noise_shares(residuals: Sequence[Residuals], flight: Flight) -> FloatArray:
+    """Return by head what share (h,) of their sigmas its returns on planes scatter; 1: as much or more, or few tell.
+
+    The root of the variance component Σ p e² / Σ r (Förstner 1979), three of its own sigmas up.
+    """
+    shares = np.ones(len(flight.heads))
+    for one in (one for one in residuals if one.group == "planes"):
+        kept = one.weight > 0.0
+        head = np.array([swath.head for swath in flight.swaths])[one.swath[kept]]
+        squares = one.weight[kept] * (one.misclosure_m[kept].astype(np.float64) / one.sigma_m[kept]) ** 2
+        square = np.bincount(head, squares, minlength=len(shares))
+        free = np.bincount(head, one.redundancy[kept], minlength=len(shares))
+        enough = free > NOISE_TELLS
+        free = np.where(enough, free, 1.0)
+        shares = np.where(enough, np.sqrt(square / free * (1.0 + 3.0 * np.sqrt(2.0 / free))), 1.0)
+    return np.minimum(shares, 1.0)
+
+
+def _examined(
+    block: Block, state: State, equations: Normals, weights: tuple[SingleArray, SingleArray]
+) -> tuple[Solution, Quality]:
+    solution = Solution(block.rows, block.ties, block.trajectory, state, equations, equations.covariance(), *weights)
+    return solution, examine(solution)
+
+
+def _without(block: Block, equations: Normals, settings: Settings) -> Block | None:
+    """Return the block with what equations do not determine held, or observed at its start; None: nothing changes."""
+    asked = block.rows.unknowns
+    held, weak = decide(equations.of_parameters, asked.names, asked.given_sigmas, settings.rules)
+    assumed = {item.name for item in asked.items if item.assumed}
+    if not held and weak.keys() <= assumed:
+        return None
+    return block.with_unknowns(
+        asked.without(frozenset(f"{one.scanner}.{one.name}" for one in held), held).assuming(weak)
+    )
+
+
+def _carried(before: Solution, block: Block) -> State:
+    """Parameters and trajectory from another solution; planes and tie points as they are found now."""
+    state, names = block.start(), before.rows.unknowns.names
+    old = dict(zip(names, before.state.values.tolist(), strict=True))
+    new = zip(block.rows.unknowns.names, state.values.tolist(), strict=True)
+    values = np.array([old.get(name, value) for name, value in new], dtype=np.float64)
+    return replace(state, values=values, knots=before.state.knots)
+
+
+def _iterated(
+    block: Block, settings: Settings, state: State, weights: tuple[SingleArray, SingleArray], huber: float
+) -> tuple[State, Normals, int, bool]:
+    """Until a step is less than the tolerance."""
+    for count in range(1, settings.iterations + 1):
+        equations = block.normals(state, weights, huber)
+        step = equations.step()
+        state = moved(state, step)
+        # δᵀ S δ is the sum of squares of independent combinations of the unknowns, each in its sigma
+        if float(step[0] @ equations.normal @ step[0]) < settings.tolerance**2 * max(len(step[0]), 1):
+            return state, equations, count, True
+    return state, equations, settings.iterations, False
+
+
+def _kept(
+    residuals: Sequence[Residuals], before: tuple[SingleArray, SingleArray], settings: Settings
+) -> tuple[SingleArray, SingleArray]:
+    """Weights of rows and sightings by the w-test; what was rejected comes back where it fits."""
+    count = sum(len(one.normalised) for one in residuals)
+    critical = w_critical(count, settings.family) if settings.family > 0.0 else np.inf
+    rows, sightings = before
+    for one in residuals:
+        good = (np.abs(one.normalised) <= critical).astype(np.float32)
+        if one.group == "planes":
+            rows = good
+        elif one.group == "ties":
+            sightings = good.reshape(-1, 3).min(axis=1)
+    return rows, sightings

@@ -1,0 +1,1 @@
+"""Planes: their search, matching and fit."""

@@ -1,0 +1,139 @@
+"""Planes the user says where to look for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.features import Features, Plane
+from swath.calib.flight import Flight, Swath, sensor_t
+from swath.calib.plane_settings import PlaneError, PlaneSettings, scaled_to
+from swath.calib.planes.cells import cell_size, keys_of
+from swath.calib.planes.fit import GATE, expected_sigma
+from swath.calib.planes.returns import plane_of, returns_near, sights_of
+from swath.georef.records import Int64Array
+
+FloatArray = NDArray[np.float64]
+Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]
+
+_DEFAULT = PlaneSettings()
+_TRIALS = 200
+_SEED = 1981
+_LONGEST_M = 2_000.0  # east or north: no face is as large, and cells of its box would fill the memory
+_SHARE_LEAST = 0.7  # of the returns in a polygon that lie on its plane
+
+
+def given_planes(flight: Flight, polygons: Rings, settings: PlaneSettings = _DEFAULT) -> Features:
+    """Planes inside polygons, each the one that most of the returns in it lie on (Fischler and Bolles 1981).
+
+    They have to stand the same tests as planes that were found; what does not is counted.
+
+    Args:
+        flight: with points.
+        polygons: names and corners (k, 2) east and north in t, not closed.
+        settings: of the tests.
+
+    Raises:
+        PlaneError: a polygon has fewer than three corners, or is no face for its size, or two have the same name.
+    """
+    rings = _checked(polygons)
+    settings = scaled_to(flight, settings)
+    cell_m = cell_size(flight, settings)
+    found: dict[str, dict[int, Int64Array]] = {name: {} for name in rings}
+    refused: Counter[str] = Counter()
+    for index, swath in enumerate(flight.swaths):
+        for name, at in _inside(swath, rings, cell_m).items():
+            on_it = _consensus(flight, swath, at, settings)
+            if len(on_it) < _SHARE_LEAST * len(at):
+                refused["mixed: under 70 % of a polygon's returns in a swath lie on one plane"] += 1
+            elif len(on_it):
+                found[name][index] = on_it
+    planes: list[Plane] = []
+    for name, by_swath in found.items():
+        sights = sights_of(flight, by_swath, settings, refused)
+        if len(sights) > 1:
+            planes.append(plane_of(name, "user", sights))
+    return Features(planes=tuple(planes), refused=+refused)
+
+
+def _checked(polygons: Rings) -> dict[str, FloatArray]:
+    pairs = list(polygons.items()) if isinstance(polygons, Mapping) else list(polygons)
+    rings: dict[str, FloatArray] = {}
+    for name, ring in pairs:
+        corners = np.asarray(ring, dtype=np.float64)
+        if corners.ndim != 2 or corners.shape[1:] != (2,) or len(corners) < 3 or not np.isfinite(corners).all():
+            raise PlaneError(f"polygon {name}: got corners of shape {corners.shape}, want (k, 2) numbers, k at least 3")
+        east_m, north_m = np.ptp(corners, axis=0).tolist()
+        if max(east_m, north_m) > _LONGEST_M:
+            size = f"{east_m:,.0f} m by {north_m:,.0f} m"
+            raise PlaneError(f"polygon {name}: got {size}, want about one face, at most {_LONGEST_M:,.0f} m a side")
+        if name in rings:
+            raise PlaneError(f"polygon {name}: there are two of this name; want each name once")
+        rings[name] = corners
+    return rings
+
+
+def _inside(swath: Swath, rings: Mapping[str, FloatArray], cell_m: float) -> dict[str, Int64Array]:
+    """A swath's single returns in polygons; those that share cells are looked for one after the other."""
+    left = {name: _cells(ring, cell_m) for name, ring in rings.items()}
+    inside: dict[str, Int64Array] = {}
+    while left:
+        now: dict[str, Int64Array] = {}
+        taken: set[int] = set()
+        for name, cells in left.items():
+            if taken.isdisjoint(cells.tolist()):
+                now[name] = cells
+                taken.update(cells.tolist())
+        left = {name: cells for name, cells in left.items() if name not in now}
+        labels = np.repeat(np.arange(len(now)), [len(cells) for cells in now.values()])
+        anywhere = np.tile([0.0, 0.0, 0.0, 0.0, np.inf], (len(now), 1))
+        near = returns_near(swath, np.concatenate(list(now.values())), labels, anywhere, cell_m)
+        for label, at in near.items():
+            name = list(now)[label]
+            kept = at[_in_ring(np.asarray(swath.points_t[at]), rings[name])]
+            if len(kept):
+                inside[name] = kept
+    return inside
+
+
+def _cells(ring: FloatArray, cell_m: float) -> Int64Array:
+    """Keys of all cells of a ring's box."""
+    low, high = np.floor(ring.min(axis=0) / cell_m), np.floor(ring.max(axis=0) / cell_m)
+    axes = [np.arange(int(first), int(last) + 1) for first, last in zip(low, high, strict=True)]
+    columns, rows = np.meshgrid(*axes)
+    return keys_of(columns.ravel(), rows.ravel())
+
+
+def _in_ring(points: FloatArray, ring: FloatArray) -> NDArray[np.bool_]:
+    """(n,) whether points lie inside: a ray to the east meets an odd number of sides."""
+    x, y = points[:, 0], points[:, 1]
+    odd = np.zeros(len(points), np.bool_)
+    for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        if y0 != y1:
+            odd ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return odd
+
+
+def _consensus(flight: Flight, swath: Swath, at: Int64Array, settings: PlaneSettings) -> Int64Array:
+    """Those of the returns that lie on the plane through three of them on which most do."""
+    points = np.asarray(swath.points_t[at])
+    if len(points) < settings.least_points:
+        return at
+    draws = np.random.default_rng(_SEED)
+    away = points.mean(axis=0) - sensor_t(flight, swath, at[len(at) // 2 : len(at) // 2 + 1])[0]
+    best = np.zeros(len(at), np.bool_)
+    for three in draws.integers(0, len(points), (_TRIALS, 3)):
+        first, second, third = points[three]
+        normal = np.cross(second - first, third - first)
+        length = float(np.linalg.norm(normal))
+        if length < 1e-6:
+            continue
+        normal /= length
+        sigma_m = float(expected_sigma(flight.heads[swath.head].noise, away, normal, settings))
+        near = np.abs((points - first) @ normal) <= GATE * sigma_m
+        if near.sum() > best.sum():
+            best = near
+    return at[best]

@@ -1,0 +1,1 @@
+"""Profiles across the swath: scan angle errors measured step by step."""

@@ -1,0 +1,1 @@
+"""Strips compared: differences, signatures of causes, corrections, accuracy standards."""

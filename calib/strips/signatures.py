@@ -1,0 +1,374 @@
+"""What the differences between strips look like: the calibration's parameters that would remove them (FORMULAS 5.3).
+
+A difference of two strips on a plane is what is wrong with each of them there, along the plane's normal. Each effect
+moves points in a way of its own with scan angle, flight direction, scan direction, range and speed; how much of each
+is in the differences is estimated together with the trajectory's errors at knots along the strips, of which the joint
+covariance is known beforehand: what is explained by them is not taken for a calibration. Errors that neighbouring
+strips share, or all of a flight, look like a boresight, and only the joint covariance keeps them apart from one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior, gauss_markov_at, knots_within
+from swath.calib.flight import FlightError
+from swath.calib.strips.differences import Checks
+from swath.calib.strips.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import rot_from_quaternion
+from swath.georef.records import Int64Array
+from swath.georef.trajectory.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+SIGNIFICANT = 3.29  # sigmas; one in a thousand by chance
+MATTERS_M = 0.01  # on the ground, at the swath's edge
+TELLS_M = 0.02  # at the edge, one sigma: what is known worse is not told
+TELLS = 1.5  # or so many times what the trajectory's attitude leaves to the best of flights
+NOT_APART = 5.0  # times that another effect's sigma may grow
+ROUGH_M = 0.3  # RMS of the differences: planes of one cell are not the same surface any more, and effects not linear
+MOST_ROWS = 12_000
+MOST_KNOTS, KNOT_S = 300, 1.0  # of a trajectory of which no joint covariance is known
+POSITION_SIGMA_M, ATTITUDE_SIGMA_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
+# Of a trajectory's told sigmas: half of the variance of roll and pitch lasts for the whole flight, as accelerometers'
+# biases tilt it, and a fifth of the heading's; the rest fades as fast as a tactical unit's gyroscopes walk. A smoothed
+# flight with such a unit has up to 0.46 of its pitch between any two strips, and up to 0.24 of its roll.
+ASSUMED = Taus(position_s=60.0, roll_pitch_s=10.0, heading_s=20.0, lasting_tilt=0.5, lasting_heading=0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """One effect in the residuals.
+
+    Attributes:
+        effect: which.
+        value, sigma: to be added to the parameter to remove it, SI; nan: not told.
+        edge_m: what the value moves at the swaths' edges.
+        level: ``none``, ``small``, ``significant``, ``not told``, ``rough``.
+        words: the verdict, one sentence.
+    """
+
+    effect: Effect
+    value: float
+    sigma: float
+    edge_m: float
+    level: str
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class Signatures:
+    """All effects; and how much of the differences they and the trajectory's errors explain.
+
+    Attributes:
+        found: an effect each, in the order of `EFFECTS`.
+        rows: differences that were used.
+        rms_m, left_rms_m: of the differences, before and after.
+        variance_factor: of what is left, against its noise.
+        prior_notes: where the covariance of the trajectory's errors is from.
+    """
+
+    found: tuple[Signature, ...]
+    rows: int
+    rms_m: float
+    left_rms_m: float
+    variance_factor: float
+    prior_notes: tuple[str, ...] = ()
+
+    @property
+    def rough(self) -> bool:
+        """Tell whether the strips are too far apart for effects to be told."""
+        return any(one.level == "rough" for one in self.found)
+
+    @property
+    def lines(self) -> list[str]:
+        """Return the verdicts for people: a line an effect, or one line where strips are too far apart."""
+        return list(dict.fromkeys(one.words for one in self.found))
+
+
+def signatures(
+    checks: Checks, seen: SeenFrom, prior: TrajectoryPrior | None = None, *, most_rows: int = MOST_ROWS
+) -> Signatures:
+    """Estimate every effect that the differences can tell.
+
+    Args:
+        checks: of `swath.calib.strips.differences`, points in t.
+        seen: where from.
+        prior: joint covariance of the trajectory's errors, knots of the trajectories in the order of
+            ``seen.trajectories`` (`swath.calib.equations.trajectory_prior.from_smoother`); None: `assumed_prior`.
+        most_rows: checks that are used, drawn evenly.
+    """
+    checks = checks.take(_known(checks, seen))
+    if len(checks) > most_rows:
+        checks = checks.take(np.random.default_rng(6_7).choice(len(checks), most_rows, replace=False))
+    if len(checks) < 10:
+        few = tuple(_not_told(effect, "too few differences") for effect in EFFECTS)
+        return Signatures(few, len(checks), math.nan, math.nan, math.nan)
+    rms_m = float(np.sqrt(np.mean(checks.distance_m**2)))
+    if rms_m > ROUGH_M:
+        words = f"rough: strips differ by {rms_m:.2f} m (RMS point to plane), too much to tell why: run swath calibrate"
+        rough = tuple(Signature(effect, math.nan, math.nan, math.nan, "rough", words) for effect in EFFECTS)
+        return Signatures(rough, len(checks), rms_m, math.nan, math.nan)
+    prior = assumed_prior(checks, seen) if prior is None else prior
+    design, errors, edges = _design(checks, seen, prior)
+    fit = _Fit(design, errors, prior.information, checks.distance_m, checks.noise_m)
+    taken, refused = _choose(fit, edges, _worst_m(prior, seen, edges))
+    values, sigmas = fit.solve(taken)
+    found = []
+    for number, effect in enumerate(EFFECTS):
+        if number in refused:
+            found.append(_not_told(effect, refused[number]))
+        else:
+            at = taken.index(number)
+            found.append(_told(effect, float(values[at]), float(sigmas[at]), float(edges[number])))
+    return Signatures(tuple(found), len(checks), rms_m, fit.left_rms_m, fit.variance_factor, prior.notes)
+
+
+def _known(checks: Checks, seen: SeenFrom) -> NDArray[np.bool_]:
+    """Rows of which both strips' trajectory is known."""
+    known = np.ones(len(checks), bool)
+    for strip, time_ns in ((checks.first, checks.point_ns), (checks.second, checks.centre_ns)):
+        for number in np.unique(strip):
+            own = strip == number
+            known[own] &= seen.trajectories[seen.flown[number]].fates(time_ns[own]) == 0
+    return known
+
+
+# ---------------------------------------------------------------------- the trajectory's errors
+
+
+def assumed_prior(checks: Checks, seen: SeenFrom) -> TrajectoryPrior:
+    """Return the covariance of trajectories' errors by the sigmas they tell, and by what is usual of the rest.
+
+    Errors fade as of `ASSUMED`, whose lasting shares are on the safe side: a larger share makes larger sigmas of the
+    boresight. Trajectories that say no sigmas have `POSITION_SIGMA_M` and `ATTITUDE_SIGMA_DEG`.
+    """
+    spans = _spans(checks, seen)
+    trajectories = [_with_sigmas(trajectory) for trajectory in seen.trajectories]
+    prior = gauss_markov_at(knots_within(spans, KNOT_S, MOST_KNOTS), trajectories, ASSUMED)
+    lasting = f"{100 * ASSUMED.lasting_tilt:.0f} % of roll and pitch, {100 * ASSUMED.lasting_heading:.0f} % of heading"
+    note = f"trajectory's errors by its sigmas; assumed to last all flight: {lasting}"
+    return replace(prior, notes=(note,))
+
+
+def _spans(checks: Checks, seen: SeenFrom) -> list[tuple[int, int, int, int]]:
+    """(trajectory, number, begin, end) of stretches with checks; of several scanners at one time it is one."""
+    strip = np.concatenate([checks.first, checks.second])
+    time_ns = np.concatenate([checks.point_ns, checks.centre_ns])
+    own = sorted(
+        (seen.flown[number], int(time_ns[strip == number].min()), int(time_ns[strip == number].max()))
+        for number in np.unique(strip).tolist()
+    )
+    joined: list[tuple[int, int, int]] = []
+    for flown, begin, end in own:
+        if joined and joined[-1][0] == flown and begin <= joined[-1][2]:
+            joined[-1] = (flown, joined[-1][1], max(end, joined[-1][2]))
+        else:
+            joined.append((flown, begin, end))
+    return [(flown, number, begin, max(end, begin + 1)) for number, (flown, begin, end) in enumerate(joined)]
+
+
+def _with_sigmas(trajectory: Trajectory) -> Trajectory:
+    position, attitude = trajectory.position_sigma_l, trajectory.attitude_sigma_rad
+    return replace(
+        trajectory,
+        position_sigma_l=np.where(np.isfinite(position), position, POSITION_SIGMA_M),
+        attitude_sigma_rad=np.where(np.isfinite(attitude), attitude, np.radians(ATTITUDE_SIGMA_DEG)),
+    )
+
+
+# ---------------------------------------------------------------------- columns
+
+
+def _design(checks: Checks, seen: SeenFrom, prior: TrajectoryPrior) -> tuple[FloatArray, csr_array, FloatArray]:
+    """Return how differences go with what is to be added so that they vanish.
+
+    Returns:
+        (n, effects); (n, 6 knots) for the trajectory's errors, linear between knots; and by effect (effects,) what one
+        unit moves at the swaths' edges.
+    """
+    sides = (
+        (checks.point, checks.first, checks.point_ns, checks.point_direction, 1.0),
+        (checks.centre, checks.second, checks.centre_ns, checks.centre_direction, -1.0),
+    )
+    count = len(checks)
+    design, edges = np.zeros((count, len(EFFECTS))), np.zeros(len(EFFECTS))
+    values, rows, columns = [], [], []
+    for points_t, strip, time_ns, direction, sign in sides:
+        moved, _ = effect_columns(points_t, strip, time_ns, direction, seen)
+        design -= sign * np.einsum("nki,ni->nk", moved, checks.normal)
+        edges = np.maximum(edges, np.percentile(np.linalg.norm(moved, axis=2), 95.0, axis=0))
+        own = -sign * np.einsum("nki,ni->nk", error_columns(points_t, strip, time_ns, seen), checks.normal)
+        for knot, share in _shares(prior, np.asarray(seen.flown)[strip], time_ns):
+            values.append(share[:, np.newaxis] * own)
+            rows.append(np.repeat(np.arange(count), ERRORS).reshape(count, ERRORS))
+            columns.append(ERRORS * knot[:, np.newaxis] + np.arange(ERRORS))
+    entries = np.concatenate(values).ravel(), (np.concatenate(rows).ravel(), np.concatenate(columns).ravel())
+    return design, csr_array(entries, shape=(count, ERRORS * len(prior))), edges
+
+
+def _shares(
+    prior: TrajectoryPrior, flown: Int64Array, time_ns: Int64Array
+) -> tuple[tuple[Int64Array, FloatArray], tuple[Int64Array, FloatArray]]:
+    """The knots (n,) before and after each moment, and how much of each knot's error is there."""
+    before, after = np.zeros(len(time_ns), np.int64), np.zeros(len(time_ns), np.int64)
+    for number in np.unique(flown):
+        own, knots = flown == number, np.flatnonzero(prior.flown == number)
+        if not len(knots):
+            raise FlightError(f"trajectory errors: the covariance has no knot of trajectory {number + 1}")
+        at = np.searchsorted(prior.time_ns[knots], time_ns[own])
+        before[own], after[own] = knots[np.maximum(at - 1, 0)], knots[np.minimum(at, len(knots) - 1)]
+    apart = np.maximum((prior.time_ns[after] - prior.time_ns[before]).astype(np.float64), 1.0)
+    later = np.clip((time_ns - prior.time_ns[before]).astype(np.float64) / apart, 0.0, 1.0)
+    return (before, 1.0 - later), (after, later)
+
+
+# ---------------------------------------------------------------------- estimation
+
+
+class _Fit:
+    """Least squares of differences on chosen effects and the trajectory's errors, robust."""
+
+    def __init__(
+        self, design: FloatArray, errors: csr_array, information: FloatArray, values: FloatArray, noise: FloatArray
+    ) -> None:
+        self._design, self._errors, self._information = design, errors, information
+        self._values, self._noise = values, noise
+        self._plain: FloatArray | None = None
+        self.left_rms_m, self.variance_factor = math.nan, math.nan
+
+    def sigmas(self, taken: Sequence[int]) -> FloatArray:
+        """(effects taken,) by the noise and the trajectory's errors alone."""
+        if self._plain is None:
+            self._plain = self._reduced(np.ones(len(self._values)))[0]
+        return _roots_of_inverse(self._plain[np.ix_(taken, taken)])
+
+    def solve(self, taken: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Values and sigmas (effects taken,), with Huber's weights and a variance factor where it is above 1."""
+        huber = np.ones(len(self._values))
+        design = self._design[:, taken]
+        for _ in range(5):
+            normal, right, factor, mixed, below = self._reduced(huber)
+            normal = normal[np.ix_(taken, taken)]
+            found = np.asarray(np.linalg.solve(normal, right[taken]), np.float64) if taken else np.zeros(0)
+            errors = cho_solve(factor, below - mixed[:, taken] @ found)
+            misfits = (self._values - design @ found - self._errors @ errors) / self._noise
+            spread = max(1.4826 * float(np.median(np.abs(misfits))), 1.0)
+            huber = np.minimum(1.0, 1.5 * spread / np.maximum(np.abs(misfits), 1e-9))
+        self.left_rms_m = float(np.sqrt(np.mean((misfits * self._noise) ** 2)))
+        self.variance_factor = float((huber * misfits**2).sum()) / max(len(misfits) - len(taken), 1)
+        return found, _roots_of_inverse(normal) * max(1.0, math.sqrt(self.variance_factor))
+
+    def _reduced(
+        self, huber: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, bool], FloatArray, FloatArray]:
+        """Return the equations of the effects with the trajectory's errors eliminated (Schur complement).
+
+        Returns:
+            (e, e) matrix, (e,) right side; and of the errors the factor, (k, e) mixed part and (k,) right side.
+        """
+        weights = huber / self._noise**2
+        weighted = self._errors.multiply(weights[:, np.newaxis]).tocsr()
+        inner = np.asarray((weighted.T @ self._errors).todense()) + self._information
+        mixed, below = weighted.T @ self._design, weighted.T @ self._values
+        factor = cho_factor(inner, lower=True, overwrite_a=True, check_finite=False)
+        solved = cho_solve(factor, np.column_stack([mixed, below]), check_finite=False)
+        own = self._design * weights[:, np.newaxis]
+        normal = own.T @ self._design - mixed.T @ solved[:, :-1]
+        return normal, own.T @ self._values - mixed.T @ solved[:, -1], factor, mixed, below
+
+
+def _roots_of_inverse(normal: FloatArray) -> FloatArray:
+    """Sigmas; inf of what nothing determines."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(scaled)
+    inverse = (vectors**2 / np.maximum(values, 1e-14)).sum(axis=1)
+    return np.asarray(np.sqrt(inverse) / scale)
+
+
+def _worst_m(prior: TrajectoryPrior, seen: SeenFrom, edges: FloatArray) -> float:
+    """The largest sigma at the edge of an effect that is told: the attitude leaves some to the best of flights."""
+    row = np.zeros((len(prior), ERRORS))
+    for number in np.unique(prior.flown):
+        own = prior.flown == number
+        trajectory = seen.trajectories[number]
+        at = np.clip(np.searchsorted(trajectory.time_ns, prior.time_ns[own]), 0, len(trajectory) - 1)
+        right_e = rot_from_quaternion(trajectory.q_e_from_b[at])[:, :, 1]
+        lat, lon, _ = geodetic_from_e(trajectory.position_e[at])
+        row[own, 3:] = np.einsum("nij,ni->nj", rot_e_from_l(lat, lon), right_e) / len(prior)
+    pitch = math.sqrt(float(row.ravel() @ prior.covariance @ row.ravel()))
+    return max(TELLS_M, TELLS * pitch * float(edges[NAMES.index("pitch")]))
+
+
+def _choose(fit: _Fit, edges: FloatArray, worst_m: float) -> tuple[list[int], dict[int, str]]:
+    """The effects that the differences tell apart, and why not of the others."""
+    taken: list[int] = []
+    refused: dict[int, str] = {}
+    for number, effect in enumerate(EFFECTS):
+        if edges[number] == 0.0:
+            refused[number] = f"nothing here shows it; it wants {effect.remedy}"
+            continue
+        before = fit.sigmas(taken) if taken else np.zeros(0)
+        after = fit.sigmas([*taken, number])
+        if after[-1] * edges[number] > worst_m:
+            refused[number] = f"this flight does not tell it; it wants {effect.remedy}"
+        elif len(before) and (growth := after[:-1] / before).max() > NOT_APART:
+            other = EFFECTS[taken[int(growth.argmax())]].name
+            refused[number] = f"not to be told apart from {other} here; it wants {effect.remedy}"
+        else:
+            taken.append(number)
+    return taken, refused
+
+
+def _not_told(effect: Effect, why: str) -> Signature:
+    return Signature(effect, math.nan, math.nan, math.nan, "not told", f"{effect.name}: {why}")
+
+
+def _told(effect: Effect, value: float, sigma: float, edge: float) -> Signature:
+    times, moves_m = abs(value) / sigma, abs(value) * edge
+    digits = max(0, 1 - math.floor(math.log10(effect.factor * sigma)))
+    size, spread = effect.factor * value, effect.factor * sigma
+    number = f"{size:+.{digits}f} ± {spread:.{digits}f} {effect.unit}".replace(" °", "°")
+    if times < SIGNIFICANT:
+        return Signature(effect, value, sigma, moves_m, "none", f"{effect.name}: no sign of it ({number})")
+    told = f"{times:.0f} σ, {100.0 * moves_m:.1f} cm at the edge"
+    if moves_m < MATTERS_M:
+        return Signature(
+            effect, value, sigma, moves_m, "small", f"{effect.name}: {number}, too small to matter ({told})"
+        )
+    words = f"{effect.name}: {effect.look}; add {number} to {effect.key} ({told})"
+    return Signature(effect, value, sigma, moves_m, "significant", words)
+
+
+def record_of(found: Signatures) -> Mapping[str, object]:
+    """For JSON: values in the unit of the report, which is that of the parameter's key in calibration files."""
+    return {
+        "rows": found.rows,
+        "rms_m": found.rms_m,
+        "left_rms_m": found.left_rms_m,
+        "variance_factor": found.variance_factor,
+        "rough": found.rough,
+        "trajectory_errors": list(found.prior_notes),
+        "effects": [
+            {
+                "name": one.effect.name,
+                "parameter": one.effect.key,
+                "unit": one.effect.unit,
+                "value": one.value * one.effect.factor if math.isfinite(one.value) else None,
+                "sigma": one.sigma * one.effect.factor if math.isfinite(one.sigma) else None,
+                "edge_m": one.edge_m if math.isfinite(one.edge_m) else None,
+                "level": one.level,
+                "words": one.words,
+            }
+            for one in found.found
+        ],
+    }

@@ -1,0 +1,1 @@
+"""Tie points: intersections of planes, picked points, markings."""

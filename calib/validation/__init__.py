@@ -1,0 +1,1 @@
+"""Calibrations compared with one another and with later flights."""

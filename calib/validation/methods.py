@@ -1,0 +1,494 @@
+"""Is a calibration right? The six methods of ISO/TS 19159-2, 6.8, each with numbers, a test and a sentence.
+
+Distances are tested against the covariance that is expected of them: noise of the planes, the trajectory's errors, as
+they go on along the strips and from one to the next, and the sigmas of the calibration itself. So a χ² that is too
+large says that something is wrong which none of these explains.
+
+A test that finds nothing is worth what it could have found: of every parameter the smallest error is told that the
+tests would have seen with `POWER` (the minimal detectable bias of Baarda 1968, A testing procedure for use in geodetic
+networks).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from swath.calib.control.points import ControlRules
+from swath.calib.equations.observability import RULES_OF_ALL
+from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior, gauss_markov
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight
+from swath.calib.strips.differences import Numbers
+from swath.calib.strips.effects import EFFECTS
+from swath.calib.validation.distances import Rows, control_rows, estimated_floor_m, plane_rows
+from swath.calib.validation.history import Compared, compare
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
+
+FloatArray = NDArray[np.float64]
+
+ALPHA = 0.001  # of each test: one true calibration in a thousand fails it
+POWER = 0.8  # with which an error of the size told would have been found
+BLIND = 25.0  # plausible sizes: an error that must be as large to be seen is not seen at all
+FEWEST = 5
+UNITS = {"rad": ("°", math.degrees(1.0)), "m": (" m", 1.0), "s": (" µs", 1e6), "s2": (" s²", 1.0)}
+SIGMAS_M, SIGMAS_DEG = 0.05, (0.005, 0.005, 0.01)  # of trajectories that say none
+KNOT_S = 1.0  # of trajectories that say sigmas only
+WANDER, WANDER_TAUS = 0.3, Taus(2.0, 2.0, 2.0)  # of these sigmas: as much as errors change from plane to plane
+CROSSING_DEG = 45.0
+HEIGHTS_RATIO = 1.2
+CODES = {  # CA_ValidationMethod
+    "testfield": "001",
+    "crossStripFlight": "002",
+    "secondFlight": "003",
+    "secondAltitude": "004",
+    "measurementActualParameters": "005",
+    "other": "006",
+}
+WORDS = {
+    "crossStripFlight": "planes seen by crossing strips",
+    "secondFlight": "planes seen by two flights",
+    "secondAltitude": "planes seen from two heights",
+    "other": "planes seen by any two strips",
+}
+WANTS = {
+    "testfield": "want control (--control)",
+    "crossStripFlight": "want strips that cross",
+    "secondFlight": "want the log of a second flight",
+    "secondAltitude": f"want strips at heights above ground that differ by {100 * (HEIGHTS_RATIO - 1):.0f} % or more",
+    "measurementActualParameters": "want the parameters measured anew (--anew)",
+    "other": "want strips that share planes",
+}
+NOT_BOTH = "no parameter was estimated in both; want a calibration file with sigmas, as swath calibrate writes it"
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """A statistical test; p: chance of so much where nothing is wrong.
+
+    ``chi2`` of all values; ``z`` of their mean; ``effects``: χ² of what the calibration's effects (roll, pitch, …)
+    explain of them, which sees what all the rest hides; ``effect``: of the one effect that fits best, p of all of them
+    together (Bonferroni), which sees a single wrong parameter best.
+    """
+
+    kind: str
+    value: float
+    freedom: float
+    p: float
+    words: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is no surprise."""
+        return self.p >= ALPHA
+
+
+@dataclass(frozen=True, slots=True)
+class Detectable:
+    """The smallest error of a parameter that a test would have seen with `POWER`, were it the only one.
+
+    Attributes:
+        scanner, parameter: as ``left``, ``omega_rad``.
+        size: SI; what the calibration's own sigmas allow is no error.
+    """
+
+    scanner: str
+    parameter: str
+    size: float
+
+    @property
+    def seen(self) -> bool:
+        """Tell whether the size is one that anybody would look for."""
+        return self.size < BLIND * RULES_OF_ALL.of(f"{self.scanner}.{self.parameter}").plausible
+
+    @property
+    def words(self) -> str:
+        """Return the parameter and its size, as ``phi 0.0062°``."""
+        unit, factor = UNITS.get(self.parameter.rpartition("_")[2], (" ppm", 1e6))
+        return f"{self.name} {float(f'{factor * self.size:.2g}'):g}{unit}"
+
+    @property
+    def name(self) -> str:
+        """Of the parameter, without its unit."""
+        name, _, unit = self.parameter.rpartition("_")
+        return name if unit in UNITS else self.parameter
+
+    def record(self) -> dict[str, Any]:
+        """For JSON, in the unit of the parameter's key; null: not at all."""
+        parameter = PARAMETERS[INDEX[self.parameter]]
+        size = self.size / parameter.factor if self.seen else None
+        return {"scanner": self.scanner, "parameter": parameter.key, "smallest_error": size}
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One method of validation.
+
+    Attributes:
+        name: of `CODES`.
+        numbers: of the values; None: not available.
+        tests: of them.
+        sentence: what came of it.
+        more: further values for JSON.
+        detectable: the smallest errors that it would have seen.
+    """
+
+    name: str
+    numbers: Numbers | None
+    tests: tuple[Test, ...]
+    sentence: str
+    more: Mapping[str, Any] = field(default_factory=dict)
+    detectable: tuple[Detectable, ...] = ()
+
+    @property
+    def code(self) -> str:
+        """Of CA_ValidationMethod."""
+        return CODES[self.name]
+
+    @property
+    def passed(self) -> bool | None:
+        """None: it could not be applied."""
+        return None if not self.tests else all(test.passed for test in self.tests)
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """All six; why they may not be independent of the calibration; and what was asked for and could not be done."""
+
+    methods: tuple[Method, ...]
+    dependent: tuple[str, ...] = ()
+    undone: tuple[str, ...] = ()
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether all that could be applied passed; None: none could."""
+        known = [method.passed for method in self.methods if method.passed is not None]
+        return all(known) if known else None
+
+    @property
+    def holds(self) -> bool:
+        """Whether all passed that could be applied, and all that was asked for could be."""
+        return bool(self.passed) and not self.undone
+
+    @property
+    def detectable(self) -> tuple[Detectable, ...]:
+        """The smallest errors that any of the methods would have seen."""
+        best: dict[tuple[str, str], Detectable] = {}
+        for one in (one for method in self.methods for one in method.detectable):
+            there = best.setdefault((one.scanner, one.parameter), one)
+            if one.size < there.size:
+                best[one.scanner, one.parameter] = one
+        return tuple(best.values())
+
+    @property
+    def sentence(self) -> str:
+        """The verdict, with what was asked for and not done, and what would not have been seen."""
+        applied = [method for method in self.methods if method.passed is not None]
+        failed = [method.name for method in applied if not method.passed]
+        undone = f"what was asked for could not be done: {'; '.join(self.undone)}" if self.undone else ""
+        if not applied:
+            return f"nothing could be validated{'; ' if undone else ''}{undone}"
+        alone = " (not independent)" if self.dependent else ""
+        if failed:
+            verdict = f"the calibration does not hold{alone}: {', '.join(failed)} of {len(applied)} methods failed"
+            return f"{verdict}{'; ' if undone else ''}{undone}"
+        could = f"{len(applied)} of 6 methods could be applied, none speaks against it"
+        if undone:
+            return f"not validated as asked{alone}: {undone}; {could}{self._unseen()}"
+        return f"the calibration holds{alone}: {could}{self._unseen()}"
+
+    def _unseen(self) -> str:
+        """What errors would not have been seen, in words."""
+        found = self.detectable
+        several = len({one.scanner for one in found}) > 1
+        below = [f"{one.scanner} {one.words}" if several else one.words for one in found if one.seen]
+        blind = [f"{one.scanner} {one.name}" if several else one.name for one in found if not one.seen]
+        words = f"; errors below {', '.join(below)} would not be seen ({POWER:.0%} of larger ones are)" if below else ""
+        return words + (f"; none of {', '.join(blind)} would be seen" if blind else "")
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What a validation is asked for beyond the planes that two strips see.
+
+    Attributes:
+        control: points in the flight's frame; None: none were named.
+        anew: by scanner, parameters measured anew from this flight or otherwise; None: that was not asked for.
+        why_not_anew: why there are none, where it was.
+        scanners: those whose calibrations were named; None: all.
+    """
+
+    control: Sequence[ControlPoint] | None = None
+    anew: Mapping[str, Calibration] | None = None
+    why_not_anew: str = ""
+    scanners: Sequence[str] | None = None
+
+
+def validate(
+    flight: Flight,
+    features: Features,
+    calibrations: Mapping[str, Calibration],
+    asked: Asked = Asked(),
+    prior: TrajectoryPrior | None = None,
+    rules: ControlRules | None = None,
+) -> Validation:
+    """Validate.
+
+    Args:
+        flight: placed with the calibrations.
+        features: planes found in it, that no adjustment behind the calibrations has used.
+        calibrations: by scanner, what is to be validated.
+        asked: for more than that.
+        prior: errors of the flight's trajectories, as navigation knows them; None: by the trajectories' sigmas, of
+            which nobody says how errors of one strip go with those of the next: where strips are compared, not at all,
+            and where control is, as `Taus` says, for so either sees the larger errors.
+        rules: of control.
+    """
+    apart, along = _by_sigmas(with_sigmas(flight)) if prior is None else (prior, prior)
+    rows = plane_rows(flight, features, calibrations, apart)
+    classes = _classes(flight, rows)
+    rows = replace(rows, floor_m=estimated_floor_m(rows.take(rows.independent(classes["other"]))))
+    found = {name: _of_rows(name, rows, which) for name, which in classes.items()}
+    found["testfield"] = _testfield(flight, asked.control or (), calibrations, rules or ControlRules(), along)
+    found["measurementActualParameters"] = _anew(calibrations, asked.anew)
+    validation = Validation(tuple(found[name] for name in CODES))
+    return replace(validation, undone=_undone(flight, validation, found, asked))
+
+
+def _by_sigmas(flight: Flight) -> tuple[TrajectoryPrior, TrajectoryPrior]:
+    """Return the errors of the trajectories with strips apart, each with some wander, and along all of them."""
+    along = gauss_markov(flight, knot_s=KNOT_S)
+    strips = np.repeat(along.flown * (along.strip.max() + 1) + along.strip, ERRORS)
+    wander = gauss_markov(flight, WANDER_TAUS, KNOT_S).covariance
+    covariance = along.covariance * (strips[:, np.newaxis] == strips) + WANDER**2 * wander
+    return replace(along, covariance=covariance), along
+
+
+def with_sigmas(flight: Flight) -> Flight:
+    """Return the flight with the sigmas `SIGMAS_M` and `SIGMAS_DEG` where its trajectories say none."""
+    trajectories = []
+    for one in flight.trajectories:
+        position = np.where(np.isfinite(one.position_sigma_l), one.position_sigma_l, SIGMAS_M)
+        attitude = np.where(np.isfinite(one.attitude_sigma_rad), one.attitude_sigma_rad, np.radians(SIGMAS_DEG))
+        trajectories.append(replace(one, position_sigma_l=position, attitude_sigma_rad=attitude))
+    return replace(flight, trajectories=tuple(trajectories))
+
+
+def _undone(flight: Flight, validation: Validation, found: Mapping[str, Method], asked: Asked) -> tuple[str, ...]:
+    """What was asked for and could not be done, a line each."""
+    lines = []
+    if asked.control is not None and found["testfield"].passed is None:
+        lines.append(f"control: {_why(found['testfield'])}")
+    if asked.anew is not None and found["measurementActualParameters"].passed is None:
+        lines.append(f"parameters anew: {asked.why_not_anew or _why(found['measurementActualParameters'])}")
+    if len(flight.trajectories) > 1 and found["secondFlight"].passed is None:
+        lines.append(
+            f"{len(flight.trajectories)} flights: fewer than {FEWEST} distances of planes that two of them see"
+        )
+    if validation.passed is not None:
+        seen = {one.scanner for one in validation.detectable if one.seen}
+        wanted = [head.name for head in flight.heads] if asked.scanners is None else asked.scanners
+        lines += [f"{name}: no error of its calibration would be seen" for name in wanted if name not in seen]
+    return tuple(lines)
+
+
+def _why(method: Method) -> str:
+    return method.sentence.partition("not applied: ")[2]
+
+
+def same_logs(calibration: Calibration, logs: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    """Sentences where logs (name, SHA-256) are those that a calibration was made of."""
+    used = {entry.get("sha256", ""): entry.get("name", "") for entry in calibration.header.get("logs", [])}
+    return tuple(
+        f"{name}: calibration {calibration.id} was made of this log; this is no independent validation of it"
+        for name, sha256 in logs
+        if sha256 in used
+    )
+
+
+# ---------------------------------------------------------------------- planes
+
+
+def _classes(flight: Flight, rows: Rows) -> dict[str, NDArray[np.bool_]]:
+    """Which rows belong to which method."""
+    headings, heights = _flown_so(flight)
+    first, second = rows.first, rows.second
+    if not len(rows):
+        none = np.zeros(0, bool)
+        return dict.fromkeys(WORDS, none)
+    apart = np.abs((headings[first] - headings[second] + 90.0) % 180.0 - 90.0)
+    ratio = np.maximum(heights[first], heights[second]) / np.minimum(heights[first], heights[second])
+    flown = np.array([swath.flown for swath in flight.swaths])
+    return {
+        "crossStripFlight": apart >= CROSSING_DEG,
+        "secondFlight": flown[first] != flown[second],
+        "secondAltitude": ratio >= HEIGHTS_RATIO,
+        "other": np.ones(len(rows), bool),
+    }
+
+
+def _flown_so(flight: Flight) -> tuple[FloatArray, FloatArray]:
+    """(swaths,) headings, degrees, and heights above their points, metres."""
+    headings, heights = np.zeros(len(flight.swaths)), np.ones(len(flight.swaths))
+    for number, swath in enumerate(flight.swaths):
+        if not len(swath):
+            continue
+        trajectory = flight.trajectories[swath.flown]
+        within = trajectory.between(int(swath.time_ns[0]), int(swath.time_ns[-1]))
+        way = within.velocity_l().mean(axis=0)
+        headings[number] = math.degrees(math.atan2(way[1], way[0])) % 360.0
+        ground = float(np.nanmedian(swath.points_t[:: max(len(swath) // 1000, 1), 2]))
+        heights[number] = max(float(np.median(geodetic_from_e(within.position_e)[2])) - ground, 1.0)
+    return headings, heights
+
+
+def _of_rows(name: str, every: Rows, which: NDArray[np.bool_]) -> Method:
+    rows, tested = every.take(which), every.take(every.independent(which))
+    if len(tested) < FEWEST:
+        return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {WANTS[name]}")
+    numbers, tests = Numbers.of(rows.value_m), distance_tests(tested)
+    smallest = smallest_errors(tested)
+    pairs = len({*zip(rows.first.tolist(), rows.second.tolist(), strict=True)})
+    what = f"{WORDS[name]}: {numbers.count:,} distances on {len(set(rows.name)):,} planes, {pairs} pairs"
+    return Method(name, numbers, tests, _sentence(name, what, numbers, tests), {"pairs": pairs}, smallest)
+
+
+def distance_tests(rows: Rows) -> tuple[Test, ...]:
+    """χ² of values with their expected covariance, z of their mean (generalised least squares), tests of effects.
+
+    Of n values none of which follows from others χ² = dᵀ C⁻¹ d has n degrees of freedom;
+    mean = (1ᵀ C⁻¹ d) / (1ᵀ C⁻¹ 1), z = mean · √(1ᵀ C⁻¹ 1).
+    """
+    factor = np.linalg.cholesky(rows.covariance())
+    whitened = np.linalg.solve(factor, np.column_stack([rows.value_m, np.ones(len(rows))]))
+    squares = float(whitened[:, 0] @ whitened[:, 0])
+    weight = float(whitened[:, 1] @ whitened[:, 1])
+    mean = float(whitened[:, 0] @ whitened[:, 1]) / weight
+    z = mean * math.sqrt(weight)
+    found = (
+        Test("chi2", squares, float(len(rows)), float(stats.chi2.sf(squares, len(rows)))),
+        Test("z", z, 1.0, float(2.0 * stats.norm.sf(abs(z)))),
+    )
+    if not rows.effects.any():
+        return found
+    return (*found, *_effects_tests(whitened[:, 0], np.linalg.solve(factor, rows.effects)))
+
+
+def _effects_tests(values: FloatArray, effects: FloatArray) -> tuple[Test, Test]:
+    """χ² of what whitened effects (n, m) explain of whitened values (n,), and z of the one that fits best."""
+    length = np.linalg.norm(effects, axis=0)
+    seen = np.flatnonzero(length > 1e-9 * length.max())
+    unit = effects[:, seen] / length[seen]
+    left, singular, _ = np.linalg.svd(unit, full_matrices=False)
+    within = left[:, singular > 1e-3].T @ values
+    alone = np.abs(unit.T @ values)
+    name = EFFECTS[seen[int(alone.argmax())] % len(EFFECTS)].name
+    squares, freedom, best = float(within @ within), len(within), float(alone.max())
+    words = f"as an error of {name} would leave ({best:.1f} σ)"
+    chance = min(1.0, 2.0 * len(seen) * float(stats.norm.sf(best)))
+    together = Test("effects", squares, float(freedom), float(stats.chi2.sf(squares, freedom)), words)
+    return together, Test("effect", best, 1.0, chance, words)
+
+
+def smallest_errors(rows: Rows) -> tuple[Detectable, ...]:
+    """Return of every effect of every scanner the smallest error that the test ``effect`` finds with `POWER`.
+
+    A unit of it moves the whitened values by g, so that δ = (z₁₋α′⁄₂ + z_power) / |g|, α′ = `ALPHA` over the number of
+    effects that are seen (Baarda 1968, the power of the other side neglected).
+    """
+    if not rows.effects.any():
+        return ()
+    moved = np.linalg.solve(np.linalg.cholesky(rows.covariance()), rows.effects)
+    length = np.linalg.norm(moved, axis=0)
+    seen = length > 1e-9 * length.max()
+    shift = float(stats.norm.isf(ALPHA / 2.0 / seen.sum()) + stats.norm.ppf(POWER))
+    return tuple(
+        Detectable(head, effect.parameter, shift / value if there else math.inf)
+        for (head, effect), value, there in zip(
+            ((head, effect) for head in rows.heads for effect in EFFECTS), length.tolist(), seen.tolist(), strict=True
+        )
+    )
+
+
+def _sentence(name: str, what: str, numbers: Numbers, tests: Sequence[Test]) -> str:
+    values = (
+        f"mean {100 * numbers.mean_m:+.1f} cm, std {100 * numbers.std_m:.1f}, RMS {100 * numbers.rms_m:.1f}, "
+        f"largest {100 * numbers.max_m:.1f}"
+    )
+    chi2, mean = tests[:2]
+    if len(tests) > 2 and not tests[2].passed:
+        verdict = f"{tests[2].words}: χ² {tests[2].value:,.0f} of {tests[2].freedom:,.0f}, p {tests[2].p:.2g}"
+    elif len(tests) > 3 and not tests[3].passed:
+        verdict = f"{tests[3].words}: p {tests[3].p:.2g}"
+    elif not chi2.passed:
+        verdict = f"more than is expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
+    elif not mean.passed:
+        verdict = f"their mean is not zero (z {mean.value:.1f}, p {mean.p:.2g})"
+    elif stats.chi2.cdf(chi2.value, chi2.freedom) < ALPHA:
+        verdict = (
+            f"less than is expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}): the trajectory's sigmas are larger "
+            "than its errors, so the test sees less than it could"
+        )
+    else:
+        verdict = f"as expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
+    return f"{name} ({CODES[name]}): {what}: {values}: {verdict}"
+
+
+# ---------------------------------------------------------------------- control, parameters
+
+
+def _testfield(
+    flight: Flight,
+    control: Sequence[ControlPoint],
+    calibrations: Mapping[str, Calibration],
+    rules: ControlRules,
+    prior: TrajectoryPrior,
+) -> Method:
+    rows = control_rows(flight, control, calibrations, replace(rules, farthest_m=math.inf), prior)
+    if len(rows) < FEWEST:
+        why = WANTS["testfield"] if not control else f"control is seen {len(rows)} times only; want {FEWEST} or more"
+        return Method("testfield", None, (), f"testfield ({CODES['testfield']}): not applied: {why}")
+    numbers, tests = Numbers.of(rows.value_m), distance_tests(rows)
+    what = f"laser above control: {numbers.count:,} distances at {len(set(rows.name))} points"
+    sentence = _sentence("testfield", what, numbers, tests)
+    return Method("testfield", numbers, tests, sentence, {"points": len(set(rows.name))}, smallest_errors(rows))
+
+
+def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibration] | None) -> Method:
+    name = "measurementActualParameters"
+    told: list[tuple[str, Compared]] = []
+    for scanner in sorted(set(calibrations) & set(anew or {})):
+        assert anew is not None
+        told.append((scanner, compare(calibrations[scanner], anew[scanner])))
+    told = [one for one in told if one[1].freedom]
+    if not told:
+        return Method(name, None, (), f"{name} ({CODES[name]}): not applied: {NOT_BOTH if anew else WANTS[name]}")
+    squares, freedom = sum(one.chi2 for _, one in told), sum(one.freedom for _, one in told)
+    test = Test("chi2", squares, float(freedom), float(stats.chi2.sf(squares, freedom)))
+    rows = [row for _, one in told for row in one.rows]
+    largest = max(rows, key=lambda row: abs(row.difference) / row.sigma)
+    verdict = "agree with the calibration" if test.passed else "do not agree with the calibration"
+    sentence = (
+        f"{name} ({CODES[name]}): {freedom} parameters measured anew {verdict} (χ² {squares:.1f} of {freedom}, "
+        f"p {test.p:.2g}); largest: {largest.words}"
+    )
+    shift = math.sqrt(_noncentrality(freedom))
+    smallest = tuple(
+        Detectable(scanner, row.name, shift / math.sqrt(weight))
+        for scanner, one in told
+        for row, weight in zip(one.rows, one.weights, strict=True)
+    )
+    return Method(name, None, (test,), sentence, {"parameters": [row.record() for row in rows]}, smallest)
+
+
+def _noncentrality(freedom: int) -> float:
+    """Return λ with which χ² of so many degrees of freedom fails at `ALPHA` with `POWER`."""
+    limit = float(stats.chi2.isf(ALPHA, freedom))
+    return float(optimize.brentq(lambda size: float(stats.ncx2.sf(limit, freedom, size)) - POWER, 1.0, 1e4))

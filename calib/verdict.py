@@ -1,0 +1,471 @@
+"""Whether a calibration may be used: a table of limits on its figures, and a sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from swath.calib.labels import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
+from swath.calib.outcome import Adjusted, Considered
+from swath.calib.summary import Difference, Pair, ReportInput
+
+DEG = 180.0 / math.pi
+BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
+MOST_CORRELATED = 0.95
+TOO_LARGE = 10.0  # times what is wanted
+# What is wanted where nobody says and the flight's points do not tell
+WANTED = {"omega_rad": 0.003 / DEG, "phi_rad": 0.003 / DEG, "kappa_rad": 0.006 / DEG, "range_offset_m": 0.02}
+
+
+class Level(IntEnum):
+    """Of a reason, and of the whole."""
+
+    GOOD = 0
+    CARE = 1
+    UNUSABLE = 2
+
+    @property
+    def words(self) -> str:
+        """As a report says it."""
+        return ("Good", "Usable with care", "Not to be used")[self]
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a calibration is not simply good.
+
+    Attributes:
+        level: how bad it is.
+        what: what is the matter, with the figure.
+        change: what to do about it.
+        excess: value over its limit, to put the worst first.
+    """
+
+    level: Level
+    what: str
+    change: str
+    excess: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The judgement: the worst reason's level, the sentence, the reasons with the worst first."""
+
+    level: Level
+    sentence: str
+    reasons: tuple[Reason, ...]
+
+
+Measure = Callable[[ReportInput], Iterator[tuple[str, float]]]  # of what, and how large
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One limit: a value above ``care`` or ``unusable`` (None: never) is a reason of that level."""
+
+    measure: Measure
+    care: float | None
+    unusable: float | None
+    what: str
+    change: str
+    shown: Callable[[float], str] = number
+
+    def judged(self, report: ReportInput) -> Iterator[Reason]:
+        """Reasons that its measure gives, one for each thing measured; what is not a number is the worst."""
+        for of, value in self.measure(report):
+            for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
+                if limit is not None and not value <= limit:
+                    excess = value / limit if limit > 0.0 and math.isfinite(value) else math.inf
+                    yield Reason(level, self.what.format(of=of, value=self.shown(value)), self.change, excess)
+                    break
+
+
+def overall_rms_m(pairs: Mapping[Pair, Difference]) -> float | None:
+    """Root mean square over all cells of all pairs; None: nothing was compared."""
+    cells = sum(one.count for one in pairs.values())
+    return math.sqrt(sum(one.count * one.rms_m**2 for one in pairs.values()) / cells) if cells else None
+
+
+def sigma_of(report: ReportInput, names: tuple[str, ...]) -> float | None:
+    """Return the largest sigma (SI) of parameters of these names, estimated or held; None: nothing is said of them."""
+    adjusted = report.adjusted
+    known = [s for n, s in zip(adjusted.names, adjusted.sigmas.tolist(), strict=True) if unknown(n).name in names]
+    known += [one.sigma for one in adjusted.considered if one.name in names]
+    return max(known, default=None)
+
+
+def wanted_of(report: ReportInput) -> dict[str, float]:
+    """Return one sigma (SI) that is wanted, by parameter's name."""
+    told = {} if report.need is None else report.need.wanted
+    return {**WANTED, **{name: sigma for name, sigma in told.items() if math.isfinite(sigma)}}
+
+
+def held_words(adjusted: Adjusted) -> list[str]:
+    """Return what held parameters would do, a sentence each: those that move an estimated one by more than its sigma.
+
+    An estimated parameter's own sigma is the one it would have if nothing that is held were wrong.
+    """
+    several = len(adjusted.calibrations) > 1
+    moved = adjusted.movements
+    own = np.sqrt(np.maximum(adjusted.sigmas**2 - (moved**2).sum(axis=1), 0.0))
+    found = []
+    for column, one in enumerate(adjusted.considered):
+        at = np.argsort(-np.abs(moved[:, column]) / np.maximum(own, 1e-300)).tolist()
+        told = [
+            f"{unknown_words(adjusted.names[i], several)} by {sized(adjusted.names[i], abs(float(moved[i, column])))}"
+            for i in at
+            if abs(float(moved[i, column])) > own[i]
+        ]
+        if told:
+            found.append(f"{_held(one, several)}, would move {listed(told)}")
+    return found
+
+
+def unknown_words(name: str, several: bool) -> str:
+    """Return the words of an unknown, as ``left.omega_rad``."""
+    one = unknown(name)
+    return words_of(one.scanner, one.name, several=several)
+
+
+def _held(one: Considered, several: bool) -> str:
+    """Return what is held, and how well it is known."""
+    name = f"{one.scanner}.{one.name}"
+    return f"{unknown_words(name, several)}, held, plausible to {sized(name, one.sigma)}"
+
+
+def undetermined(report: ReportInput) -> list[str]:
+    """Parameters that this flight does not determine, in words."""
+    several = len(report.adjusted.calibrations) > 1
+    held = [one for one in report.adjusted.held if is_undetermined(one)]
+    return [words_of(one.scanner, one.name, several=several) for one in held]
+
+
+def _not_converged(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield "", 0.0 if report.adjusted.converged else 1.0
+
+
+def _no_redundancy(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield number(report.adjusted.redundancy, ".0f"), 100.0 / max(report.adjusted.redundancy, 1e-9)
+
+
+def _held_angles(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield the boresight angles that are held, and how many times what is wanted they are uncertain by."""
+    yield from _held_of(report, BORESIGHT)
+
+
+def _held_range(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield from _held_of(report, ("range_offset_m",))
+
+
+def _held_of(report: ReportInput, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    adjusted, wanted = report.adjusted, wanted_of(report)
+    several = len(adjusted.calibrations) > 1
+    sigmas = {(one.scanner, one.name): one for one in adjusted.considered}
+    held = [one for one in adjusted.held if one.name in names]
+    if not held:
+        return
+    words, worst = [], 1e-9
+    for one in held:
+        known = sigmas.get((one.scanner, one.name), Considered(one.scanner, one.name, 0.0, 0.0))
+        words.append(_held(known, several))
+        worst = max(worst, known.sigma / wanted[one.name])
+    yield listed(words), worst
+
+
+def _beyond_wanted(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield estimated parameters with their sigmas and what is wanted, and the ratio."""
+    several = len(report.adjusted.calibrations) > 1
+    wanted = wanted_of(report)
+    for name, sigma in zip(report.adjusted.names, report.adjusted.sigmas.tolist(), strict=True):
+        limit = wanted.get(unknown(name).name)
+        if limit is not None:
+            words = (
+                f"{unknown_words(name, several)} is known to {sized(name, sigma)} only, {sized(name, limit)} is wanted"
+            )
+            yield words, sigma / limit
+
+
+def _points(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield what the calibration leaves in points, over what is wanted."""
+    need = report.need
+    if need is None or not need.point_m > 0.0:
+        return
+    several = len(need.left_m) > 1
+    for scanner, left_m in need.left_m.items():
+        of = f" of {scanner}" if several else ""
+        if math.isfinite(left_m):
+            yield f"leaves {length(left_m)} in points{of}, {length(need.point_m)} is wanted", left_m / need.point_m
+
+
+def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield held parameters that the flight says are wrong."""
+    several = len(report.adjusted.calibrations) > 1
+    for one in report.adjusted.considered:
+        if one.contradicted:
+            name = f"{one.scanner}.{one.name}"
+            told = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
+            yield f"{unknown_words(name, several)} that is held: it would change it by {told}", 1.0
+
+
+def _profiles(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Yield what profiles say against the adjustment, in sigmas of the difference."""
+    several = len(report.adjusted.calibrations) > 1
+    for one in () if report.check is None else report.check.comparisons:
+        name = f"{one.scanner}.{one.parameter}"
+        told = sized(name, one.told - one.adjusted, sign=True)
+        sigmas = number(one.normalised, "+.1f")
+        yield (
+            f"{one.profiles} profiles put {unknown_words(name, several)} {told} from the adjustment ({sigmas} sigmas)",
+            abs(one.normalised),
+        )
+
+
+def _variance(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield "", report.adjusted.variance_factor
+
+
+def _variance_small(report: ReportInput) -> Iterator[tuple[str, float]]:
+    yield number(report.adjusted.variance_factor, ".2f"), 1.0 / max(report.adjusted.variance_factor, 1e-9)
+
+
+def _rejected(report: ReportInput) -> Iterator[tuple[str, float]]:
+    for group in report.adjusted.groups:
+        yield group.group, group.rejected / max(group.observations, 1)
+
+
+def _beyond_prior(report: ReportInput) -> Iterator[tuple[str, float]]:
+    adjusted = report.adjusted
+    several = len(adjusted.calibrations) > 1
+    change = np.abs(adjusted.values - adjusted.start)
+    for i, name in enumerate(adjusted.names):
+        prior = float(adjusted.prior_sigmas[i])
+        if math.isfinite(prior) and prior > 0.0:
+            one = unknown(name)
+            yield words_of(one.scanner, one.name, several=several), float(change[i]) / prior
+
+
+def _strips(report: ReportInput) -> Iterator[tuple[str, float]]:
+    rms_m = overall_rms_m(dict(report.after))
+    if rms_m is not None:
+        yield "", rms_m
+
+
+def _worse(report: ReportInput) -> Iterator[tuple[str, float]]:
+    before_m, after_m = overall_rms_m(dict(report.before)), overall_rms_m(dict(report.after))
+    if before_m and after_m:
+        yield f"{length(before_m)} before, {length(after_m)} after", after_m / before_m
+
+
+def _control(report: ReportInput) -> Iterator[tuple[str, float]]:
+    for point in report.adjusted.control:
+        yield f"{point.name} ({length(point.misclosure_m)})", abs(point.normalised)
+
+
+def _influence(report: ReportInput) -> Iterator[tuple[str, float]]:
+    several = len(report.adjusted.calibrations) > 1
+    for point in report.adjusted.control:
+        if point.influence:
+            name, moved = max(point.influence.items(), key=lambda item: abs(item[1]))
+            one = unknown(name)
+            yield f"{point.name} moves {words_of(one.scanner, one.name, several=several)}", abs(moved)
+
+
+def _trajectory(report: ReportInput) -> Iterator[tuple[str, float]]:
+    fit = report.adjusted.trajectory
+    if fit is not None and len(fit.time_ns):
+        for words, value, prior in (
+            ("positions", fit.position_l, fit.prior_position_sigma_l),
+            ("attitude", fit.attitude_rad, fit.prior_attitude_sigma_rad),
+        ):
+            known = prior > 0.0
+            if known.any():
+                yield words, float(np.sqrt(np.mean((value[known] / prior[known]) ** 2)))
+
+
+def _correlated(report: ReportInput) -> Iterator[tuple[str, float]]:
+    """Tell pairs whose sum alone is known, but where points are known as well as is wanted: there the sum suffices."""
+    adjusted, need = report.adjusted, report.need
+    left_m = {} if need is None else need.left_m
+    enough = {scanner for scanner, left in left_m.items() if need is not None and left <= need.point_m}
+    several = len(adjusted.calibrations) > 1
+    at = [i for i, name in enumerate(adjusted.names) if unknown(name).is_parameter]
+    known = [unknown(adjusted.names[i]) for i in at]
+    words = [words_of(one.scanner, one.name, several=several) for one in known]
+    matrix = np.abs(adjusted.correlation[np.ix_(at, at)])
+    for i, j in np.argwhere(np.triu(matrix, 1) > MOST_CORRELATED):
+        if not {known[i].scanner, known[j].scanner} <= enough:
+            yield f"{words[i]} and {words[j]}", float(matrix[i, j])
+
+
+def _sigmas_words(value: float) -> str:
+    return number(value, ".1f")
+
+
+RULES: tuple[Rule, ...] = (
+    Rule(
+        _not_converged,
+        None,
+        0.5,
+        "the adjustment did not converge{of}",
+        "start from a better calibration (pre-alignment), or look for matches that are wrong",
+    ),
+    Rule(
+        _no_redundancy,
+        1.0,
+        10.0,
+        "only {of} observations beyond the unknowns",
+        "fly over more roofs and slopes, with more overlap of lines",
+    ),
+    Rule(
+        _held_angles,
+        0.0,
+        TOO_LARGE,
+        "not a boresight calibration: {of}",
+        "fly the lines, or give the control, that stand below under Not determined",
+    ),
+    Rule(
+        _held_range,
+        1.0,
+        None,
+        "{of}",
+        "control on flat, hard ground (at least 8 points of 1 cm)",
+    ),
+    Rule(
+        _beyond_wanted,
+        1.0,
+        TOO_LARGE,
+        "{of}",
+        "fly more of the lines that determine it, or say [calibration] wanted where less will do",
+    ),
+    Rule(
+        _points,
+        1.0,
+        TOO_LARGE,
+        "the calibration {of}",
+        "more lines, control or heights; or say [calibration] wanted where less will do",
+    ),
+    Rule(
+        _contradicted,
+        0.5,
+        None,
+        "the flight contradicts {of}",
+        "free it (--free), or give it the value it has",
+    ),
+    Rule(
+        _profiles,
+        2.9,
+        8.0,
+        "{of}",
+        "look below at the profiles: which pairs say so, and whether all have one sign",
+    ),
+    Rule(
+        _variance,
+        2.0,
+        9.0,
+        "residuals are larger than their sigmas say (variance factor {value})",
+        "check the noise of scanner and trajectory; look below where residuals are large",
+    ),
+    Rule(
+        _variance_small,
+        4.0,
+        None,
+        "residuals are far smaller than their sigmas say (variance factor {of})",
+        "the noise of scanner or trajectory is stated too large; sigmas here are too careful",
+    ),
+    Rule(
+        _rejected,
+        0.05,
+        0.4,
+        "{value} of the observations ({of}) were rejected as outliers",
+        "look below at which planes, strips and angles they lie",
+        share,
+    ),
+    Rule(
+        _beyond_prior,
+        3.3,
+        10.0,
+        "{of} has moved {value} times the sigma it was given before",
+        "check what was measured on the ground, or give it a larger sigma",
+        _sigmas_words,
+    ),
+    Rule(
+        _strips,
+        0.08,
+        0.5,
+        "strips differ by {value} (RMSDz) after the calibration",
+        "look below which pairs do: a strip of its own kind has a bad trajectory",
+        length,
+    ),
+    Rule(
+        _worse,
+        1.05,
+        1.5,
+        "strips agree worse than before ({of})",
+        "look below which pairs do, and at the outliers",
+    ),
+    Rule(
+        _control,
+        3.29,
+        10.0,
+        "control point {of} is {value} sigmas off",
+        "check its height system (ellipsoidal?), its place, and what grows on it; leave it out",
+        _sigmas_words,
+    ),
+    Rule(
+        _influence,
+        1.5,
+        6.0,
+        "control point {of} by {value} sigmas when it is left out",
+        "more control: no single point should carry a parameter",
+        _sigmas_words,
+    ),
+    Rule(
+        _trajectory,
+        1.6,
+        4.0,
+        "corrections of the trajectory's {of} are {value} times what its sigmas let expect",
+        "process the trajectory anew; its sigmas are too small",
+        _sigmas_words,
+    ),
+    Rule(
+        _correlated,
+        MOST_CORRELATED,
+        None,
+        "{of} can hardly be told apart (correlation {value})",
+        "a second flying height or speed, or hold one of them",
+    ),
+)
+
+
+def judge(report: ReportInput) -> Verdict:
+    """The verdict."""
+    reasons = [reason for rule in RULES for reason in rule.judged(report)]
+    reasons += [
+        Reason(Level.UNUSABLE if one.unusable else Level.CARE, one.what, one.change, one.excess)
+        for one in report.findings
+    ]
+    reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
+    level = max((reason.level for reason in reasons), default=Level.GOOD)
+    return Verdict(level, _sentence(level, report, reasons), tuple(reasons))
+
+
+def accuracy_words(report: ReportInput) -> str:
+    """Sigmas and agreement, as people say them."""
+    boresight, offset_m = sigma_of(report, BORESIGHT), sigma_of(report, ("range_offset_m",))
+    words = [f"boresight to {degrees(boresight * DEG)}"] if boresight is not None else []
+    words += [f"range offset to {length(offset_m)}"] if offset_m is not None else []
+    rms_m = overall_rms_m(dict(report.after))
+    told = ", ".join(words) or "the model has neither boresight nor range offset"
+    return told + (f"; strips agree to {length(rms_m)} (RMSDz)" if rms_m is not None else "")
+
+
+def _sentence(level: Level, report: ReportInput, reasons: list[Reason]) -> str:
+    accuracy, missing = accuracy_words(report), undetermined(report)
+    tail = f" Not determined by this flight: {listed(missing)}." if missing else ""
+    if level is Level.GOOD:
+        return f"{level.words}: {accuracy}.{tail}"
+    return f"{level.words}: {reasons[0].what}. {accuracy[0].upper()}{accuracy[1:]}.{tail}"
