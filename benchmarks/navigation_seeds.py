@@ -21,7 +21,7 @@ import numpy as np
 from swath.daemon.processing.navigation_sources import filter_setup
 from swath.georef.navigation.inputs import GRADES, ImuNoise, Setup
 from swath.georef.navigation.solve import solve
-from swath.sim.plan_tables import ImuTable
+from swath.sim.plan.tables import ImuTable
 from tests.georef.navigation.flights import drawn_start
 from tests.georef.navigation.virtual_aircraft import (
     ARM,

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.memory import keep_freed_memory
-from swath.sim.plan import parse_plan
-from swath.sim.scene import Scene, build_scene
+from swath.sim.plan.plan import parse_plan
+from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.site import Site
 
 FloatArray = NDArray[np.float64]

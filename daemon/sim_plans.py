@@ -41,7 +41,7 @@ class Wish:
             UserError: it is not there, or a key is wrong; or what `sim` needs is not installed.
         """
         _check_installed()
-        from swath.sim.plan import load_plan
+        from swath.sim.plan.plan import load_plan
 
         with self.told():
             plan = load_plan(self.plan)
@@ -54,7 +54,7 @@ class Wish:
         Args:
             names: of files beside the plan's that may be what is wrong.
         """
-        from swath.sim.errors import PlanError
+        from swath.sim.plan.errors import PlanError
 
         try:
             yield
@@ -128,7 +128,7 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
 def draw(wish: Wish, picture: Path) -> list[dict[str, Any]]:
     """Draw a plan; what it covers, a row a line and one for all. Raises UserError, OSError."""
     plan = wish.load()
-    from swath.sim.picture import draw_plan
+    from swath.sim.preview.picture import draw_plan
 
     with wish.told(str(picture)):
         rows: list[dict[str, Any]] = draw_plan(plan, picture)

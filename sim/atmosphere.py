@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from swath.sim.plan_tables import AtmosphereTable
+from swath.sim.plan.tables import AtmosphereTable
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.sim.gravity import RATE_IE_E, gravity_e
-from swath.sim.plan_tables import FlightTable
+from swath.sim.plan.tables import FlightTable
 from swath.sim.site import geodetic_from_e, rot_e_from_ned
 
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.sim.plan_tables import OscillatorTable, PpsTable
+from swath.sim.plan.tables import OscillatorTable, PpsTable
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

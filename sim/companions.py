@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from swath.sim.calibration_files import calibration_text
 from swath.sim.clocks import generator
-from swath.sim.coverage import control_points
-from swath.sim.gnss_wire import config_table as gnss_config
-from swath.sim.imu_wire import config_table as imu_config
-from swath.sim.imu_wire import dbc_text
-from swath.sim.plan import Plan
+from swath.sim.gnss.wire import config_table as gnss_config
+from swath.sim.imu.wire import config_table as imu_config
+from swath.sim.imu.wire import dbc_text
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.toml_text import toml_text
+from swath.sim.preview.coverage import control_points
+from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.scanners.ouster_wire import config_table as ouster_config
 from swath.sim.scanners.ouster_wire import os1_metadata
 from swath.sim.scanners.srep_wire import config_table as srep_config
 from swath.sim.scanners.velodyne_wire import config_table as velodyne_config
-from swath.sim.scene import Scene
+from swath.sim.scene.scene import Scene
 from swath.sim.shots import FloatArray
 from swath.sim.site import Site, geodetic_from_e
-from swath.sim.toml_text import toml_text
 
 FIRST_UDP_PORT = 2368
 FIRST_POSITION_PORT = 8308

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from swath.sim.clocks import generator
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import FaultTable, Tables
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import FaultTable, Tables
 from swath.sim.shots import WireUnit
 
 Window = tuple[float, float]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swath.georef.timescales import unix_ns_from_gps
-from swath.sim.plan import Plan
+from swath.sim.plan.plan import Plan
 
 UPTIME_AT_START_NS = 600 * 1_000_000_000  # what CLOCK_MONOTONIC says at the plan's start
 _NS = 1_000_000_000

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from swath.daemon.sim_plans import Wish
     from swath.daemon.wire_player import Output, PlayReport
 
-PRESETS = "small, calibration, corridor, block, bench"  # swath.sim.plan's
+PRESETS = "small, calibration, corridor, block, bench"  # swath.sim.plan.plan's
 CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
 SETTLE_S = 1.0  # from the last reader at a port to the first unit: nobody can see whether UDP and CAN are read
 LATE_S = 0.5  # a time message that comes later than this after its edge may be taken for the next one's

@@ -29,9 +29,9 @@ from swath.georef.scanner.calibration import PARAMETERS, read_calibration
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
-from swath.sim.calibration_files import calibration_text
-from swath.sim.coverage import Survey, control_points, fan_of
-from swath.sim.plan import Plan
+from swath.sim.plan.plan import Plan
+from swath.sim.preview.coverage import Survey, control_points, fan_of
+from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 
 FloatArray = NDArray[np.float64]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration_plan import PlannedCalibration
-from swath.sim.picture_map import INK, MUTED, draw_map
+from swath.sim.preview.map import INK, MUTED, draw_map
 
 FloatArray = NDArray[np.float64]
 

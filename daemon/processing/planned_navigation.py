@@ -34,11 +34,11 @@ from swath.georef.navigation.inputs import (
 from swath.georef.navigation.solve import solve
 from swath.georef.records import FixType, GnssHeading, Int64Array, StructArray
 from swath.georef.timescales import SECOND_NS
-from swath.sim.coverage import Survey
-from swath.sim.imu_wire import config_table
-from swath.sim.inertial import true_increments
-from swath.sim.plan_tables import GnssTable, ImuTable
-from swath.sim.satellites import Epochs, Receiver
+from swath.sim.gnss.receiver import Epochs, Receiver
+from swath.sim.imu.sensors import true_increments
+from swath.sim.imu.wire import config_table
+from swath.sim.plan.tables import GnssTable, ImuTable
+from swath.sim.preview.coverage import Survey
 
 FloatArray = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from swath.drivers.gnss.nmea.sentences import (
 from swath.georef.records import FixType
 from swath.sim.gnss.calendar import Calendar, Stamp
 from swath.sim.gnss.pulse import Pulse
-from swath.sim.plan_tables import GnssTable
-from swath.sim.satellites import Epochs, InsEpochs
+from swath.sim.gnss.receiver import Epochs, InsEpochs
+from swath.sim.plan.tables import GnssTable
 
 QUALITY = {FixType.SINGLE: 1, FixType.RTK_FIXED: 4, FixType.RTK_FLOAT: 5}  # GGA field 6
 

@@ -12,8 +12,8 @@ from swath.drivers.gnss.novatel.tables import CLOCK_VALID, POSITION_NONE, SOL_CO
 from swath.georef.records import FixType
 from swath.sim.gnss.calendar import Calendar
 from swath.sim.gnss.pulse import Pulse
-from swath.sim.plan_tables import GnssTable
-from swath.sim.satellites import Epochs, InsEpochs
+from swath.sim.gnss.receiver import Epochs, InsEpochs
+from swath.sim.plan.tables import GnssTable
 
 INSUFFICIENT_OBSERVATIONS = 1  # solution status
 NONE, SINGLE, FLOAT, FIXED = int(FixType.NONE), int(FixType.SINGLE), int(FixType.RTK_FLOAT), int(FixType.RTK_FIXED)

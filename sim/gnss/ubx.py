@@ -9,8 +9,8 @@ from swath.georef.records import FixType
 from swath.georef.timescales import week_from_gps
 from swath.sim.gnss.calendar import NS_PER_MS, NS_PER_S, Calendar, Stamp
 from swath.sim.gnss.pulse import Pulse
-from swath.sim.plan_tables import GnssTable
-from swath.sim.satellites import Epochs, InsEpochs
+from swath.sim.gnss.receiver import Epochs, InsEpochs
+from swath.sim.plan.tables import GnssTable
 
 FIX_3D = 3
 CARRIER = {FixType.RTK_FLOAT: 1 << 6, FixType.RTK_FIXED: 2 << 6}  # flags of NAV-PVT

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.faults import windows
-from swath.sim.flight import Trajectory
-from swath.sim.plan import Plan
+from swath.sim.flight.trajectory import Trajectory
+from swath.sim.plan.plan import Plan
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.ouster_wire import OusterWire
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.sim.clocks import Oscillator
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners import mirrors, motions
 from swath.sim.scanners.motions import Motion, Swing
 from swath.sim.shots import Pulses

@@ -14,9 +14,9 @@ import numpy as np
 from swath.drivers.scanner.ouster.head import SYNC_PULSE, read_head
 from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.sim.clocks import PulsePerSecond
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.spinning_wire import (
     Arrivals,
     HeadClock,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from swath.sim.atmosphere import Air
 from swath.sim.clocks import generator
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.shots import Echoes, Measured, Pulses
 from swath.sim.truth import StructArray
 

@@ -19,8 +19,8 @@ import numpy as np
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import PLACES, VLP16
 from swath.sim.clocks import Oscillator
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.ouster_wire import COLUMNS, os1_metadata
 from swath.sim.shots import FloatArray, IntArray, Pulses
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import OscillatorTable, ScannerTable
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import OscillatorTable, ScannerTable
 from swath.sim.shots import FloatArray, IntArray, Measured
 
 Windows = Sequence[tuple[float, float]]

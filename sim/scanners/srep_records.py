@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.srep.layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.line_heads import emission_ticks
 from swath.sim.scanners.ranging import LIGHT_MPS, packed
 from swath.sim.shots import Measured, Pulses

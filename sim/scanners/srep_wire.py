@@ -19,10 +19,10 @@ from swath.drivers.scanner.srep.layout import (
     encode_datagrams,
     pulse_dtype,
 )
-from swath.sim.calibration_files import mirror_factor
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import HostTable, ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import HostTable, ScannerTable
+from swath.sim.scanners.calibration_files import mirror_factor
 from swath.sim.scanners.line_heads import config_geometry
 from swath.sim.scanners.ranging import LIGHT_MPS
 from swath.sim.scanners.srep_records import ApparentRanges, RecordMaker, Records, WholeRanges, no_records

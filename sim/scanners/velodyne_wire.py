@@ -17,8 +17,8 @@ from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, enc
 from swath.drivers.scanner.velodyne.position import HOUR_US, encode_position_packet
 from swath.georef.timescales import SECOND_NS, utc_from_gps
 from swath.sim.clocks import PulsePerSecond
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.spinning_wire import (
     Arrivals,
     HeadClock,
@@ -40,7 +40,7 @@ RMC_DELAY_S = 0.15  # from an edge to the sentence that names it, as a receiver 
 
 
 class Track(Protocol):
-    """Where the aircraft is, for the sentences its head is given; `swath.sim.flight.Trajectory` is one."""
+    """Where the aircraft is, for the sentences its head is given; `swath.sim.flight.trajectory.Trajectory` is one."""
 
     def geodetic(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Latitude, longitude, height of (n,) times."""

@@ -17,8 +17,8 @@ from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import Calibration, nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
-from swath.sim.plan import parse_plan
-from swath.sim.scene import Scene, build_scene
+from swath.sim.plan.plan import parse_plan
+from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.shots import CAR, ROOF, WALL
 from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
 

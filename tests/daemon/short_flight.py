@@ -25,7 +25,7 @@ from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth
 from swath.sim.gnss.novatel import NovatelMessages
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 
 MARK_AFTER_NS = 123_456_789  # of each whole second
 CLOCK_OFFSET_S = 2.5e-7  # of the receiver, in what its marks say

@@ -28,7 +28,7 @@ from swath.daemon.processing.calibration_plan import PlanWish, plan_calibration
 from swath.daemon.processing.warm_calibration import warm_calibration
 from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.calibration import Calibration, read_calibration
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 from tests.calib.village import KNOWN, Made, judge_unusable, village
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

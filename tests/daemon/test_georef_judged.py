@@ -15,7 +15,7 @@ from swath.daemon.errors import ExitCode
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.fly import VirtualFlight, open_truth
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 from tests.calib.village import judge_unusable
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 

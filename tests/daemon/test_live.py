@@ -41,7 +41,7 @@ from swath.georef.stream.clocks import DevicePlan
 from swath.georef.timescales import ClockStatus, TimeState
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 from tests.daemon.commands import ROOT
 from tests.daemon.test_cli import swath
 

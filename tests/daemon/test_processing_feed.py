@@ -35,7 +35,7 @@ from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -24,7 +24,7 @@ from swath.daemon.sim_folder import FlightFolder
 from swath.daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
 from swath.daemon.wire_player import Output, TimedUnit
 from swath.drivers.extras import how_to_install
-from swath.sim.plan import PRESETS as REAL_PRESETS
+from swath.sim.plan.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, one_processor, session_table, wait_until
 from tests.daemon.standin import (

@@ -10,7 +10,7 @@ from swath.calib.control.points import HEADER, read_control
 from swath.daemon.config import load_config
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.text_files import text_of
-from swath.sim.plan import load_plan
+from swath.sim.plan.plan import load_plan
 from tests.daemon.rig import session_table
 
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-32"]  # the latter three with a byte order mark

@@ -18,7 +18,7 @@ from swath.daemon.processing.event_marks import PLACED
 from swath.daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
-from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan.plan import Plan, parse_plan
 from tests.daemon import short_flight
 from tests.daemon.short_flight import MARK_AFTER_NS, Flown, errors, fly_short, post_processed, two_lines
 

@@ -39,7 +39,7 @@ from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.scanner.beams import GeometryError, read_fibres
 from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 from swath.georef.strips import CSV_COLUMNS, StripError
-from swath.sim.plan import PRESETS
+from swath.sim.plan.plan import PRESETS
 from tests.fuzz.engine import Target
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, OF_TOML, text_target
 

@@ -16,10 +16,10 @@ from rasterio.transform import Affine
 
 from swath.daemon.processing.terrain import read_terrain
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan, load_plan
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, load_plan
+from swath.sim.scene.terrain import build_ground
 from swath.sim.site import Site
-from swath.sim.terrain import build_ground
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import bounds, damage
 from tests.fuzz.texts import told

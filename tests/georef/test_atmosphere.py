@@ -24,7 +24,7 @@ from swath.georef.air.atmosphere import (
 from swath.georef.air.kernels import BLOCK, means
 from swath.georef.refraction import SPHERE_M, ardc_k, layer_air, layer_constant_ppm, spherical_bending
 from swath.sim.atmosphere import Air as SimulatedAir
-from swath.sim.plan_tables import AtmosphereTable
+from swath.sim.plan.tables import AtmosphereTable
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

@@ -17,8 +17,8 @@ from swath.georef.scanner.calibration import (
     nominal,
     read_calibration,
 )
-from swath.sim.calibration_files import calibration_text
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
+from swath.sim.scanners.calibration_files import calibration_text
 
 WHOLE = """
 [calibration]

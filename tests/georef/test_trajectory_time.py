@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from swath.georef.trajectory.turn_rates import TimeShift, correlate_turn_rates
-from swath.sim.inertial import true_increments
+from swath.sim.imu.sensors import true_increments
 from tests.georef.flown import START_NS, flown
 from tests.sim.inertial_motion import rough_flight
 

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.sim.flight import Motion, fly
-from swath.sim.plan import Plan, parse_plan
+from swath.sim.flight.trajectory import Motion, fly
+from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.site import Site, e_from_geodetic, rot_e_from_ned
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from swath.sim.flight import Trajectory
+    from swath.sim.flight.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ height_m = 1300.0
 
 
 class Moving:
-    """A trajectory given by a function of time; stands in for `swath.sim.flight.Trajectory`."""
+    """A trajectory given by a function of time; stands in for `swath.sim.flight.trajectory.Trajectory`."""
 
     def __init__(self, end_s: float, motion: Callable[[FloatArray], Motion]) -> None:
         self.end_s, self.motion = end_s, motion

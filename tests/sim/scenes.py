@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.sim.plan import Plan, parse_plan
-from swath.sim.scene import Scene, build_scene
+from swath.sim.plan.plan import Plan, parse_plan
+from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.shots import Echoes
 from swath.sim.site import Site
 

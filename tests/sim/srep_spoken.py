@@ -15,7 +15,7 @@ from swath.drivers.scanner.srep.layout import HEADER_DTYPE
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Chunk, DeviceClockSamples, ScannerReturns
 from swath.sim.clocks import PulsePerSecond
-from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable
+from swath.sim.plan.tables import HostTable, PpsTable, ScannerTable
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.srep_wire import SrepWire, config_table
 from swath.sim.shots import Measured, Pulses, WireUnit

@@ -16,7 +16,7 @@ from swath.sim.atmosphere import (
     phase_refractivity_ppm,
     vapour_fraction,
 )
-from swath.sim.plan_tables import AtmosphereTable
+from swath.sim.plan.tables import AtmosphereTable
 
 FloatArray = NDArray[np.float64]
 DOWN = np.array([0.0, 0.0, -1.0])

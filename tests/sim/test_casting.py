@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from swath.sim.scene import Scene
+from swath.sim.scene.scene import Scene
 from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, ROOF, WALL, WATER, WIRE
 from swath.sim.site import geodetic_from_e
 from tests.sim.scenes import cast, plan_of, scene_of, towards
@@ -443,7 +443,7 @@ def test_echoes_do_not_depend_on_how_pulses_are_cut_into_batches() -> None:
 def test_another_seed_gives_other_leaves_on_the_same_trees() -> None:
     one = scene_of(EVERYTHING)
     plan = plan_of(EVERYTHING).with_seed(2)
-    from swath.sim.scene import build_scene
+    from swath.sim.scene.scene import build_scene
 
     other = build_scene(plan, one.site, one.corners)
     np.testing.assert_array_equal(one.trees, other.trees)

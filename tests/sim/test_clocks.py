@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
-from swath.sim.plan_tables import OscillatorTable, PpsTable
+from swath.sim.plan.tables import OscillatorTable, PpsTable
 
 
 def test_an_oscillator_runs_fast_by_its_offset_and_drift() -> None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from swath.sim.errors import PlanError
 from swath.sim.faults import check_faults, windows, with_faults
-from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.shots import WireUnit
 
 PLAN = """

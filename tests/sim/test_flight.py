@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pyproj import Geod, Transformer
 from scipy.spatial.transform import Rotation
 
-from swath.sim.errors import PlanError
-from swath.sim.flight import Trajectory, fly
-from swath.sim.plan import Plan, load_plan, parse_plan
+from swath.sim.flight.smoothing import PEAK, kernel, smoothed, spline_through
+from swath.sim.flight.trajectory import Trajectory, fly
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, load_plan, parse_plan
 from swath.sim.site import Site
-from swath.sim.smoothing import PEAK, kernel, smoothed, spline_through
 
 FloatArray = NDArray[np.float64]
 

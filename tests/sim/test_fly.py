@@ -13,11 +13,11 @@ import pytest
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import Chunk, GnssFix, ScannerReturns
-from swath.sim.calibration_files import calibration_text
 from swath.sim.companions import companion_files, config_text, default_wires
-from swath.sim.errors import PlanError
 from swath.sim.fly import VirtualFlight, open_truth
-from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, parse_plan
+from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.shots import WireUnit
 from tests.sim.direct import TO_ECEF
 

@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.sim.flight import Poses
-from swath.sim.mounting import Mounting
-from swath.sim.plan_tables import ParameterTable, ScannerTable
+from swath.sim.flight.trajectory import Poses
+from swath.sim.plan.tables import ParameterTable, ScannerTable
 from swath.sim.scanners.mirrors import swung_mirror
+from swath.sim.scanners.mounting import Mounting
 from swath.sim.shots import Pulses
 from swath.sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 

@@ -31,11 +31,11 @@ from swath.georef.records import (
 )
 from swath.georef.timescales import whole_gps_ns
 from swath.sim.clocks import PulsePerSecond
-from swath.sim.errors import PlanError
-from swath.sim.gnss_wire import GnssWire, config_table
-from swath.sim.plan import Plan, parse_plan
-from swath.sim.plan_tables import PpsTable
-from swath.sim.satellites import Receiver
+from swath.sim.gnss.receiver import Receiver
+from swath.sim.gnss.wire import GnssWire, config_table
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, parse_plan
+from swath.sim.plan.tables import PpsTable
 from swath.sim.shots import WireUnit
 from tests.sim.circling import Circling, FloatArray, geodetic
 

@@ -16,12 +16,12 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
 from swath.sim.clocks import PulsePerSecond
-from swath.sim.errors import PlanError
-from swath.sim.imu_wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text
-from swath.sim.inertial import InertialUnit
-from swath.sim.plan_tables import ImuTable, OscillatorTable, PpsTable
+from swath.sim.imu.sensors import InertialUnit
+from swath.sim.imu.wire import FORCE_UNIT_MPS2, RATE_UNIT_RADPS, ImuWire, config_table, dbc_text
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ImuTable, OscillatorTable, PpsTable
+from swath.sim.plan.toml_text import toml_text
 from swath.sim.shots import WireUnit
-from swath.sim.toml_text import toml_text
 from tests.sim.inertial_motion import circling_the_pole, standing
 
 FloatArray = NDArray[np.float64]

@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 from scipy.integrate import simpson
 from scipy.spatial.transform import Rotation
 
-from swath.sim.errors import PlanError
 from swath.sim.gravity import EARTH_RATE_RADPS, gravity_at, gravity_e, normal_gravity
-from swath.sim.imu_grades import GRADES, noise_of, sensor_grades
-from swath.sim.inertial import InertialUnit, SensorErrors, drift_constants, drift_level, specific_force, true_increments
-from swath.sim.plan import parse_plan
-from swath.sim.plan_tables import ImuNoiseTable, ImuTable, OscillatorTable
+from swath.sim.imu.grades import GRADES, noise_of, sensor_grades
+from swath.sim.imu.sensors import (
+    InertialUnit,
+    SensorErrors,
+    drift_constants,
+    drift_level,
+    specific_force,
+    true_increments,
+)
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import parse_plan
+from swath.sim.plan.tables import ImuNoiseTable, ImuTable, OscillatorTable
 from swath.sim.site import e_from_geodetic, geodetic_from_e
 from tests.sim.inertial_motion import ROUGH_PLAN, circling_the_pole, rough_flight, standing
 

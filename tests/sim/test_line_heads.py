@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 
 from swath.daemon.config.tables import GeometryConfig
 from swath.sim.clocks import Oscillator
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners import mirrors, motions
 from swath.sim.scanners.line_heads import LineHead, config_geometry
 from swath.sim.shots import Pulses

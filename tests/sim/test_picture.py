@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.sim.coverage import (
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan, parse_plan
+from swath.sim.plan.tables import ScannerTable
+from swath.sim.preview.coverage import (
     FloatArray,
     Strip,
     Survey,
@@ -22,10 +25,7 @@ from swath.sim.coverage import (
     pulse_rate_hz,
     strip_of,
 )
-from swath.sim.errors import PlanError
-from swath.sim.picture import _framed, draw_plan
-from swath.sim.plan import Plan, parse_plan
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.preview.picture import _framed, draw_plan
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 

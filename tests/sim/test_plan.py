@@ -16,9 +16,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from swath.sim.errors import PlanError
-from swath.sim.plan import PRESETS, Plan, load_plan, parse_plan
-from swath.sim.plan_tables import Tables
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import PRESETS, Plan, load_plan, parse_plan
+from swath.sim.plan.tables import Tables
 from swath.sim.shots import SURFACES
 from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE
 

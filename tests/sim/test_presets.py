@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.sim.coverage import Survey, summary_of
 from swath.sim.faults import check_faults
-from swath.sim.plan import PRESETS, load_plan, parse_plan
+from swath.sim.plan.plan import PRESETS, load_plan, parse_plan
+from swath.sim.preview.coverage import Survey, summary_of
 
 PAGE = (Path(__file__).parents[2] / "docs/simulation.md").read_text()
 EXAMPLES = [text for text in re.findall(r"^```toml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL) if "[flight]" in text]

@@ -27,7 +27,7 @@ from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth
-from swath.sim.plan import Plan, parse_plan
+from swath.sim.plan.plan import Plan, parse_plan
 from tests.sim.direct import (
     TO_GEODETIC,
     Bending,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from swath.sim.atmosphere import Air
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import AtmosphereTable, ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import AtmosphereTable, ScannerTable
 from swath.sim.scanners.ranging import IntensityScale, Ranging, packed
 from swath.sim.shots import Echoes, Measured, Pulses
 from swath.sim.truth import RETURN_TRUTH_DTYPE

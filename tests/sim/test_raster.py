@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from rasterio.transform import Affine
 
-from swath.sim.errors import PlanError
-from swath.sim.scene import Scene, build_scene
+from swath.sim.plan.errors import PlanError
+from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.site import Site, geodetic_from_e
 from tests.sim.scenes import plan_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from swath.sim.route import Arc, Leg, Pose, Route, Turning, Way, length_m, shortest_way, way_of_length
+from swath.sim.flight.route import Arc, Leg, Pose, Route, Turning, Way, length_m, shortest_way, way_of_length
 
 R = 300.0
 FREE = Turning(R, R, 0.0)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from swath.georef.records import FixType
-from swath.sim.errors import PlanError
 from swath.sim.gnss.noise import Noise
-from swath.sim.plan_tables import GnssTable
-from swath.sim.satellites import Epochs, InsEpochs, Receiver
+from swath.sim.gnss.receiver import Epochs, InsEpochs, Receiver
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import GnssTable
 from tests.sim.circling import TO_E, Circling, FloatArray, Standing, geodetic, ned_from_e
 
 LEVER_ARM = [0.8, -0.6, -1.9]

@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from swath.sim.errors import PlanError
-from swath.sim.objects import build_solids
-from swath.sim.scene import build_scene
+from swath.sim.plan.errors import PlanError
+from swath.sim.scene.objects import build_solids
+from swath.sim.scene.scene import build_scene
+from swath.sim.scene.terrain import LARGEST_NODES, MARGIN_M, analytic_heights, ups
+from swath.sim.scene.village import ROOFS, build_village
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 from swath.sim.site import Site, geodetic_from_e
-from swath.sim.terrain import LARGEST_NODES, MARGIN_M, analytic_heights, ups
-from swath.sim.village import ROOFS, build_village
 from tests.sim.scenes import cast, plan_of, scene_of
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
@@ -265,7 +265,7 @@ def test_no_room_for_control_points_names_the_key() -> None:
 def test_a_wide_area_gets_larger_cells_and_the_same_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
     text = VILLAGE + "[[terrain.forest]]\ncenter_m = [-200, 200]\nsize_m = [150, 150]\n"
     fine = scene_of(text, 300.0)
-    monkeypatch.setattr("swath.sim.cells.MOST_CELLS", 50)
+    monkeypatch.setattr("swath.sim.scene.cells.MOST_CELLS", 50)
     coarse = scene_of(text, 300.0)
     assert fine.arrays.frame.size == 20.0
     assert coarse.arrays.frame.size == 120.0

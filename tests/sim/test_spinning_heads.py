@@ -14,8 +14,8 @@ from swath.drivers.scanner.ouster.head import beam_points as ouster_points
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.georef.records import RETURN_DTYPE
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.ouster_wire import os1_metadata
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 from swath.sim.shots import Pulses

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from swath.sim.plan_tables import HostTable
+from swath.sim.plan.tables import HostTable
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.srep_wire import SrepWire
 from swath.sim.shots import Measured, WireUnit

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.scanner.srep.layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
 from swath.sim.clocks import Oscillator, PulsePerSecond
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import HostTable, PpsTable, ScannerTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import HostTable, PpsTable, ScannerTable
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.srep_wire import PROCESSING_S, SrepWire, config_table
 from swath.sim.shots import Measured, Pulses

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from swath.sim.flight import Trajectory
+from swath.sim.flight.trajectory import Trajectory
 from swath.sim.gravity import EARTH_RATE_RADPS
-from swath.sim.inertial import Increments, true_increments
-from swath.sim.strapdown import States, navigate
+from swath.sim.imu.sensors import Increments, true_increments
+from swath.sim.imu.strapdown import States, navigate
 from tests.sim.inertial_motion import rough_flight
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.sim.toml_text import toml_text
+from swath.sim.plan.toml_text import toml_text
 from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, TruthWriter
 
 

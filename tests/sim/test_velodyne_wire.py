@@ -25,7 +25,7 @@ from swath.georef.records import (
     TimeMessage,
 )
 from swath.georef.timescales import HOUR_NS, gps_ns_from_utc, gps_ns_past_hour
-from swath.sim.plan import Plan
+from swath.sim.plan.plan import Plan
 from swath.sim.scanners.spinning_heads import Vlp16Head
 from swath.sim.scanners.spinning_wire import PPS_LOCKED, HeadClock
 from swath.sim.scanners.velodyne_wire import VelodyneWire, config_table

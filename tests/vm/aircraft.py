@@ -11,7 +11,7 @@ from swath.daemon.log.chunks import json_objects
 from swath.daemon.log.reader import open_logs
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 from tests.vm import installed
 from tests.vm.machine import GUEST, MODULES
 

@@ -30,7 +30,7 @@ from swath.daemon.sim_wire import CAN_GROUP, free_ports
 from swath.drivers.transports.spec import parse_transport
 from swath.sim.companions import companion_files, config_text
 from swath.sim.fly import VirtualFlight
-from swath.sim.plan import parse_plan
+from swath.sim.plan.plan import parse_plan
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, wait_until
 from tests.daemon.test_live_growing import running

@@ -14,8 +14,8 @@ from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_f
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
 from swath.georef.records import FixType, StructArray
-from swath.sim.flight import Trajectory
-from swath.sim.inertial import error_matrix, true_increments
+from swath.sim.flight.trajectory import Trajectory
+from swath.sim.imu.sensors import error_matrix, true_increments
 from tests.georef.navigation.vehicles import Motion, ns, observed
 
 FloatArray = NDArray[np.float64]

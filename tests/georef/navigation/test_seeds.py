@@ -14,8 +14,8 @@ import pytest
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import Setup, Solution
-from swath.sim.inertial import InertialUnit
-from swath.sim.plan_tables import ImuTable
+from swath.sim.imu.sensors import InertialUnit
+from swath.sim.plan.tables import ImuTable
 from tests.georef.navigation.flights import drawn_start
 from tests.georef.navigation.virtual_aircraft import (
     ARM,

@@ -18,7 +18,7 @@ from swath.georef.navigation.filter.filter import start_state
 from swath.georef.navigation.filter.strapdown import ACCEL_BIAS, GYRO_BIAS, STATE_SIZE, navigate
 from swath.georef.navigation.inputs import ImuNoise, Inertial
 from swath.sim.gravity import gravity_e
-from swath.sim.inertial import true_increments
+from swath.sim.imu.sensors import true_increments
 from tests.georef.navigation.flights import drawn_start, errors, fly, setup_for, survey
 from tests.georef.navigation.vehicles import ns, reference
 from tests.sim.inertial_motion import circling_the_pole

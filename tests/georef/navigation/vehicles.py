@@ -28,8 +28,8 @@ from swath.georef.navigation.inputs import (
     sort_observations,
 )
 from swath.georef.records import FixType, StructArray
-from swath.sim.flight import Trajectory
-from swath.sim.inertial import error_matrix, true_increments
+from swath.sim.flight.trajectory import Trajectory
+from swath.sim.imu.sensors import error_matrix, true_increments
 
 FloatArray = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """The virtual aircraft's flights, inertial units and receivers, as navigation takes them: no wires, no log.
 
-The way is flown once by `swath.sim.flight`; units and receivers draw their errors anew with each seed, as
-`swath.sim.inertial` and `swath.sim.satellites` make them.
+The way is flown once by `swath.sim.flight.trajectory`; units and receivers draw their errors anew with each seed, as
+`swath.sim.imu.sensors` and `swath.sim.gnss.receiver` make them.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from scipy.stats import t as student
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Solution, imu_noise
 from swath.georef.records import FixType, StructArray
 from swath.georef.timescales import SECOND_NS
-from swath.sim.flight import fly
-from swath.sim.inertial import InertialUnit, true_increments
-from swath.sim.plan import parse_plan
-from swath.sim.plan_tables import GnssTable, ImuNoiseTable, ImuTable
-from swath.sim.satellites import Receiver
+from swath.sim.flight.trajectory import fly
+from swath.sim.gnss.receiver import Receiver
+from swath.sim.imu.sensors import InertialUnit, true_increments
+from swath.sim.plan.plan import parse_plan
+from swath.sim.plan.tables import GnssTable, ImuNoiseTable, ImuTable
 from swath.sim.site import Site, e_from_geodetic, rot_e_from_ned
 from tests.georef.navigation.flights import Truth, errors
 from tests.georef.navigation.vehicles import BEGIN_NS, ns, observed

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.sim.envelope import Ground
-from swath.sim.errors import PlanError
-from swath.sim.flight import Trajectory, fly
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.flight.envelope import Ground
+from swath.sim.flight.trajectory import Trajectory, fly
+from swath.sim.flight.turbulence import ANGLE_RMS_DEG, INTENSITY
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners import mirrors
-from swath.sim.scene import Scene, build_scene
+from swath.sim.scene.scene import Scene, build_scene
+from swath.sim.scene.terrain import MARGIN_M
 from swath.sim.site import Site
-from swath.sim.terrain import MARGIN_M
-from swath.sim.turbulence import ANGLE_RMS_DEG, INTENSITY
 
 FloatArray = NDArray[np.float64]
 
@@ -184,8 +184,8 @@ def strip_of(plan: Plan, index: int, start_s: float, end_s: float) -> Strip:
 def corners(plan: Plan) -> FloatArray:
     """(k, 2) east and north of ground that must be there: around every line, as wide as it can be seen.
 
-    `swath.sim.terrain.MARGIN_M` beyond is there anyway, which is enough for a wing that dips a little; corners lie
-    outside the swath only where it is not.
+    `swath.sim.scene.terrain.MARGIN_M` beyond is there anyway, which is enough for a wing that dips a little; corners
+    lie outside the swath only where it is not.
     """
     terrain, found = plan.tables.terrain, []
     for index in range(len(plan.tables.line)):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from swath.sim.plan_base import NotNegative, Point, Positive, Section
+from swath.sim.plan.base import NotNegative, Point, Positive, Section
 
 Roof = Literal["flat", "gabled", "hipped"]
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from swath.sim.attitude import coordinated, quaternions_e_from_b
-from swath.sim.envelope import Envelope, Ground, refuse_lines
-from swath.sim.itinerary import route_of
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import Tables
-from swath.sim.route import Route
+from swath.sim.flight.envelope import Envelope, Ground, refuse_lines
+from swath.sim.flight.itinerary import route_of
+from swath.sim.flight.route import Route
+from swath.sim.flight.smoothing import STEP_S, smoothed, spline_through
+from swath.sim.flight.turbulence import angles_rad, displacement_m
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import Tables
 from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
-from swath.sim.smoothing import STEP_S, smoothed, spline_through
-from swath.sim.turbulence import angles_rad, displacement_m
 
 FloatArray = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
 from pyproj import Transformer
 
-from swath.sim.coverage import FloatArray, Strip, Survey, control_points
-from swath.sim.envelope import Ground
-from swath.sim.village import STREET_M
+from swath.sim.flight.envelope import Ground
+from swath.sim.preview.coverage import FloatArray, Strip, Survey, control_points
+from swath.sim.scene.village import STREET_M
 
 INK, MUTED = "#22262b", "#5a6068"
 ROOFS, WATER, TREES, ROAD, MAST, CAR = "#a65f4a", "#8fbfdc", "#7fa65e", "#8d8d89", "#3b3b3b", "#c23b22"

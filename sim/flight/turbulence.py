@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
 from swath.sim.clocks import generator
-from swath.sim.smoothing import STEP_S
+from swath.sim.flight.smoothing import STEP_S
 
 FloatArray = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swath.georef.records import FixType
-from swath.sim.errors import PlanError
 from swath.sim.gnss import grades
 from swath.sim.gnss.noise import Noise
-from swath.sim.plan_tables import GnssTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import GnssTable
 from swath.sim.site import FloatArray, e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 IntArray = NDArray[np.int64]
@@ -26,7 +26,7 @@ VELOCITY_AGE_S = {"novatel": 0.05, "ubx": 0.0, "nmea": 0.0}  # velocity lags its
 
 
 class BodyMotion(Protocol):
-    """The part of `swath.sim.flight.Motion` that an antenna needs."""
+    """The part of `swath.sim.flight.trajectory.Motion` that an antenna needs."""
 
     @property
     def position_e(self) -> FloatArray: ...
@@ -39,7 +39,7 @@ class BodyMotion(Protocol):
 
 
 class Flown(Protocol):
-    """The part of `swath.sim.flight.Trajectory` that a receiver needs."""
+    """The part of `swath.sim.flight.trajectory.Trajectory` that a receiver needs."""
 
     @property
     def end_s(self) -> float: ...

@@ -14,8 +14,8 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from swath.drivers.extras import how_to_install
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
 from swath.sim.site import Site, geodetic_from_e
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +35,7 @@ class RasterHeights:
         plan: names the raster and, in ``flight.crs``, the CRS it must have.
         site: of the grid.
         east_m, north_m: first and last column and row.
-        of_height: makes a smooth function of place and height quick on that grid (`swath.sim.terrain.OfHeight`).
+        of_height: makes a smooth function of place and height quick on that grid (`swath.sim.scene.terrain.OfHeight`).
 
     Raises:
         PlanError: ``terrain.raster``, one line: no rasterio, no such file, another CRS, a corner not covered; when

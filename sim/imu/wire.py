@@ -17,10 +17,10 @@ from swath.drivers.imu.dbc.encoder import encode_latch, encode_samples
 from swath.drivers.imu.dbc.settings import map_signals
 from swath.drivers.parser import DeviceSettings
 from swath.sim.clocks import PulsePerSecond, generator
-from swath.sim.errors import PlanError
-from swath.sim.imu_grades import noise_of
-from swath.sim.inertial import InertialUnit
-from swath.sim.plan_tables import ImuTable
+from swath.sim.imu.grades import noise_of
+from swath.sim.imu.sensors import InertialUnit
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ImuTable
 from swath.sim.shots import WireUnit
 
 FloatArray = NDArray[np.float64]

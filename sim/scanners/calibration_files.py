@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import ScannerTable, Tables
-from swath.sim.toml_text import toml_text
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import ScannerTable, Tables
+from swath.sim.plan.toml_text import toml_text
 
 CONVENTIONS_VERSION = 1
 SPINNING = ("vlp16", "os1")

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import FlightTable, LineTable, Tables
-from swath.sim.route import Turning
-from swath.sim.smoothing import PEAK, SPLINE_REACH, STEP_S
+from swath.sim.flight.route import Turning
+from swath.sim.flight.smoothing import PEAK, SPLINE_REACH, STEP_S
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import FlightTable, LineTable, Tables
 
 FloatArray = NDArray[np.float64]
 Ground = Callable[[FloatArray, FloatArray], FloatArray]

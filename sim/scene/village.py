@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.sim.clocks import generator
-from swath.sim.errors import PlanError
-from swath.sim.plan_terrain import BuildingTable, RoadTable, VillageTable
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.terrain_tables import BuildingTable, RoadTable, VillageTable
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -13,16 +13,17 @@ from pydantic import ValidationError
 from swath.georef.text_encoding import decoded
 from swath.georef.timescales import gps_ns_from_unix, table_leap_seconds
 from swath.georef.toml_tables import TomlError, toml_tables
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import Tables
-from swath.sim.toml_text import toml_text
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import Tables
+from swath.sim.plan.toml_text import toml_text
 
 PRESETS = ("small", "calibration", "corridor", "block", "bench")
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan whose keys are all right; whether it can be flown is for `swath.sim.flight` and `swath.sim.scene` to say.
+    """A plan whose keys are all right; whether it can be flown is for `swath.sim.flight.trajectory` and
+    `swath.sim.scene.scene` to say.
 
     Attributes:
         tables: every key.

@@ -11,17 +11,17 @@ import numpy as np
 
 from swath.georef.records import FixType
 from swath.sim.clocks import PulsePerSecond, generator
-from swath.sim.errors import PlanError
 from swath.sim.gnss.calendar import Calendar
 from swath.sim.gnss.nmea import NmeaMessages
 from swath.sim.gnss.noise import Noise
 from swath.sim.gnss.novatel import NovatelMessages
 from swath.sim.gnss.pulse import Pulse
+from swath.sim.gnss.receiver import INS_RATE_HZ, Epochs, InsEpochs, Receiver
 from swath.sim.gnss.serial_line import BITS_PER_BYTE, SerialLine
 from swath.sim.gnss.ubx import UbxMessages
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import GnssTable
-from swath.sim.satellites import INS_RATE_HZ, Epochs, InsEpochs, Receiver
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import GnssTable
 from swath.sim.shots import WireUnit
 
 VARIATION_S = 0.002  # one sigma of what an epoch takes longer than the least

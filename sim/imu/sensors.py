@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from swath.sim.clocks import Oscillator, generator
-from swath.sim.errors import PlanError
 from swath.sim.gravity import EARTH_RATE_RADPS, RATE_IE_E, gravity_e
-from swath.sim.imu_grades import sensor_grades
-from swath.sim.plan_tables import ImuNoiseTable, ImuTable
+from swath.sim.imu.grades import sensor_grades
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import ImuNoiseTable, ImuTable
 
 if TYPE_CHECKING:
-    from swath.sim.flight import Motion, Trajectory
+    from swath.sim.flight.trajectory import Motion, Trajectory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.sim.terrain import Ground
+from swath.sim.scene.terrain import Ground
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swath.sim.clocks import generator
-from swath.sim.plan_terrain import CarTable, ForestTable, RoadTable, WireTable
-from swath.sim.rays import PLANE
+from swath.sim.plan.terrain_tables import CarTable, ForestTable, RoadTable, WireTable
+from swath.sim.scene.rays import PLANE
+from swath.sim.scene.terrain import Ground, Lake, ups
+from swath.sim.scene.village import ROOFS, Houses
 from swath.sim.shots import CAR, ROOF, WALL
-from swath.sim.terrain import Ground, Lake, ups
-from swath.sim.village import ROOFS, Houses
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swath.sim.plan_tables import ImuNoiseTable, ImuTable
+from swath.sim.plan.tables import ImuNoiseTable, ImuTable
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 RAD = np.pi / 180.0

@@ -13,12 +13,12 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from swath.sim.coverage import FloatArray, Grid, Survey, grid_of, summary_of
-from swath.sim.envelope import Ground
-from swath.sim.errors import PlanError
-from swath.sim.picture_map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of, shortened
-from swath.sim.plan import Plan
-from swath.sim.terrain import build_ground
+from swath.sim.flight.envelope import Ground
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.preview.coverage import FloatArray, Grid, Survey, grid_of, summary_of
+from swath.sim.preview.map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of, shortened
+from swath.sim.scene.terrain import build_ground
 
 FORMATS = (".pdf", ".png", ".svg")
 DPI = 150
@@ -41,7 +41,7 @@ MOST_ROWS = 24
 
 
 def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
-    """Draw a plan onto one page; gives its `swath.sim.coverage.plan_summary`.
+    """Draw a plan onto one page; gives its `swath.sim.preview.coverage.plan_summary`.
 
     Args:
         plan: of the flight.

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from swath.sim.envelope import CLIMB_MOST_S, SPEED_UP_MPS2, Envelope, Ground, refuse_far, speed_mps
-from swath.sim.errors import PlanError
-from swath.sim.plan_tables import GroundStart, LineTable, Tables
-from swath.sim.route import Arc, Leg, Pose, Route, way_of_length
-from swath.sim.smoothing import SPLINE_REACH, STEP_S
+from swath.sim.flight.envelope import CLIMB_MOST_S, SPEED_UP_MPS2, Envelope, Ground, refuse_far, speed_mps
+from swath.sim.flight.route import Arc, Leg, Pose, Route, way_of_length
+from swath.sim.flight.smoothing import SPLINE_REACH, STEP_S
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.tables import GroundStart, LineTable, Tables
 
 BEFORE_S = 8.0  # in the air, to the first lead
 

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from swath.sim.compiled import kept, kernel
-from swath.sim.flight import Poses
-from swath.sim.plan_tables import ScannerTable
+from swath.sim.flight.trajectory import Poses
+from swath.sim.plan.tables import ScannerTable
 from swath.sim.shots import FloatArray, Pulses
 from swath.sim.site import Site
 

@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from swath.sim.casting import CARS, COVERS, LAKES, ROADS, SOLIDS, THINGS, TREES, WIRES, Frame, SceneArrays
-from swath.sim.cells import CELL_M, Listed, build_cells
 from swath.sim.clocks import generator
-from swath.sim.echoes import cast_pulses, room_to_work
-from swath.sim.errors import PlanError
-from swath.sim.objects import (
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.tables import ScannerTable
+from swath.sim.plan.terrain_tables import CarTable, RoadTable, TerrainTable, WireTable
+from swath.sim.scene.casting import CARS, COVERS, LAKES, ROADS, SOLIDS, THINGS, TREES, WIRES, Frame, SceneArrays
+from swath.sim.scene.cells import CELL_M, Listed, build_cells
+from swath.sim.scene.echoes import cast_pulses, room_to_work
+from swath.sim.scene.objects import (
     CAR_SIZE_M,
     Solids,
     Things,
@@ -28,13 +31,10 @@ from swath.sim.objects import (
     near_circles,
     near_pieces,
 )
-from swath.sim.plan import Plan
-from swath.sim.plan_tables import ScannerTable
-from swath.sim.plan_terrain import CarTable, RoadTable, TerrainTable, WireTable
+from swath.sim.scene.terrain import Ground, build_ground, fill_lake
+from swath.sim.scene.village import Houses, build_village
 from swath.sim.shots import Echoes
 from swath.sim.site import Site
-from swath.sim.terrain import Ground, build_ground, fill_lake
-from swath.sim.village import Houses, build_village
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -173,7 +173,8 @@ def _far_apart(places: FloatArray, count: int) -> FloatArray:
 
 
 def build_scene(plan: Plan, site: Site, corners: FloatArray) -> Scene:
-    """The scene over corners (k, 2) east, north, and `swath.sim.terrain.MARGIN_M` around; what lies beyond is left out.
+    """The scene over corners (k, 2) east, north, and `swath.sim.scene.terrain.MARGIN_M` around; what lies beyond is
+    left out.
 
     Raises:
         PlanError: ``terrain.cell_m``: too large an area for it; ``terrain.raster``: it cannot be used;

@@ -11,8 +11,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from swath.sim.plan_base import Matrix, Name, NotNegative, Point, Positive, Section, Vector, Wired
-from swath.sim.plan_terrain import TerrainTable
+from swath.sim.plan.base import Matrix, Name, NotNegative, Point, Positive, Section, Vector, Wired
+from swath.sim.plan.terrain_tables import TerrainTable
 
 
 def _identity() -> list[list[float]]:

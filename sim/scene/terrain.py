@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from swath.sim.clocks import generator
-from swath.sim.errors import PlanError
-from swath.sim.plan import Plan
-from swath.sim.plan_terrain import TerrainTable
-from swath.sim.raster import RasterHeights
+from swath.sim.plan.errors import PlanError
+from swath.sim.plan.plan import Plan
+from swath.sim.plan.terrain_tables import TerrainTable
+from swath.sim.scene.raster import RasterHeights
 from swath.sim.site import Site
 
 FloatArray = NDArray[np.float64]
@@ -128,7 +128,7 @@ def build_ground(plan: Plan, site: Site, corners: FloatArray) -> Ground:
     """The ground under corners (k, 2) east, north, and `MARGIN_M` around.
 
     Raises:
-        PlanError: ``terrain.cell_m``: too many nodes; ``terrain.raster``: see `swath.sim.raster`.
+        PlanError: ``terrain.cell_m``: too many nodes; ``terrain.raster``: see `swath.sim.scene.raster`.
     """
     table = plan.tables.terrain
     cell_m = table.cell_m

@@ -1,7 +1,8 @@
 """Rays through the scene, compiled: each pulse on its own, one after the other, on one core.
 
-A ray goes from cell to cell (`swath.sim.cells`) until it meets something hard; in a cell it looks at what the cell
-lists and at the ground. Crowns and wires it meets on the way take their share of its energy and let the rest through.
+A ray goes from cell to cell (`swath.sim.scene.cells`) until it meets something hard; in a cell it looks at what the
+cell lists and at the ground. Crowns and wires it meets on the way take their share of its energy and let the rest
+through.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.sim.compiled import kernel, whole
-from swath.sim.rays import (
+from swath.sim.scene.rays import (
     NEVER,
     Ray,
     boundary,
@@ -79,11 +80,11 @@ class SceneArrays(NamedTuple):
 
     Attributes:
         frame: see there.
-        z: (rows, columns) the ground's nodes (`swath.sim.terrain.Ground`).
+        z: (rows, columns) the ground's nodes (`swath.sim.scene.terrain.Ground`).
         top: (2, rows, columns) site z that nothing in a cell exceeds, and that its ground does not exceed.
         first: (2, cells + 1) a cell's things are ``item[first[0, c] : first[0, c + 1]]``, its covers those of row 1.
         item: code of an object: where its row begins in ``rows``, times `THINGS` or `COVERS`, plus its kind.
-        rows: the tables of `swath.sim.objects.Things`, one behind the other.
+        rows: the tables of `swath.sim.scene.objects.Things`, one behind the other.
         seed: of leaves and water.
     """
 

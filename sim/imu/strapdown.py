@@ -49,7 +49,7 @@ def navigate(
     Args:
         position_e, velocity_e: (3,) at the start.
         rot_e_from_b: (3, 3) at the start.
-        angle_b, velocity_b: (n, 3) increments of `swath.sim.inertial.true_increments`.
+        angle_b, velocity_b: (n, 3) increments of `swath.sim.imu.sensors.true_increments`.
         span_s: (n,) lengths of their intervals.
     """
     attitude = Rotation.from_matrix(rot_e_from_b).as_quat(scalar_first=True)

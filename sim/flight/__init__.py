@@ -1,0 +1,1 @@
+"""The aircraft's path, speed and attitude."""

@@ -1,0 +1,1 @@
+"""The plan of a flight: its tables, presets and errors."""

@@ -1,0 +1,1 @@
+"""Terrain, village and objects, and rays that meet them."""
