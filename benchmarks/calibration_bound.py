@@ -29,11 +29,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
-from swath.daemon.processing.calibrate_run import prior_of
-from swath.daemon.processing.calibration_flight import read_flight
-from swath.daemon.processing.flights import Wish as Logs
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.returns import read_flight
+from swath.daemon.processing.calibration.run import prior_of
+from swath.daemon.processing.flights.read import Wish as Logs
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from swath.georef.scanner.uncertainty import Noise
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 from swath.sim.site import e_from_geodetic, rot_e_from_ned

@@ -26,10 +26,10 @@ from swath.calib.parameters import MODELS, Wish
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.returns import thinned
 from swath.calib.planes.search import find_planes
-from swath.daemon.processing.calibration_flight import KNOT_S, read_flight, replaced
-from swath.daemon.processing.flights import Wish as Logs
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, replaced
+from swath.daemon.processing.flights.read import Wish as Logs
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from swath.georef.navigation.cross_covariance import ErrorChain
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration, read_calibration

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.daemon.processing.navigation_sources import filter_setup
+from swath.daemon.processing.navigation.sources import filter_setup
 from swath.georef.navigation.inputs import GRADES, ImuNoise, Setup
 from swath.georef.navigation.solve import solve
 from swath.sim.plan.tables import ImuTable

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.soak_log import Found, is_finished
-from swath.daemon.log.scan import OP_CHUNK
-from swath.daemon.parts import read_sign
+from swath.daemon.log.mcap.scan import OP_CHUNK
+from swath.daemon.log.parts import read_sign
 
 POLL_S = 0.005
 FAR_S = 5.0  # no chunk is as old as this but for a clock that was set

@@ -31,10 +31,10 @@ from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import differences
 from swath.calib.strips.effects import NAMES, SeenFrom
 from swath.calib.strips.signatures import signatures
-from swath.daemon.processing.calibration_flight import read_flight, smoothed_prior
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.returns import read_flight, smoothed_prior
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from swath.georef.scanner.calibration import Calibration
 from tests.calib.cast_flight import cast_flight
 from tests.calib.village import village

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from swath.calib.profiles.stepwise import Profile, Section
-from swath.calib.report_canvas import INK, MUTED
+from swath.daemon.processing.pages.canvas import INK, MUTED
 
 PAGE_IN = (9.6, 4.6)
 COLOURS = ("#0072b2", "#d55e00")  # first, second; told apart without colour by their marks too

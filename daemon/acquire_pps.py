@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from swath.daemon.acquire import WAIT_S, Receiver, Shared
-from swath.daemon.channels import JsonChannel
-from swath.daemon.events import Severity
-from swath.daemon.host_clock import read_clock_pair
-from swath.daemon.log.encode import MESSAGE_HEADER_BYTES
-from swath.daemon.wire_trouble import WireTrouble
+from swath.daemon.log.channels import JsonChannel
+from swath.daemon.log.events import Severity
+from swath.daemon.log.host_clock import read_clock_pair
+from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES
+from swath.daemon.recorder.receivers import WAIT_S, Receiver, Shared
+from swath.daemon.recorder.wire_trouble import WireTrouble
 from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import RawEdge
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path
 
-from swath.daemon.wire_player import TimedUnit
+from swath.daemon.replay.wire_player import TimedUnit
 from swath.drivers.captures.opening import CapturedUnit, read_candump, read_pcap, read_serial
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings

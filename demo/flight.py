@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.console import Console
 
 from demo.proof import Show
-from swath.daemon.sim_ahead import Ahead
-from swath.daemon.sim_plans import Wish, configuration, make_flight_in_time
-from swath.daemon.sim_wire import own_wires
+from swath.daemon.simulate.ahead import Ahead
+from swath.daemon.simulate.on_wires import own_wires
+from swath.daemon.simulate.plans import Wish, configuration, make_flight_in_time
 
 PLAN = "small"
 WHAT = {

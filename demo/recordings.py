@@ -8,8 +8,8 @@ from pathlib import Path
 
 from demo.captures import can_units, gnss_units, pps_units, scanner_units, until
 from demo.proof import Show
-from swath.daemon.sim_wire import free_ports
-from swath.daemon.wire_player import TimedUnit
+from swath.daemon.replay.wire_player import TimedUnit
+from swath.daemon.simulate.on_wires import free_ports
 
 WHAT = {
     "gnss/rover": "NovAtel ProPak6 SPAN, 2014, through a pty",

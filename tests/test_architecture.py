@@ -194,7 +194,9 @@ def loaded_by(code: str) -> set[str]:
 
 
 def test_importing_the_recorder_loads_nothing_of_processing() -> None:
-    loaded = loaded_by("import swath.daemon.run, swath.drivers.driver as r; [r.all_drivers(k) for k in r.KINDS]")
+    loaded = loaded_by(
+        "import swath.daemon.recorder.run, swath.drivers.driver as r; [r.all_drivers(k) for k in r.KINDS]"
+    )
     assert "swath.daemon" in loaded
     assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 
@@ -223,9 +225,9 @@ def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
     processing = ["swath.calib.**", "swath.georef.**", "laspy", "matplotlib", "numba", "pyproj", "scipy"]
     assert light["ignore_imports"] == [
         "swath.drivers.scanner.slots_compiled -> numba",
-        "swath.daemon.sim_plans -> swath.sim.*",
-        "swath.daemon.processing.calibration_plan -> swath.sim.*",
-        "swath.daemon.processing.calibration_plan_page -> swath.sim.*",
-        "swath.daemon.processing.planned_navigation -> swath.sim.*",
+        "swath.daemon.simulate.plans -> swath.sim.*",
+        "swath.daemon.processing.calibration.plan -> swath.sim.*",
+        "swath.daemon.processing.calibration.plan_page -> swath.sim.*",
+        "swath.daemon.processing.calibration.plan_navigation -> swath.sim.*",
         *(f"swath.daemon.processing.** -> {name}" for name in processing),
     ]

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from demo.proof import Hashed, prove
-from swath.daemon.wire_player import Output, PlayReport
+from swath.daemon.replay.wire_player import Output, PlayReport
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S
 

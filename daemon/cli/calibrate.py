@@ -19,7 +19,7 @@ from swath.daemon.cli.options import (
     TrajectoryWeek,
 )
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 OBSERVE = ("planes", "ties", "markings")
 
@@ -88,14 +88,14 @@ def command(
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.config import load_config
-    from swath.daemon.processing.calibrate_model import file_of, model_of
-    from swath.daemon.processing.calibrate_products import write_products
-    from swath.daemon.processing.calibrate_record import facts_of
-    from swath.daemon.processing.calibrate_run import CalibrateWish, calibrate
-    from swath.daemon.processing.flights import Wish
-    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.calibration.model import file_of, model_of
+    from swath.daemon.processing.calibration.products import write_products
+    from swath.daemon.processing.calibration.record import facts_of
+    from swath.daemon.processing.calibration.run import CalibrateWish, calibrate
+    from swath.daemon.processing.flights.read import Wish
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.setup import Options
+    from swath.daemon.processing.setup.setup import Options
 
     _refuse(output, observe, overwrite=overwrite)
     if facts is not None and report is None:

@@ -11,8 +11,8 @@ import typer
 from swath.daemon.errors import ExitCode
 
 if TYPE_CHECKING:
-    from swath.daemon.check import Report
     from swath.daemon.config import Config
+    from swath.daemon.devices.check import Report
 
 
 def command(
@@ -41,7 +41,7 @@ def command(
 def _listen(config: Config, seconds: float) -> list[Report]:
     from rich.console import Console
 
-    from swath.daemon.check import check_everything
+    from swath.daemon.devices.check import check_everything
 
     with Console(stderr=True).status(f"listening for {seconds:g} s"):
         return check_everything(config, seconds)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, one_line
-from swath.daemon.places import DEFAULT_CONFIG
+from swath.daemon.log.directory import DEFAULT_CONFIG
 
 if TYPE_CHECKING:
     from swath.daemon.doctor import Finding

@@ -11,7 +11,7 @@ import typer
 from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
-    from swath.daemon.exporting import ExportReport
+    from swath.daemon.exchange.export import ExportReport
     from swath.daemon.log.reader import Session
 
 
@@ -27,7 +27,7 @@ def command(
     """
     from rich.console import Console
 
-    from swath.daemon.exporting import export_session
+    from swath.daemon.exchange.export import export_session
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
 

@@ -18,7 +18,7 @@ from swath.daemon.cli.options import (
     TrajectoryWeek,
 )
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 from swath.daemon.text_files import text_of
 
 
@@ -67,11 +67,11 @@ def command(
     """
     require_installed("swath georef")
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights import Wish
-    from swath.daemon.processing.flown import TrajectoryWish
-    from swath.daemon.processing.products import georeference
+    from swath.daemon.processing.flights.read import Wish
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.georeferencing.run import georeference
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.setup import Options
+    from swath.daemon.processing.setup.setup import Options
     from swath.georef.strips import StripRules
 
     wish = Wish(

@@ -17,10 +17,10 @@ import typer
 from swath.daemon.errors import ExitCode, UserError, one_line
 
 if TYPE_CHECKING:
-    from swath.daemon.capture_routes import Routes
-    from swath.daemon.captures import Capture
     from swath.daemon.config import Config
-    from swath.daemon.importing import ImportReport
+    from swath.daemon.exchange.captures import Capture
+    from swath.daemon.exchange.import_ import ImportReport
+    from swath.daemon.exchange.routes import Routes
 
 ValueT = TypeVar("ValueT")
 
@@ -50,9 +50,9 @@ def command(
     UDP ports and CAN interfaces of CONFIG say whose the units of a pcap file or candump log are; `--source` says it of
     a serial stream. Exit code 4 when a capture is damaged, 1 when one holds nothing of CONFIG's devices.
     """
-    from swath.daemon.capture_files import Told, find_captures
-    from swath.daemon.capture_routes import Routes
     from swath.daemon.config import load_config
+    from swath.daemon.exchange.capture_files import Told, find_captures
+    from swath.daemon.exchange.routes import Routes
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # what is told of captures stands below
     told = Told(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
@@ -75,8 +75,8 @@ def command(
 def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
     from rich.console import Console
 
-    from swath.daemon.importing import import_captures
-    from swath.daemon.places import take_directory
+    from swath.daemon.exchange.import_ import import_captures
+    from swath.daemon.log.directory import take_directory
     from swath.drivers.transports.base import TransportError
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

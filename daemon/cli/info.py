@@ -28,7 +28,7 @@ def command(
 
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
-    from swath.daemon.statistics import session_statistics
+    from swath.daemon.log.statistics import session_statistics
 
     passed_over: list[str] = []
     try:
@@ -65,7 +65,7 @@ def _unaccounted(numbers: dict[str, Any]) -> int:
 def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from swath.daemon.health import clock_text
+    from swath.daemon.recorder.health import clock_text
 
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
     console.print(

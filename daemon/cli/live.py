@@ -15,8 +15,8 @@ import typer
 
 from swath.daemon.cli.options import AcceptVerdict
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.places import DEFAULT_CONFIG, log_directory
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
+from swath.daemon.processing.requirements import require_installed
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -110,10 +110,10 @@ def _follow(
 
     from swath.daemon.config import load_config
     from swath.daemon.config.tables import LiveConfig
-    from swath.daemon.processing.live import Live, be_humble
-    from swath.daemon.processing.setup import Options, Setup
+    from swath.daemon.processing.live.session import Live, be_humble
+    from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import before_compiling, get_ready, warm_up
-    from swath.daemon.sd_notify import ServiceManager
+    from swath.daemon.recorder.service_manager import ServiceManager
 
     directory = log_directory(where)
     config = None if where.is_dir() else load_config(where)
@@ -179,7 +179,7 @@ def page(found: dict[str, Any]) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    from swath.daemon.processing.live_status import is_well
+    from swath.daemon.processing.live.status import is_well
 
     style = "bold green" if is_well(found) else "bold yellow"
     parts: list[RenderableType] = [Text(found["sentence"], style=style), Text("")]
@@ -211,8 +211,8 @@ def _replay(
     from swath.daemon.config import load_config
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
-    from swath.daemon.processing.live import replay
-    from swath.daemon.processing.setup import Options, Setup
+    from swath.daemon.processing.live.session import replay
+    from swath.daemon.processing.setup.setup import Options, Setup
 
     configs = [path for path in paths if path.suffix == ".toml"]
     passed_over: list[str] = []

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.places import DEFAULT_CONFIG, log_directory
+from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 
 
 def command(
@@ -27,8 +27,8 @@ def command(
 
     Exit code 1 while recording stands still (the note waits for it), 3 when no recorder runs there.
     """
-    from swath.daemon.control import NOTE_CHARACTERS
-    from swath.daemon.control_client import ask
+    from swath.daemon.recorder.control import NOTE_CHARACTERS
+    from swath.daemon.recorder.control_client import ask
 
     if not text.strip() or len(text) > NOTE_CHARACTERS:
         raise UserError(f"a note is a text of 1 to {NOTE_CHARACTERS} characters", ExitCode.USAGE)

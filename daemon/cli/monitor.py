@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, one_line
-from swath.daemon.places import DEFAULT_CONFIG, log_directory
+from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-    from swath.daemon.monitor import Monitor
+    from swath.daemon.monitor.display import Monitor
 
 EVENTS_SHOWN = 8
 FIRST_STATUS_S = 3.0  # a recorder that has just begun tells its first status after a second
@@ -43,7 +43,7 @@ def command(
     from rich.console import Console
     from rich.live import Live
 
-    from swath.daemon.monitor import Monitor
+    from swath.daemon.monitor.display import Monitor
 
     monitor = Monitor(log_directory(where), decode=decode)
     if once:
@@ -150,7 +150,7 @@ def _disk(found: dict[str, Any]) -> str:
 def _event(event: dict[str, Any]) -> Any:
     from rich.text import Text
 
-    from swath.daemon.health import clock_text
+    from swath.daemon.recorder.health import clock_text
 
     when, severity = clock_text(event.get("time_ns")), str(event.get("severity"))
     style = {"critical": "bold red", "error": "red", "warning": "yellow"}.get(severity, "")

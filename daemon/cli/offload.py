@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from swath.daemon.cli.progress import transfer_bar
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.places import log_directory
-from swath.daemon.transfer_bar import transfer_bar
+from swath.daemon.log.directory import log_directory
 
 if TYPE_CHECKING:
-    from swath.daemon.offload import OffloadReport
+    from swath.daemon.exchange.offload import OffloadReport
 
 
 def command(
@@ -36,7 +36,7 @@ def command(
     Goes on where an interrupted run ended. A log being recorded is passed over; nothing is deleted or overwritten.
     Exit code 3 when a log could not be copied or DEST is full, 4 when a copy is not what the log holds.
     """
-    from swath.daemon.offload import is_growing, offload
+    from swath.daemon.exchange.offload import is_growing, offload
     from swath.daemon.priority import give_way
 
     directory = log_directory(where)

@@ -10,12 +10,12 @@ import typer
 
 from swath.daemon.cli.sim import PlanArgument
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from swath.daemon.processing.calibration_plan import PlannedCalibration
+    from swath.daemon.processing.calibration.plan import PlannedCalibration
 
 
 def command(
@@ -46,10 +46,10 @@ def command(
     require_installed("swath plan-calibration", "matplotlib")
     from rich.console import Console
 
-    from swath.daemon.processing.calibrate_model import model_of
-    from swath.daemon.processing.calibration_plan import PlanWish, plan_calibration
-    from swath.daemon.processing.calibration_plan_page import draw_planned, require_picture
-    from swath.daemon.sim_plans import Wish
+    from swath.daemon.processing.calibration.model import model_of
+    from swath.daemon.processing.calibration.plan import PlanWish, plan_calibration
+    from swath.daemon.processing.calibration.plan_page import draw_planned, require_picture
+    from swath.daemon.simulate.plans import Wish
 
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
     require_picture(picture)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from swath.daemon.log.reader import Session
-    from swath.daemon.wire_player import Output, PlayReport
+    from swath.daemon.replay.wire_player import Output, PlayReport
 
 
 def command(
@@ -28,8 +28,8 @@ def command(
 
     from swath.daemon.config import load_config
     from swath.daemon.errors import ExitCode, UserError
-    from swath.daemon.replay import close_outputs, open_outputs
-    from swath.daemon.wire_player import wait_for_readers
+    from swath.daemon.replay.units import close_outputs, open_outputs
+    from swath.daemon.replay.wire_player import wait_for_readers
 
     if not 0 < pace < math.inf:
         raise UserError(f"--pace {pace}: must be a number above 0", exit_code=ExitCode.USAGE)
@@ -75,8 +75,8 @@ def _play_session(
 ) -> PlayReport:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from swath.daemon.replay import timed_units
-    from swath.daemon.wire_player import play
+    from swath.daemon.replay.units import timed_units
+    from swath.daemon.replay.wire_player import play
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[told]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

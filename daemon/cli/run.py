@@ -12,7 +12,7 @@ import typer
 
 
 def _log_to_stderr() -> None:
-    from swath.daemon.journal import JournalFormatter, JournalHandler
+    from swath.daemon.recorder.journal import JournalFormatter, JournalHandler
 
     handler = JournalHandler(sys.stderr.fileno())
     if "JOURNAL_STREAM" in os.environ:
@@ -29,7 +29,7 @@ def command(
 ) -> None:
     """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP starts a new part."""
     from swath.daemon.config import load_config
-    from swath.daemon.run import record
+    from swath.daemon.recorder.run import record
 
     _log_to_stderr()
     raise typer.Exit(int(record(load_config(config), seconds)))

@@ -13,7 +13,7 @@ from swath.daemon.errors import ExitCode
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from swath.daemon.device_setup import DeviceSetup, Step, WireSetup
+    from swath.daemon.devices.setup import DeviceSetup, Step, WireSetup
 
 MAX_BAUD = 20_000_000  # as in swath.drivers.transports.spec, which loads NumPy: too much for a help
 
@@ -37,7 +37,7 @@ def command(
     Exit code 1 when a device refuses a message, does not answer, or cannot be sent to.
     """
     from swath.daemon.config import load_config
-    from swath.daemon.device_setup import plan_setup
+    from swath.daemon.devices.setup import plan_setup
 
     wires = plan_setup(load_config(config), device or (), save=save, present_baud=from_baud)
     if apply:
@@ -56,7 +56,7 @@ def command(
 def _apply(wires: list[WireSetup], timeout_s: float) -> None:
     from rich.console import Console
 
-    from swath.daemon.device_setup import apply_setup
+    from swath.daemon.devices.setup import apply_setup
 
     for wire in wires:
         with Console(stderr=True).status(f"asking by {wire.spec.text}"):

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from swath.daemon.sim_ahead import Ahead, FlightFacts
-    from swath.daemon.sim_folder import FlightFolder
-    from swath.daemon.sim_log import SimReport
-    from swath.daemon.sim_plans import Wish
-    from swath.daemon.wire_player import Output, PlayReport
+    from swath.daemon.replay.wire_player import Output, PlayReport
+    from swath.daemon.simulate.ahead import Ahead, FlightFacts
+    from swath.daemon.simulate.folder import FlightFolder
+    from swath.daemon.simulate.into_log import SimReport
+    from swath.daemon.simulate.plans import Wish
 
 PRESETS = "small, calibration, corridor, block, bench"  # swath.sim.plan.plan's
 CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
@@ -75,7 +75,7 @@ def fly(
     """
     from rich.console import Console
 
-    from swath.daemon.sim_plans import Wish
+    from swath.daemon.simulate.plans import Wish
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # events of the log are in the log
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
@@ -103,7 +103,7 @@ def plan_(
     """Draw a plan: map of lines, swaths and buildings, height profile, point density, overlap; the same as a table."""
     from rich.console import Console
 
-    from swath.daemon.sim_plans import Wish, draw
+    from swath.daemon.simulate.plans import Wish, draw
 
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
     try:
@@ -145,7 +145,7 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 
 
 def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: bool) -> None:
-    from swath.daemon.sim_folder import FlightFolder
+    from swath.daemon.simulate.folder import FlightFolder
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     started_s = time.monotonic()
@@ -167,8 +167,8 @@ def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: boo
 def _make_log(console: Console, wish: Wish, folder: FlightFolder, *, with_truth: bool) -> tuple[SimReport, list[str]]:
     """Everything of a flight, in the folder's place out of sight."""
     from swath.daemon.config import load_config
-    from swath.daemon.sim_log import fly_into_log, sim_session_info
-    from swath.daemon.sim_plans import configuration, make_flight
+    from swath.daemon.simulate.into_log import fly_into_log, sim_session_info
+    from swath.daemon.simulate.plans import configuration, make_flight
 
     plan = wish.load()
     folder.refuse_taken([CONFIG_NAME])  # before anything that takes its time
@@ -220,10 +220,10 @@ def _fly_on_wires(
     console: Console, wish: Wish, folder: Path | None, config_path: Path | None, wait_s: float, *, set_clock: bool
 ) -> None:
     from swath.daemon.config import load_config
-    from swath.daemon.replay import close_outputs
-    from swath.daemon.sim_ahead import Ahead
-    from swath.daemon.sim_plans import make_flight_in_time
-    from swath.daemon.sim_wire import check_steps, open_wires
+    from swath.daemon.replay.units import close_outputs
+    from swath.daemon.simulate.ahead import Ahead
+    from swath.daemon.simulate.on_wires import check_steps, open_wires
+    from swath.daemon.simulate.plans import make_flight_in_time
 
     plan = wish.load()
     config = load_config(config_path) if config_path is not None else None
@@ -260,8 +260,8 @@ def _fly_on_wires(
 
 def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | None) -> Path:
     """A folder with ports, FIFOs and the configuration that records from them."""
-    from swath.daemon.sim_plans import configuration
-    from swath.daemon.sim_wire import own_wires
+    from swath.daemon.simulate.on_wires import own_wires
+    from swath.daemon.simulate.plans import configuration
 
     place = Path(tempfile.mkdtemp(prefix="swath-sim-")) if folder is None else folder.absolute()
     path = place / CONFIG_NAME
@@ -279,7 +279,7 @@ def _make_wires(console: Console, plan: Any, facts: FlightFacts, folder: Path | 
 
 
 def _await_readers(console: Console, outputs: Mapping[str, Output], wait_s: float, stopped: Callable[[], bool]) -> None:
-    from swath.daemon.wire_player import wait_for_readers
+    from swath.daemon.replay.wire_player import wait_for_readers
 
     with console.status("waiting for somebody to open the ports"):
         for source in wait_for_readers(outputs, wait_s, stopped):
@@ -297,7 +297,7 @@ def _play(
     others: Mapping[str, Output],
     stopped: Callable[[], bool],
 ) -> PlayReport:
-    from swath.daemon.sim_wire import fly_on_wires
+    from swath.daemon.simulate.on_wires import fly_on_wires
 
     with _progress(console) as bar:
         duration_s = ahead.facts.duration_s

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from swath.daemon.errors import UserError
-from swath.daemon.places import DEFAULT_CONFIG, log_directory
+from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 
 
 def command(
@@ -25,7 +25,7 @@ def command(
 
     Exit code 1 when no new part came, 3 when no recorder runs there.
     """
-    from swath.daemon.control_client import ask, wait_for_part
+    from swath.daemon.recorder.control_client import ask, wait_for_part
 
     directory = log_directory(where)
     answer = ask(directory, {"command": "split"})

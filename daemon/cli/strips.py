@@ -13,10 +13,10 @@ import typer
 
 from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 if TYPE_CHECKING:
-    from swath.daemon.processing.flights import Wish
+    from swath.daemon.processing.flights.read import Wish
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.05, 100.0
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
@@ -80,9 +80,9 @@ def command(
     require_installed("swath strips", *(["matplotlib"] if output else []))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights import Wish
-    from swath.daemon.processing.flown import TrajectoryWish
-    from swath.daemon.processing.setup import Options
+    from swath.daemon.processing.flights.read import Wish
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.setup.setup import Options
 
     if cell is not None and not SMALLEST_CELL_M <= cell <= LARGEST_CELL_M:
         wanted = f"{SMALLEST_CELL_M:g} to {LARGEST_CELL_M:g} metres"
@@ -121,7 +121,7 @@ def _compare(
     as_json: bool,
 ) -> None:
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.strips_run import StripsWish, compare_strips, rules_of
+    from swath.daemon.processing.strips.compare import StripsWish, compare_strips, rules_of
 
     wish = StripsWish(logs.logs, logs, before, rules_of(*cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
@@ -136,8 +136,8 @@ def _adjust(
 ) -> None:
     from swath.daemon.processing.carried_verdict import refusal
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.strip_adjust_products import write_adjustment
-    from swath.daemon.processing.strip_adjust_run import AdjustWish, correct_strips
+    from swath.daemon.processing.strips.adjust import AdjustWish, correct_strips
+    from swath.daemon.processing.strips.adjust_products import write_adjustment
 
     wish = AdjustWish(logs, folder, control, strip_model, overwrite)
     with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:

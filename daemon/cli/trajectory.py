@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 
 def command(
@@ -57,10 +57,10 @@ def command(
     """
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
     from swath.daemon.config import load_config
-    from swath.daemon.processing.navigate import NavigateWish, arm_of_text, attitude_of_text
-    from swath.daemon.processing.navigation_inputs import INS_USES, InputWish
+    from swath.daemon.processing.navigation.inputs import INS_USES, InputWish
+    from swath.daemon.processing.navigation.navigate import NavigateWish, arm_of_text, attitude_of_text
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.trajectory_run import TrajectoryWish, make_trajectory
+    from swath.daemon.processing.trajectory.run import TrajectoryWish, make_trajectory
 
     if ins not in INS_USES:
         raise UserError(f'--ins: got "{ins}", want {", ".join(INS_USES)}', ExitCode.USAGE)

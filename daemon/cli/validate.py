@@ -12,7 +12,7 @@ import typer
 
 from swath.daemon.cli.options import AcceptVerdict, ForceTrajectory, TrajectoryDatum, TrajectoryPoint, TrajectoryWeek
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 from swath.daemon.text_files import text_of
 
 
@@ -63,11 +63,11 @@ def command(
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights import Wish
-    from swath.daemon.processing.flown import TrajectoryWish
+    from swath.daemon.processing.flights.read import Wish
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
     from swath.daemon.processing.progress import progress_bar
-    from swath.daemon.processing.setup import Options
-    from swath.daemon.processing.validate_run import ValidateWish, read_file, run_validation
+    from swath.daemon.processing.setup.setup import Options
+    from swath.daemon.processing.validation.run import ValidateWish, read_file, run_validation
 
     if not logs and not past:
         raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 
 def command(
@@ -64,9 +64,9 @@ def _make(
     from rich.console import Console
 
     from swath.daemon.processing.json_values import finite
-    from swath.daemon.processing.quicklook import look_at, numbers_of
-    from swath.daemon.processing.quicklook_page import make_page
-    from swath.daemon.processing.quicklook_read import QuickLookError
+    from swath.daemon.processing.quicklook.page import make_page
+    from swath.daemon.processing.quicklook.read import QuickLookError
+    from swath.daemon.processing.quicklook.run import look_at, numbers_of
 
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     first = paths[0]

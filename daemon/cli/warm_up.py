@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from swath.daemon.processing.installed import require_installed
+from swath.daemon.processing.requirements import require_installed
 
 
 def command(
@@ -22,7 +22,7 @@ def command(
     """
     require_installed("swath warm-up")
     from swath.daemon.config import load_config
-    from swath.daemon.processing.setup import Options, Setup
+    from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import warm_up
 
     setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]

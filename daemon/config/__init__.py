@@ -1,7 +1,7 @@
 """The configuration: one TOML file, validated whole before anything starts."""
 
 from swath.daemon.config.config import Config, DeviceEntry, DeviceTable
-from swath.daemon.config.loading import load_config, parse_config
+from swath.daemon.config.load import load_config, parse_config
 from swath.daemon.config.tables import (
     AtmosphereConfig,
     AttitudeConfig,

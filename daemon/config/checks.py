@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from pydantic import BaseModel
 
-from swath.daemon.config.calibration_file import check_calibration
+from swath.daemon.config.calibration import check_calibration
 from swath.daemon.config.config import Config, DeviceTable
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
 from swath.drivers.driver import UnknownProtocolError, find_driver

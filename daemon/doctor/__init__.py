@@ -12,10 +12,10 @@ from shutil import disk_usage
 from swath.daemon.config import Config
 from swath.daemon.doctor import clock, devices, disk, host
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
-from swath.daemon.host_clock import read_clock_discipline
 from swath.daemon.log.claim import is_being_written
-from swath.daemon.parts import read_sign
-from swath.daemon.places import nearest_there
+from swath.daemon.log.directory import nearest_there
+from swath.daemon.log.host_clock import read_clock_discipline
+from swath.daemon.log.parts import read_sign
 from swath.drivers.transports.can_bitrate import interface_bitrate
 from swath.drivers.transports.spec import TransportSpec
 from swath.drivers.transports.udp_socket import DEFAULT_BUFFER_MB

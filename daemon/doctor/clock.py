@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import PurePosixPath
 
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
-from swath.daemon.host_clock import STEP_NOTICED_NS, ClockDiscipline, read_clock_pair, read_clock_sample
+from swath.daemon.log.host_clock import STEP_NOTICED_NS, ClockDiscipline, read_clock_pair, read_clock_sample
 
 KEEPERS = {"chronyd": "chrony", "ntpd": "ntpd", "systemd-timesyn": "systemd-timesyncd", "openntpd": "openntpd"}
 STEPPERS = ("systemd-timesyncd", "openntpd", "ntpd")  # step whenever they find the clock far off

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from mcap import records
 
-from swath.daemon.log.chunks import LogBatch, chunk_batches
 from swath.daemon.log.format import MAGIC, SESSION_METADATA, ChannelSpec, LogError, SessionInfo
-from swath.daemon.log.scan import (
+from swath.daemon.log.mcap.chunks import LogBatch, chunk_batches
+from swath.daemon.log.mcap.scan import (
     MAX_RECORD_BYTES,
     OP_ATTACHMENT,
     OP_CHUNK,
@@ -27,7 +27,7 @@ from swath.daemon.log.scan import (
     parse_record,
     unpack_chunk,
 )
-from swath.daemon.parts import Sign, read_sign
+from swath.daemon.log.parts import Sign, read_sign
 
 EVENT_CHUNKS = 100  # of a part, the latest: what is shown of the time before the following began
 _HEAD = struct.Struct("<BQ")

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from mcap import records
 
-from swath.daemon.log.chunks import LogBatch, TopicFilter, chunk_batches, damage_within, take_description
 from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.format import PROFILE, SESSION_METADATA, ChannelSpec, LogError, SessionInfo
-from swath.daemon.log.scan import (
+from swath.daemon.log.mcap.chunks import LogBatch, TopicFilter, chunk_batches, damage_within, take_description
+from swath.daemon.log.mcap.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
     OP_CHUNK,

@@ -17,13 +17,12 @@ from typing import BinaryIO
 
 from mcap import records
 
-from swath.daemon.log.chunks import chunk_batches, damage_within, take_description
 from swath.daemon.log.claim import claim, is_being_written, stands_at
 from swath.daemon.log.durable import sync_directory
-from swath.daemon.log.encode import encode_raw
 from swath.daemon.log.format import SCHEMAS, SESSION_METADATA, ChannelSpec, LogError
-from swath.daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
-from swath.daemon.log.scan import (
+from swath.daemon.log.mcap.chunks import chunk_batches, damage_within, take_description
+from swath.daemon.log.mcap.encode import encode_raw
+from swath.daemon.log.mcap.scan import (
     OP_ATTACHMENT,
     OP_CHANNEL,
     OP_CHUNK,
@@ -37,7 +36,8 @@ from swath.daemon.log.scan import (
     scan,
     summary_records,
 )
-from swath.daemon.log.writer import PartWriter, create_exclusively
+from swath.daemon.log.mcap.writer import PartWriter, create_exclusively
+from swath.daemon.log.reader import MAX_DAMAGE, RECOVERED, read_part_head
 
 UNFINISHED = ".part"  # behind the name of a copy that is not whole yet
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.navigation_figures import figures_of
-from swath.daemon.processing.navigation_series import Flight, separation_of
-from swath.daemon.processing.navigation_verdict import Level, judge
+from swath.daemon.processing.trajectory.figures import figures_of
+from swath.daemon.processing.trajectory.series import Flight, separation_of
+from swath.daemon.processing.trajectory.verdict import Level, judge
 from swath.georef.scanner.calibration import INDEX
 
 if TYPE_CHECKING:
-    from swath.daemon.processing.navigate import Navigated
-    from swath.daemon.processing.setup import Setup
+    from swath.daemon.processing.navigation.navigate import Navigated
+    from swath.daemon.processing.setup.setup import Setup
     from swath.georef.scanner.calibration import Calibration
     from swath.georef.trajectory.trajectory import Trajectory
 

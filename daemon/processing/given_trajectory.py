@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.daemon.processing.navigation_observations import fix_observations, gps_times
+from swath.daemon.processing.navigation.observations import fix_observations, gps_times
 from swath.georef.agreement import (
     MUCH_BETTER,
     Apart,
@@ -29,8 +29,8 @@ from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from swath.daemon.processing.feed import LogClocks
-    from swath.daemon.processing.setup import Setup
+    from swath.daemon.processing.points.feed import LogClocks
+    from swath.daemon.processing.setup.setup import Setup
     from swath.georef.trajectory.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chunks
 from swath.daemon.log.reader import PartDamage
-from swath.daemon.processing.log_index import SCANNER, ChunkPlace, LogIndex, read_chunks
-from swath.daemon.replay import source_of_topic
+from swath.daemon.replay.units import source_of_topic
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     ChunkBatch,
@@ -41,7 +41,7 @@ from swath.georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
 from swath.georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 
 if TYPE_CHECKING:
-    from swath.daemon.processing.setup import Setup
+    from swath.daemon.processing.setup.setup import Setup
 
 LOOKED_AT_BYTES = 96 << 20  # of a log's scanner chunks, in pieces
 PIECES = 12

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from swath.daemon.errors import UserError
-from swath.daemon.processing.feed import read_clocks
-from swath.daemon.processing.navigation_log import session_holes
-from swath.daemon.processing.navigation_sources import config_of_log, files_of, without_scanners
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.navigation.log import session_holes
+from swath.daemon.processing.navigation.sources import config_of_log, files_of, without_scanners
+from swath.daemon.processing.points.feed import read_clocks
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from swath.daemon.config.loading import describe, shown
+from swath.daemon.config.load import describe, shown
 from swath.daemon.config.tables import Section
 from swath.daemon.errors import ConfigError
 from swath.daemon.text_files import text_of

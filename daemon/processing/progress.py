@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from swath.daemon.transfer_bar import transfer_bar
+from swath.daemon.cli.progress import transfer_bar
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 

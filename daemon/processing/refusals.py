@@ -19,9 +19,9 @@ from swath.georef.trajectory.trajectory import gps_text
 
 if TYPE_CHECKING:
     from swath.daemon.config.config import Config
-    from swath.daemon.processing.feed import LogClocks
-    from swath.daemon.processing.flights import Flight
-    from swath.daemon.processing.setup import Options
+    from swath.daemon.processing.flights.read import Flight
+    from swath.daemon.processing.points.feed import LogClocks
+    from swath.daemon.processing.setup.setup import Options
     from swath.georef.timescales import ClockStatus, Stamps
     from swath.georef.trajectory.trajectory import Trajectory
 
@@ -102,7 +102,7 @@ def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
 
 
 def _datum_of(config: Config) -> str | None:
-    """As `swath.daemon.processing.setup.Setup` takes it."""
+    """As `swath.daemon.processing.setup.setup.Setup` takes it."""
     return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
 
 

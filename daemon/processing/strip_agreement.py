@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from swath.calib.flight import Flight
 from swath.calib.strips.standards import ASPRS_2014, TO_CONFIRM, USGS, Judged, best_of, judge
 from swath.calib.summary import DifferenceMap, PairDifference
-from swath.daemon.processing.quicklook_read import Block
-from swath.daemon.processing.quicklook_strips import (
+from swath.daemon.processing.quicklook.read import Block
+from swath.daemon.processing.quicklook.strips import (
     FEWEST_CELLS,
     FEWEST_PLACES,
     STEEPEST_DEG,

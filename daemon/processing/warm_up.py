@@ -27,10 +27,10 @@ import pyproj
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import SessionInfo
-from swath.daemon.processing.live_frame import LocalFrame, Maps
-from swath.daemon.processing.live_grid import CountGrid, count_points
-from swath.daemon.processing.live_products import Thinning
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.live.frame import LocalFrame, Maps
+from swath.daemon.processing.live.grid import CountGrid, count_points
+from swath.daemon.processing.live.products import Thinning
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_navigation import warm_navigation
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, Parser

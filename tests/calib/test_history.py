@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.calib.history_plots import history_png
 from swath.calib.validation.history import BORESIGHT, HistoryError, compare, history
+from swath.daemon.processing.calibration.report.history_picture import history_png
 from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 
 SIGMAS = np.radians([0.001, 0.001, 0.002])

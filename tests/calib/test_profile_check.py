@@ -18,7 +18,7 @@ from swath.calib.profiles.check import CHECK, check, compare
 from swath.calib.profiles.influence import influence
 from swath.calib.profiles.measure import KINDS, PARAMETER
 from swath.calib.profiles.stepwise import Given, Profile, survey
-from swath.calib.report_profiles import comparison_table, pictures, profiles_table
+from swath.daemon.processing.calibration.report.profiles import comparison_table, pictures, profiles_table
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables
 from tests.calib.roofs import exactly_known
 

@@ -29,7 +29,7 @@ from swath.calib.profiles.stepwise import (
     stepwise,
     survey,
 )
-from swath.calib.report_profiles import pictures
+from swath.daemon.processing.calibration.report.profiles import pictures
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables, only, retold, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -20,15 +20,15 @@ from swath.calib.labels import decimals_of, degrees, length, number, plain, shar
 from swath.calib.need import Need
 from swath.calib.outcome import Adjusted, Considered, ControlFit, GroupFit, Held
 from swath.calib.profiles.check import Check, Comparison
-from swath.calib.report import PairDifference, Profile, ReportInput, html, judge, pdf
-from swath.calib.report_canvas import NARROW, PAPER
-from swath.calib.report_cut_plots import cuts_of
-from swath.calib.report_map_plots import plane_rms_cm
-from swath.calib.report_pdf import width_in, wrapped
-from swath.calib.report_residual_plots import residual_picture, seen_of
-from swath.calib.report_tables import entries_table, held_table, parameter_tables
 from swath.calib.summary import Finding
 from swath.calib.verdict import Level, held_words
+from swath.daemon.processing.calibration.report.cuts import cuts_of
+from swath.daemon.processing.calibration.report.maps import plane_rms_cm
+from swath.daemon.processing.calibration.report.page import PairDifference, Profile, ReportInput, html, judge, pdf
+from swath.daemon.processing.calibration.report.pdf import width_in, wrapped
+from swath.daemon.processing.calibration.report.residuals import residual_picture, seen_of
+from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
+from swath.daemon.processing.pages.canvas import NARROW, PAPER
 from tests.calib.made_outcome import RISE, Outcome, made_outcome, made_report
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from swath.calib.flight import Flight
-from swath.daemon.processing.calibration_flight import read_flight
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.returns import read_flight
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.scanner.calibration import Calibration, read_calibration
 from swath.georef.trajectory.trajectory import Trajectory

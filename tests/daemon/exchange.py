@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.daemon.capture_files import Told, find_captures
-from swath.daemon.capture_routes import Routes
-from swath.daemon.captures import Capture
 from swath.daemon.config import Config, load_config
-from swath.daemon.importing import ImportReport, import_captures
-from swath.daemon.log.encode import encode_block
+from swath.daemon.exchange.capture_files import Told, find_captures
+from swath.daemon.exchange.captures import Capture
+from swath.daemon.exchange.import_ import ImportReport, import_captures
+from swath.daemon.exchange.routes import Routes
 from swath.daemon.log.format import ChannelSpec, SessionInfo
+from swath.daemon.log.mcap.encode import encode_block
+from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log.writer import PartWriter
 
 CONFIG = """
 [session]

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from swath.daemon.config import load_config
-from swath.daemon.run import record
+from swath.daemon.recorder.run import record
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from swath.daemon.events import Severity
+from swath.daemon.log.events import Severity
 
 
 class Said(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.daemon.processing.navigation_series import Flight
+from swath.daemon.processing.trajectory.series import Flight
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup, Solution

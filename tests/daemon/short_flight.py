@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from swath.daemon.config import Config, load_config
 from swath.daemon.log.reader import Session, open_logs
-from swath.daemon.sim_log import fly_into_log
+from swath.daemon.simulate.into_log import fly_into_log
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel.encoder import encode_log
 from swath.drivers.gnss.novatel.tables import CLOCK_VALID

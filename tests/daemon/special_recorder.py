@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from typing import NoReturn
 
-from swath.daemon.account import Account
-from swath.daemon.acquire import UnitReceiver
 from swath.daemon.config import load_config
-from swath.daemon.run import QUEUE_BYTES, record
+from swath.daemon.log.account import Account
+from swath.daemon.recorder.receivers import UnitReceiver
+from swath.daemon.recorder.run import QUEUE_BYTES, record
 
 SMALL_QUEUE_BYTES = 300_000
 _started_s = time.monotonic()

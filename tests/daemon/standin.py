@@ -130,7 +130,7 @@ def make_standin(*arguments: object) -> tuple[Standin, dict[str, bytes]]:
 
 
 def standin_for(wish: object) -> tuple[Standin, dict[str, bytes]]:
-    """In the place of `swath.daemon.sim_plans.make_flight_in_time`: a second."""
+    """In the place of `swath.daemon.simulate.plans.make_flight_in_time`: a second."""
     return Standin(1.0), {}
 
 

@@ -21,10 +21,10 @@ from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.search import find_planes
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing import calibrate_run
-from swath.daemon.processing.calibrate_model import model_of
-from swath.daemon.processing.calibrate_run import refuse_no_planes
-from swath.daemon.processing.calibration_plan import PlanWish, plan_calibration
+from swath.daemon.processing.calibration import run as calibrate_run
+from swath.daemon.processing.calibration.model import model_of
+from swath.daemon.processing.calibration.plan import PlanWish, plan_calibration
+from swath.daemon.processing.calibration.run import refuse_no_planes
 from swath.daemon.processing.warm_calibration import warm_calibration
 from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.calibration import Calibration, read_calibration

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from swath.calib.profiles.check import Check, Comparison
-from swath.daemon.processing.calibrate_model import model_of
-from swath.daemon.processing.calibrate_products import strips_say, validation_says, write_products
-from swath.daemon.processing.calibrate_run import Calibrated, CalibrateWish, calibrate
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.model import model_of
+from swath.daemon.processing.calibration.products import strips_say, validation_says, write_products
+from swath.daemon.processing.calibration.run import Calibrated, CalibrateWish, calibrate
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from swath.georef.trajectory.trajectory import Trajectory

@@ -11,8 +11,8 @@ import pytest
 
 from swath.calib.ties.picked import PickedError
 from swath.daemon.errors import UserError
-from swath.daemon.processing.calibrate_inputs import PolygonError, read_polygons, rings_of, ties_of
-from swath.daemon.processing.calibration_flight import refuse_without_noise
+from swath.daemon.processing.calibration.inputs import PolygonError, read_polygons, rings_of, ties_of
+from swath.daemon.processing.calibration.returns import refuse_without_noise
 from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.uncertainty import Noise
 from tests.calib.analytic_scene import Line, Scanner, fly, gables

@@ -11,7 +11,14 @@ import pytest
 
 from swath.calib.parameters import Wish
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibrate_model import file_of, in_words, key_of, model_of, of_parameters, tables_in_words
+from swath.daemon.processing.calibration.model import (
+    file_of,
+    in_words,
+    key_of,
+    model_of,
+    of_parameters,
+    tables_in_words,
+)
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/calibration.md"
 DEG = math.pi / 180.0

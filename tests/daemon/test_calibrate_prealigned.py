@@ -18,7 +18,7 @@ from swath.calib.outcome import Considered
 from swath.calib.parameters import Wish
 from swath.calib.planes.search import find_planes
 from swath.calib.summary import Finding
-from swath.daemon.processing.calibrate_run import COARSE_RAD, _aligned, prealigned_otherwise
+from swath.daemon.processing.calibration.run import COARSE_RAD, _aligned, prealigned_otherwise
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
 

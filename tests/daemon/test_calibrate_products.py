@@ -14,10 +14,10 @@ from swath.calib.need import POINT, need_of
 from swath.calib.verdict import Level as CalibrationLevel
 from swath.calib.verdict import judge, wanted_of
 from swath.daemon.config import parse_config
-from swath.daemon.processing.calibrate_products import _header, _wanted, trajectory_says
-from swath.daemon.processing.calibrate_run import Calibrated
+from swath.daemon.processing.calibration.products import _header, _wanted, trajectory_says
+from swath.daemon.processing.calibration.run import Calibrated
 from swath.daemon.processing.carried_verdict import Carried
-from swath.daemon.processing.navigation_verdict import Level
+from swath.daemon.processing.trajectory.verdict import Level
 from tests.calib.made_outcome import made_outcome, made_report
 
 pytestmark = pytest.mark.xdist_group("kernels")

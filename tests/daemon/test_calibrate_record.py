@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from swath.calib.record.record import told_value
-from swath.daemon.processing.calibrate_record import instruments_of
-from swath.daemon.processing.calibration_flight import read_flight
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.setup import Options
+from swath.daemon.processing.calibration.record import instruments_of
+from swath.daemon.processing.calibration.returns import read_flight
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

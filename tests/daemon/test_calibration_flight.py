@@ -11,13 +11,14 @@ import pytest
 
 from swath.calib.flight import Flight
 from swath.daemon.cli.main import run_app
-from swath.daemon.processing import calibration_flight, flights
-from swath.daemon.processing.calibration_flight import read_flight
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish, offset_of
-from swath.daemon.processing.jobs import JobResult
-from swath.daemon.processing.setup import Options, Setup
-from swath.daemon.processing.workers import run_jobs
+from swath.daemon.processing.calibration import returns as calibration_flight
+from swath.daemon.processing.calibration.returns import read_flight
+from swath.daemon.processing.flights import read as flights
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, offset_of
+from swath.daemon.processing.points.jobs import JobResult
+from swath.daemon.processing.points.workers import run_jobs
+from swath.daemon.processing.setup.setup import Options, Setup
 from tests.calib.village import Made, village
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

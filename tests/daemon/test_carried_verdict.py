@@ -24,8 +24,8 @@ from swath.daemon.processing.carried_verdict import (
     trajectory_entry,
     verdict_entry,
 )
-from swath.daemon.processing.navigation_verdict import Level
-from swath.daemon.processing.setup import Setup
+from swath.daemon.processing.setup.setup import Setup
+from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.georef.flown import flown
 

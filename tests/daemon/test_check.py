@@ -21,9 +21,9 @@ import can
 import numpy as np
 import pytest
 
-from swath.daemon.check import Report, bitrate_problems, check_everything
 from swath.daemon.config import DeviceEntry, parse_config
-from swath.daemon.identify import describe_tag, identify
+from swath.daemon.devices.check import Report, bitrate_problems, check_everything
+from swath.daemon.devices.identify import describe_tag, identify
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.opening import read_pcap
 from swath.drivers.parser import DeviceSettings

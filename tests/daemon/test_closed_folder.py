@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.daemon.places import nearest_there
+from swath.daemon.log.directory import nearest_there
 from tests.daemon.rig import HANGS_S, session_table
 from tests.daemon.test_cli import ROOT
 
@@ -20,7 +20,7 @@ from tests.daemon.test_cli import ROOT
 AS_NOBODY = """
 import json, os, sys
 from pathlib import Path
-from swath.daemon.check import check_directory
+from swath.daemon.devices.check import check_directory
 from swath.daemon.config import parse_config
 from swath.daemon.doctor import Tree, disk, examine
 from swath.daemon.doctor.devices import User

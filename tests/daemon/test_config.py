@@ -17,10 +17,10 @@ from pydantic import BaseModel
 
 from swath.daemon.config import Config, Tables, load_config, parse_config
 from swath.daemon.config.checks import rotation_problem, same_wire
-from swath.daemon.config.loading import MAX_CONFIG_BYTES, _model_in, validate
+from swath.daemon.config.load import MAX_CONFIG_BYTES, _model_in, validate
 from swath.daemon.errors import ConfigError, ExitCode, UserError
-from swath.daemon.log_parsers import stored_parsers
-from swath.daemon.processing.models import mount_of
+from swath.daemon.log.parsers import stored_parsers
+from swath.daemon.processing.setup.models import mount_of
 from swath.drivers.driver import all_drivers
 from swath.drivers.transports.spec import parse_transport
 

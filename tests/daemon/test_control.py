@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from swath.daemon.control import LINE_BYTES, NOTE_CHARACTERS, NOTES_AT_ONCE, NOTES_PER_S, SPLITS_AT_ONCE, Control
+from swath.daemon.recorder.control import (
+    LINE_BYTES,
+    NOTE_CHARACTERS,
+    NOTES_AT_ONCE,
+    NOTES_PER_S,
+    SPLITS_AT_ONCE,
+    Control,
+)
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table, wait_until
@@ -29,7 +36,7 @@ from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recorder_faults import Numbers, scanner
 
 if TYPE_CHECKING:
-    from swath.daemon.run import Assembly
+    from swath.daemon.recorder.run import Assembly
 
 NOBODY = 65534
 CONNECT_AS = """
@@ -39,8 +46,8 @@ print(socket.socket(socket.AF_UNIX).connect_ex(sys.argv[1]))
 """
 RUN_AS = """
 import os, sys
-import swath.daemon.cli.main, swath.daemon.config, swath.daemon.control_client
-import swath.daemon.monitor, swath.daemon.offload, rich.live, rich.progress
+import swath.daemon.cli.main, swath.daemon.config, swath.daemon.recorder.control_client
+import swath.daemon.monitor.display, swath.daemon.exchange.offload, rich.live, rich.progress
 swath.daemon.cli.main.make_app(None)
 os.setgroups([]); os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))
 sys.exit(swath.daemon.cli.main.run_app(sys.argv[2:]))

@@ -14,15 +14,15 @@ from pathlib import Path
 
 import pytest
 
-from swath.daemon.block_queue import BlockQueue
-from swath.daemon.channels import ChannelTable
-from swath.daemon.check import check_everything
 from swath.daemon.config import parse_config
-from swath.daemon.config.loading import validate
-from swath.daemon.corrections import MOST_WAITING, Relay
+from swath.daemon.config.load import validate
+from swath.daemon.devices.check import check_everything
 from swath.daemon.errors import ConfigError
-from swath.daemon.events import Events
-from swath.daemon.host_clock import HostClock
+from swath.daemon.log.block_queue import BlockQueue
+from swath.daemon.log.channels import ChannelTable
+from swath.daemon.log.events import Events
+from swath.daemon.log.host_clock import HostClock
+from swath.daemon.recorder.corrections import MOST_WAITING, Relay
 from tests.daemon.commands import swath
 from tests.daemon.journal import journal_of
 from tests.daemon.log_check import official_counts, read_log

@@ -22,8 +22,8 @@ from typing import Any
 import can
 import pytest
 
+from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log_parsers import stored_parsers
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.scanner.srep.parser import SrepHeader, encode_datagram
 from swath.georef.records import ChunkBatch, DeviceClockSamples, Record

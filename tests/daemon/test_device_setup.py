@@ -13,7 +13,7 @@ from pyubx2 import SET, UBXReader
 
 from swath.daemon.cli import setup
 from swath.daemon.config import parse_config
-from swath.daemon.device_setup import DeviceSetup, Outcome, apply_setup, plan_setup
+from swath.daemon.devices.setup import DeviceSetup, Outcome, apply_setup, plan_setup
 from swath.daemon.errors import ExitCode, UserError
 from swath.drivers.transports import spec as uri
 from tests.daemon.commands import swath

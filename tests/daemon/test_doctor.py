@@ -15,7 +15,7 @@ import pytest
 from swath.daemon.config import parse_config
 from swath.daemon.doctor import _specs, clock, devices, disk, host, needed_modules
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
-from swath.daemon.host_clock import STA_UNSYNC, ClockDiscipline
+from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from tests.daemon.rig import session_table
 from tests.daemon.test_cli import ROOT, swath
 from tests.daemon.test_doctor_chrony import DEBIAN_CHRONY

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.daemon.processing.navigation_inputs import _missing
-from swath.daemon.processing.navigation_times import ImuTimes, Stretch
+from swath.daemon.processing.navigation.inputs import _missing
+from swath.daemon.processing.navigation.times import ImuTimes, Stretch
 from swath.georef.navigation.samples import Sampler
 from swath.georef.records import IMU_DTYPE, Int64Array
 

@@ -22,9 +22,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swath.daemon.config import Config, load_config
-from swath.daemon.exporting import MANIFEST, ExportReport, export_session
+from swath.daemon.exchange.export import MANIFEST, ExportReport, export_session
+from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.reader import open_logs
-from swath.daemon.sidecar import SUFFIX
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
 from tests.daemon.commands import swath

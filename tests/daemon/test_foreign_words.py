@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from swath.daemon import control_client
-from swath.daemon.control_client import ask
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.monitor_source import usable_status
-from swath.daemon.parts import RECORDING_SIGN, read_sign
-from swath.daemon.processing.live_follow import _parts_before
+from swath.daemon.log.parts import RECORDING_SIGN, read_sign
+from swath.daemon.monitor.source import usable_status
+from swath.daemon.processing.live.follow import _parts_before
+from swath.daemon.recorder import control_client
+from swath.daemon.recorder.control_client import ask
 
 ANSWER = {"ok": True, "session_id": "a", "part": 3, "recording": True, "reason": "", "time_ns": 5, "text": "x"}
 SIGN = {"session_id": "a-20261121T100000Z-ab12", "part": 1, "path": "a_1.mcap", "boot_id": "b"}

@@ -16,8 +16,8 @@ import pytest
 from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
+from swath.daemon.log.chunk_index import index_log
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.log_index import index_log
 from swath.georef.formats.sbet import sbet_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.timescales.gps_time import DAY_NS
@@ -256,8 +256,8 @@ class TestPartial:
         def interrupted(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("swath.daemon.processing.products.write_sidecar", interrupted)
-        monkeypatch.setattr("swath.daemon.processing.products._write_trajectory", interrupted)
+        monkeypatch.setattr("swath.daemon.processing.georeferencing.run.write_sidecar", interrupted)
+        monkeypatch.setattr("swath.daemon.processing.georeferencing.run._write_trajectory", interrupted)
         assert run_app(flown.arguments(tmp_path / "out")) == 130
         assert list((tmp_path / "out").iterdir()) == []
 
@@ -371,7 +371,7 @@ class TestRefusals:
         more: tuple[str, str],
         words: str,
     ) -> None:
-        monkeypatch.setattr("swath.daemon.processing.workers.CONNECT_S", 1)
+        monkeypatch.setattr("swath.daemon.processing.points.workers.CONNECT_S", 1)
         assert words in refused(capsys, tmp_path / "out", flown.arguments(tmp_path / "out", *more))
 
     def test_a_calibration_of_another_head_or_atmosphere(
@@ -407,7 +407,7 @@ class TestRefusals:
     def test_earth_centred_coordinates_are_no_map(
         self, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("swath.daemon.processing.flights.read_clocks", None)  # before any work
+        monkeypatch.setattr("swath.daemon.processing.flights.read.read_clocks", None)  # before any work
         arguments = flown.arguments(tmp_path / "out")
         arguments[arguments.index("--crs") + 1] = "EPSG:4978"
         line = refused(capsys, tmp_path / "out", arguments)

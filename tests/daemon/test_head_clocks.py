@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swath.daemon.capture_routes import Routes
-from swath.daemon.captures import ImportUnit
 from swath.daemon.config import Config, parse_config
 from swath.daemon.errors import UserError
-from swath.daemon.importing import ImportLog
+from swath.daemon.exchange.captures import ImportUnit
+from swath.daemon.exchange.import_ import ImportLog
+from swath.daemon.exchange.routes import Routes
+from swath.daemon.log.chunk_index import index_log
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.feed import read_clocks
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
-from swath.daemon.processing.log_index import index_log
+from swath.daemon.processing.points.feed import read_clocks
 from swath.daemon.processing.refusals import refuse_no_time, time_trouble
-from swath.daemon.processing.setup import Setup
+from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.scanner.hesai.gps import encode_gps_packet
 from swath.drivers.scanner.hesai.parser import encode_point_packet
 from swath.drivers.scanner.velodyne.parser import encode_data_packet

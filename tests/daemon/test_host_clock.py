@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from swath.daemon.host_clock import (
+from swath.daemon.log.host_clock import (
     STA_UNSYNC,
     ClockDiscipline,
     ClockPair,

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.daemon.capture_files import Told
 from swath.daemon.errors import UserError
-from swath.daemon.exporting import export_session
+from swath.daemon.exchange.capture_files import Told
+from swath.daemon.exchange.export import export_session
+from swath.daemon.exchange.sidecar import read_sidecar, sidecar_of
+from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
-from swath.daemon.places import take_directory
-from swath.daemon.replay import timed_units
-from swath.daemon.sidecar import read_sidecar, sidecar_of
+from swath.daemon.replay.units import timed_units
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.base import CaptureDamageError
 from swath.drivers.captures.opening import read_candump, read_pcap, read_serial

@@ -24,18 +24,18 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.config import Config, load_config
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.errors import UserError
-from swath.daemon.log.chunks import LogBatch
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.parts import RECORDING_SIGN
 from swath.daemon.log.reader import Session, open_logs
-from swath.daemon.parts import RECORDING_SIGN
-from swath.daemon.processing import live as live_module
-from swath.daemon.processing import live_follow
-from swath.daemon.processing.feed import TICK_BYTES, TICK_NS
-from swath.daemon.processing.live import Live, LiveSession, Told, replay
-from swath.daemon.processing.live_points import POINT_DTYPE
-from swath.daemon.processing.live_status import LiveStatus, sentence
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.live import follow as live_follow
+from swath.daemon.processing.live import session as live_module
+from swath.daemon.processing.live.points import POINT_DTYPE
+from swath.daemon.processing.live.session import Live, LiveSession, Told, replay
+from swath.daemon.processing.live.status import LiveStatus, sentence
+from swath.daemon.processing.points.feed import TICK_BYTES, TICK_NS
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import WarmUp
-from swath.daemon.sim_log import fly_into_log
+from swath.daemon.simulate.into_log import fly_into_log
 from swath.georef.points import Fate
 from swath.georef.stream.clocks import DevicePlan
 from swath.georef.timescales import ClockStatus, TimeState
@@ -420,8 +420,8 @@ class TestCommand:
                 return {"state": "ended (stopped)"}
 
         monkeypatch.setattr("swath.daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
-        monkeypatch.setattr("swath.daemon.processing.live.be_humble", lambda: None)
-        monkeypatch.setattr("swath.daemon.processing.live.Live", Nothing)
+        monkeypatch.setattr("swath.daemon.processing.live.session.be_humble", lambda: None)
+        monkeypatch.setattr("swath.daemon.processing.live.session.Live", Nothing)
         assert run_app(["live", str(tmp_path)]) == 0
         told = capfd.readouterr()
         assert told.out == ""

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swath.daemon.log.chunks import LogBatch
-from swath.daemon.log.encode import encode_block
 from swath.daemon.log.format import SessionInfo
-from swath.daemon.log.writer import PartWriter
-from swath.daemon.parts import RECORDING_SIGN
-from swath.daemon.processing import live_follow
-from swath.daemon.processing.live_follow import LiveFollower, Skipped, cached_from, is_cached
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.mcap.encode import encode_block
+from swath.daemon.log.mcap.writer import PartWriter
+from swath.daemon.log.parts import RECORDING_SIGN
+from swath.daemon.processing.live import follow as live_follow
+from swath.daemon.processing.live.follow import LiveFollower, Skipped, cached_from, is_cached
 from tests.daemon.test_log import INFO, ROVER, SCANNER, START_NS
 
 SECOND_NS = 1_000_000_000

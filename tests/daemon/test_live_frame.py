@@ -11,10 +11,10 @@ from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import LiveConfig
-from swath.daemon.processing.live_frame import LocalFrame
-from swath.daemon.processing.live_mcap import NAME
-from swath.daemon.processing.live_points import PointsFile
-from swath.daemon.processing.live_products import LiveProducts, Room
+from swath.daemon.processing.live.frame import LocalFrame
+from swath.daemon.processing.live.mcap import NAME
+from swath.daemon.processing.live.points import PointsFile
+from swath.daemon.processing.live.products import LiveProducts, Room
 from tests.daemon.test_live_products import SECOND_NS, Utm, flight, points_at, read_back
 
 pytestmark = pytest.mark.xdist_group("kernels")

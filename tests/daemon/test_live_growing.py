@@ -16,8 +16,8 @@ import pytest
 
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.live import Told, replay
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.live.session import Told, replay
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
 from tests.daemon.rig import HANGS_S, Recorder, session_table, wait_until
 from tests.daemon.test_cli import ROOT

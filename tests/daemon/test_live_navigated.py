@@ -15,8 +15,8 @@ from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.log.reader import Session, open_logs
-from swath.daemon.processing.feed import LogFeed
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.points.feed import LogFeed
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
 from swath.georef.points import Points
 from tests.daemon.rig import HANGS_S, Recorder, wait_until

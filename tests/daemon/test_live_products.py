@@ -18,9 +18,9 @@ from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import LiveConfig
-from swath.daemon.processing.live_grid import TILE, CountGrid
-from swath.daemon.processing.live_mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
-from swath.daemon.processing.live_products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
+from swath.daemon.processing.live.grid import TILE, CountGrid
+from swath.daemon.processing.live.mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
+from swath.daemon.processing.live.products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
 from swath.georef.points import Points
 from swath.georef.trajectory.trajectory import Trajectory
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from swath.daemon.errors import UserError
-from swath.daemon.places import LOCK, take_directory
+from swath.daemon.log.directory import LOCK, take_directory
 from tests.daemon.rig import HANGS_S
 from tests.daemon.test_cli import ROOT
 
@@ -19,7 +19,7 @@ AS_NOBODY = """
 import os, sys
 from pathlib import Path
 from swath.daemon.errors import UserError
-from swath.daemon.places import take_directory
+from swath.daemon.log.directory import take_directory
 
 os.chdir(sys.argv[1])  # what lies above may be closed to others
 os.setgroups([]); os.setgid(65534); os.setuid(65534)

@@ -23,12 +23,12 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
 from swath.daemon.log.claim import claim, is_being_written
-from swath.daemon.log.encode import encode_block, encode_json
 from swath.daemon.log.format import ChannelSpec, LogError, SessionInfo, safe_attachment_path
+from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.mcap.scan import MAX_CHUNK_BYTES, Damage, scan, unpack_chunk
+from swath.daemon.log.mcap.writer import LogWriteError, PartWriter
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.log.recover import examine, recover
-from swath.daemon.log.scan import MAX_CHUNK_BYTES, Damage, scan, unpack_chunk
-from swath.daemon.log.writer import LogWriteError, PartWriter
 
 START_NS = 1_800_000_000_000_000_000
 INFO = SessionInfo("flight-20261121T100000Z-ab12", "swath test", "host", "boot", START_NS, 1000)

@@ -8,9 +8,9 @@ from itertools import groupby
 import numpy as np
 import pytest
 
-from swath.daemon.log.chunks import ONE_BY_ONE, chunk_batches
-from swath.daemon.log.encode import encode_block
 from swath.daemon.log.format import ChannelSpec
+from swath.daemon.log.mcap.chunks import ONE_BY_ONE, chunk_batches
+from swath.daemon.log.mcap.encode import encode_block
 
 CHANNELS = {
     number: ChannelSpec(f"/scanner/{name}/raw", "x-swath-udp", {"protocol": "srep"}, None, "scanner")

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from small_mcap import get_summary, read_message
 
-from swath.daemon.log.encode import encode_block, encode_json
 from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.mcap.scan import Damage, Record, scan, unpack_chunk
+from swath.daemon.log.mcap.writer import LogWriteError, PartWriter
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import examine, recover
-from swath.daemon.log.scan import Damage, Record, scan, unpack_chunk
-from swath.daemon.log.writer import LogWriteError, PartWriter
 from tests.daemon.commands import swath
 from tests.daemon.rig import session_table
 from tests.daemon.test_cli import ROOT

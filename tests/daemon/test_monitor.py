@@ -25,13 +25,13 @@ import pytest
 from rich.console import Console
 
 from swath.daemon.cli.monitor import page, time_text
-from swath.daemon.log.encode import encode_block
 from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.mcap.encode import encode_block
+from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log.writer import PartWriter
-from swath.daemon.monitor import Monitor
-from swath.daemon.monitor_source import Decoding
-from swath.daemon.run import read_boot_id
+from swath.daemon.monitor.display import Monitor
+from swath.daemon.monitor.source import Decoding
+from swath.daemon.recorder.run import read_boot_id
 from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record

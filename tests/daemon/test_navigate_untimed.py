@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swath.daemon.processing.navigate import NavigateWish, navigate_session
-from swath.daemon.processing.navigation_inputs import InputWish
+from swath.daemon.processing.navigation.inputs import InputWish
+from swath.daemon.processing.navigation.navigate import NavigateWish, navigate_session
 from swath.georef.timescales import SECOND_NS
 from tests.calib.village import HEADER, LINE, LINES
 from tests.daemon.short_flight import fly_short

@@ -15,9 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from swath.daemon.processing.navigation_page import PICTURES, write_page
-from swath.daemon.processing.navigation_plots import FATE_LOOK, FIX_LOOK, draw_innovations, draw_map
-from swath.daemon.processing.navigation_series import (
+from swath.daemon.processing.trajectory.page import PICTURES, write_page
+from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn
+from swath.daemon.processing.trajectory.pictures import FATE_LOOK, FIX_LOOK, draw_innovations, draw_map
+from swath.daemon.processing.trajectory.series import (
     COLUMNS,
     Flight,
     Pixels,
@@ -27,7 +28,6 @@ from swath.daemon.processing.navigation_series import (
     outages_of,
     separation_of,
 )
-from swath.daemon.processing.navigation_sheet import NARROW, WIDE, Drawn
 from swath.georef.navigation.inputs import Fate, Kind, Solution
 from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from swath.daemon.processing.navigation_figures import CHI2_MEDIAN, Figures, figures_of
-from swath.daemon.processing.navigation_page import summary_of
-from swath.daemon.processing.navigation_series import Flight, separation_of
-from swath.daemon.processing.navigation_verdict import RULES, Level, judge
+from swath.daemon.processing.trajectory.figures import CHI2_MEDIAN, Figures, figures_of
+from swath.daemon.processing.trajectory.page import summary_of
+from swath.daemon.processing.trajectory.series import Flight, separation_of
+from swath.daemon.processing.trajectory.verdict import RULES, Level, judge
 from swath.georef.navigation.diagnosis.diagnose import Finding
 from swath.georef.navigation.inputs import Fate, Kind
 from swath.georef.timescales.gps_time import SECOND_NS

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swath.daemon.log.chunks import LogBatch
-from swath.daemon.processing.feed import LogFeed
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.processing.points.feed import LogFeed
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE
 from swath.georef.points import Fate, Points
 from swath.georef.timescales import SECOND_NS

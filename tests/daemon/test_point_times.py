@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swath.daemon.processing.point_times import PointClock, PointTimes, TimeKind, point_times_of, time_notes
-from swath.daemon.processing.quicklook import look_at
+from swath.daemon.processing.quicklook.run import look_at
 from swath.georef.timescales.gps_time import WEEK_NS
 from tests.daemon.test_quicklook import lattice, write
 

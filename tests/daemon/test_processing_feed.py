@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 
 from swath.daemon.config import Config, load_config
-from swath.daemon.log import scan as scan_module
-from swath.daemon.log.chunks import LogBatch
 from swath.daemon.log.follow import PartFollower
 from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.mcap import scan as scan_module
+from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session, open_logs
-from swath.daemon.processing import feed as feed_module
-from swath.daemon.processing.feed import LogClocks, LogFeed, Placed, read_clocks
-from swath.daemon.processing.models import TerrainRanges
-from swath.daemon.processing.setup import Options, Setup
-from swath.daemon.sim_log import fly_into_log
+from swath.daemon.processing.points import feed as feed_module
+from swath.daemon.processing.points.feed import LogClocks, LogFeed, Placed, read_clocks
+from swath.daemon.processing.setup.models import TerrainRanges
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.simulate.into_log import fly_into_log
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.points import Fate
 from swath.georef.records import ChunkBatch, Int64Array, Record, StructArray

@@ -16,11 +16,12 @@ from typing import Any
 import pytest
 
 from swath.daemon.cli.main import run_app
+from swath.daemon.log.chunk_index import OP_CHUNK_INDEX, index_log, read_chunks
+from swath.daemon.log.mcap.scan import summary_records
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log.scan import summary_records
-from swath.daemon.processing import products, workers
-from swath.daemon.processing.jobs import Job, JobResult, SessionPlan, Tell, run_job
-from swath.daemon.processing.log_index import OP_CHUNK_INDEX, index_log, read_chunks
+from swath.daemon.processing.georeferencing import run as products
+from swath.daemon.processing.points import workers
+from swath.daemon.processing.points.jobs import Job, JobResult, SessionPlan, Tell, run_job
 from swath.georef.strips import Segment
 from tests.daemon.commands import ROOT
 from tests.daemon.one_line import Flown, fly
@@ -154,7 +155,7 @@ class TestWorkers:
         script = tmp_path / "script.py"
         call = "run_jobs([None], jobs, workers=2, scheduler=None, progress=lambda done: None, do=counts)"
         script.write_text(
-            "from swath.daemon.processing.workers import run_jobs\n"
+            "from swath.daemon.processing.points.workers import run_jobs\n"
             "from tests.daemon.test_processing_jobs import TestWorkers, counts\n"
             "jobs = TestWorkers().jobs(2)\n"
             + ('if __name__ == "__main__":\n' if guarded else "if True:\n")

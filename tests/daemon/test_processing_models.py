@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from swath.daemon.config import Config
 from swath.daemon.config.tables import GimbalConfig, ScannerConfig
 from swath.daemon.errors import ConfigError
-from swath.daemon.processing.models import (
+from swath.daemon.processing.setup.models import (
     connect,
     geometry_of,
     gimbal_sources,

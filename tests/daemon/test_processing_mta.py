@@ -17,7 +17,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import ScannerConfig
-from swath.daemon.processing.models import TerrainRanges, connect, make_resolver
+from swath.daemon.processing.setup.models import TerrainRanges, connect, make_resolver
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser

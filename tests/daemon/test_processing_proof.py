@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.daemon.config import parse_config
-from swath.daemon.processing.models import make_motion
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.setup.models import make_motion
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.points import Points
 from swath.georef.trajectory.trajectory import Trajectory

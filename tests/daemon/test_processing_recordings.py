@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import ScannerConfig
-from swath.daemon.processing.models import geometry_of
+from swath.daemon.processing.setup.models import geometry_of
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, PacketParser
 from swath.drivers.scanner.hesai.heads import XT32

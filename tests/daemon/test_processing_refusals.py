@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from swath.daemon.config.config import Config
-from swath.daemon.config.loading import parse_config
+from swath.daemon.config.load import parse_config
 from swath.daemon.errors import UserError
 from swath.daemon.processing import refusals
-from swath.daemon.processing.feed import LogClocks
-from swath.daemon.processing.setup import Options
-from swath.daemon.processing.sidecar import unit_doubts
+from swath.daemon.processing.georeferencing.sidecar import unit_doubts
+from swath.daemon.processing.points.feed import LogClocks
+from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.unread import Unread, unread_lines
 from swath.drivers.parser import Parser, ParserCounters
 from swath.georef.mapping.frame import Mapping

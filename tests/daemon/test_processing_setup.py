@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from swath.daemon.config import Config
 from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.format import SessionInfo
-from swath.daemon.processing.setup import Options, Setup
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.records import INS_DTYPE, NamesEdge
 from swath.georef.scanner.beams import LineGeometry, SpinningGeometry
 from swath.georef.stream.clocks import DevicePlan, GnssPlan, PpsPlan

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.daemon.config import ScannerConfig
-from swath.daemon.processing.models import make_motion
+from swath.daemon.processing.setup.models import make_motion
 from swath.georef.geodesy.earth import rot_e_from_l
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import PARAMETERS, read_calibration

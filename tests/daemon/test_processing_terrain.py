@@ -13,7 +13,7 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from swath.daemon.errors import ConfigError
-from swath.daemon.processing.terrain import read_terrain
+from swath.daemon.processing.setup.terrain import read_terrain
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 
 pytestmark = pytest.mark.xdist_group("kernels")

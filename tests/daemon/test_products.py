@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from swath.daemon.processing.products import _numbers
+from swath.daemon.processing.georeferencing.run import _numbers
 
 
 def session(*scanners: str) -> Any:

@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from swath.daemon.processing.quicklook import Look, look_at, numbers_of
-from swath.daemon.processing.quicklook_grids import Frame, frame_of, inner, round_up
-from swath.daemon.processing.quicklook_profile import steps_of
-from swath.daemon.processing.quicklook_read import BLOCK_POINTS, QuickLookError
-from swath.daemon.processing.quicklook_strips import MOMENTS, TILE, StripCells, _halved
+from swath.daemon.processing.quicklook.grids import Frame, frame_of, inner, round_up
+from swath.daemon.processing.quicklook.profile import steps_of
+from swath.daemon.processing.quicklook.read import BLOCK_POINTS, QuickLookError
+from swath.daemon.processing.quicklook.run import Look, look_at, numbers_of
+from swath.daemon.processing.quicklook.strips import MOMENTS, TILE, StripCells, _halved
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -322,7 +322,7 @@ def test_a_profile_that_is_asked_for_lies_where_it_was_asked_for(tmp_path: Path)
 
 def test_cells_made_twice_as_large_say_the_same(shifted: Look, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """With room for few tiles the cells grow; the moments are the ones of larger cells from the beginning."""
-    monkeypatch.setattr("swath.daemon.processing.quicklook_strips.MOST_TILES", 30)
+    monkeypatch.setattr("swath.daemon.processing.quicklook.strips.MOST_TILES", 30)
     look = two_strips(tmp_path, 0.07)
     assert look.cells.frame.cell_m >= 2 * shifted.cells.frame.cell_m
     (row,) = look.overlap.rows

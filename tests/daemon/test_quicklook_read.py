@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from swath.daemon.processing.quicklook import Look, look_at
+from swath.daemon.processing.quicklook.read import Units, density_near, open_source
+from swath.daemon.processing.quicklook.run import Look, look_at
 from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, has_varying_chunks
-from swath.daemon.processing.quicklook_read import Units, density_near, open_source
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import LasSettings
 from swath.georef.points import Points
@@ -77,7 +77,7 @@ def test_copc_looks_like_the_laz_of_its_points(both: tuple[Look, Path]) -> None:
 
 def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """At the far end, where only some of the blocks are wanted."""
-    monkeypatch.setattr("swath.daemon.processing.quicklook_read.BLOCK_POINTS", 5_000)
+    monkeypatch.setattr("swath.daemon.processing.quicklook.read.BLOCK_POINTS", 5_000)
     ends = (EAST_M + 290.0, NORTH_M + 5.0, EAST_M + 290.0, NORTH_M + 155.0)
     heights = []
     for folder in (both[0].sources[0].path.parent, both[1]):
@@ -91,7 +91,7 @@ def test_a_profile_through_copc_has_the_points_of_laz(both: tuple[Look, Path], m
 @pytest.mark.parametrize("size", [5_000, 100_000])
 def test_density_is_found_in_any_order(both: tuple[Look, Path], monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     """COPC's is that of a tree: a piece of it is less dense than the whole."""
-    monkeypatch.setattr("swath.daemon.processing.quicklook_read.SAMPLE_POINTS", size)
+    monkeypatch.setattr("swath.daemon.processing.quicklook.read.SAMPLE_POINTS", size)
     assert density_near(open_source(both[1] / "s1.copc.laz"), Units()) == pytest.approx(4.0, rel=0.3)
 
 

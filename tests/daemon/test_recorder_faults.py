@@ -19,11 +19,11 @@ from typing import Any
 
 import pytest
 
-from swath.daemon.acquire import MAX_SENDERS
 from swath.daemon.errors import UserError
+from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
-from swath.daemon.places import take_directory
-from swath.daemon.repair import MCAP_MAGIC, unfinished_logs
+from swath.daemon.recorder.receivers import MAX_SENDERS
+from swath.daemon.recorder.repair import MCAP_MAGIC, unfinished_logs
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table, wait_until

@@ -16,20 +16,20 @@ from typing import cast
 import numpy as np
 import pytest
 
-from swath.daemon.acquire import Receiver, Shared
 from swath.daemon.acquire_pps import PpsReceiver
-from swath.daemon.block_queue import BlockQueue, QueueItem, SourceCount
-from swath.daemon.channels import ChannelTable
-from swath.daemon.events import Events, Severity
-from swath.daemon.health import a_restart_helps_nobody, sentence, stuck_threads
-from swath.daemon.host_clock import HostClock
-from swath.daemon.log.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
+from swath.daemon.log.block_queue import BlockQueue, QueueItem, SourceCount
+from swath.daemon.log.channels import ChannelTable
+from swath.daemon.log.events import Events, Severity
 from swath.daemon.log.format import ChannelSpec, SessionInfo
-from swath.daemon.log.writer import PartWriter
-from swath.daemon.parts import Attachment, Parts
-from swath.daemon.recorder import Recorder, RecorderSettings, WriterHealth, Writing
-from swath.daemon.sd_notify import ServiceManager
-from swath.daemon.wire_trouble import WireTrouble
+from swath.daemon.log.host_clock import HostClock
+from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
+from swath.daemon.log.mcap.writer import PartWriter
+from swath.daemon.log.parts import Attachment, Parts
+from swath.daemon.recorder.health import a_restart_helps_nobody, sentence, stuck_threads
+from swath.daemon.recorder.receivers import Receiver, Shared
+from swath.daemon.recorder.service_manager import ServiceManager
+from swath.daemon.recorder.wire_trouble import WireTrouble
+from swath.daemon.recorder.writer import Recorder, RecorderSettings, WriterHealth, Writing
 from swath.drivers.session import Session
 from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters
 from tests.daemon.journal import journal_of

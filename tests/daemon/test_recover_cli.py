@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from swath.daemon import repair
-from swath.daemon.events import Event, Events, Severity
 from swath.daemon.log.claim import claim
+from swath.daemon.log.events import Event, Events, Severity
 from swath.daemon.log.format import LogError
 from swath.daemon.log.recover import recover
+from swath.daemon.recorder import repair
 from tests.daemon.commands import ROOT, swath
 from tests.daemon.log_check import official_counts
 from tests.daemon.rig import HANGS_S, wait_until

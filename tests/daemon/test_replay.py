@@ -18,7 +18,7 @@ from statistics import median
 import can
 import pytest
 
-from swath.daemon.wire_player import Output, PtyOutput, TimedUnit, play
+from swath.daemon.replay.wire_player import Output, PtyOutput, TimedUnit, play
 from swath.drivers.transports.base import TransportError
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table

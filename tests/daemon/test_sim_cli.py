@@ -19,10 +19,10 @@ from swath.daemon.cli.sim import PRESETS
 from swath.daemon.config import load_config
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import open_logs
-from swath.daemon.sim_ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
-from swath.daemon.sim_folder import FlightFolder
-from swath.daemon.sim_wire import WallClock, fly_on_wires, open_wires, own_wires
-from swath.daemon.wire_player import Output, TimedUnit
+from swath.daemon.replay.wire_player import Output, TimedUnit
+from swath.daemon.simulate.ahead import AHEAD_S, BATCH_S, Ahead, FlightFacts
+from swath.daemon.simulate.folder import FlightFolder
+from swath.daemon.simulate.on_wires import WallClock, fly_on_wires, open_wires, own_wires
 from swath.drivers.extras import how_to_install
 from swath.sim.plan.plan import PRESETS as REAL_PRESETS
 from tests.daemon.log_check import official_counts, read_log
@@ -179,7 +179,7 @@ class TestIntoALog:
         def refuse_chunk(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr("swath.daemon.log.writer.PartWriter.flush", refuse_chunk)
+        monkeypatch.setattr("swath.daemon.log.mcap.writer.PartWriter.flush", refuse_chunk)
         words = ("fly", plan, "-o", str(tmp_path / "flight"), "--seconds", "2", "--no-truth")
         line = f"swath: {tmp_path / 'flight'}: No space left on device; nothing is left of this flight\n"
         assert in_process(capsys, *words) == (ExitCode.IO, line)
@@ -374,7 +374,7 @@ class TestWires:
         def makers(*_: object, **__: object) -> dict[str, Callable[[], Output]]:
             return {source: functools.partial(Noted, notes, source) for source in SOURCES}
 
-        monkeypatch.setattr("swath.daemon.sim_wire.output_makers", makers)
+        monkeypatch.setattr("swath.daemon.simulate.on_wires.output_makers", makers)
         monkeypatch.setattr(time, "clock_settime_ns", lambda _, now_ns: steps.append(now_ns - time.time_ns()))
         flight = Standin(2.0, ((0.75, 3600.0),), (("gnss/rover", 0.05, 0.105),))
         facts = FlightFacts(2.0, SOURCES, tuple(flight.wall_steps), tuple(flight.unplugged))
@@ -436,7 +436,7 @@ class TestWires:
     def test_a_folder_of_wires_is_not_made_twice(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", standin_for)
+        monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", standin_for)
         path = tmp_path / "swath.toml"
         path.write_text("")
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path))
@@ -451,7 +451,7 @@ class TestWires:
         config = session_table(tmp_path / "logs")
         config += f'[pps.main]\nsource = "fixed:{tmp_path}/pps"\n[pps.other]\nsource = "fixed:{tmp_path}/other"\n'
         path.write_text(config)
-        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", standin_for)
+        monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", standin_for)
         with one_processor():
             code, said = in_process(capsys, "fly", plan, "--wire", "--config", str(path), "--wait", "0")
         assert code == 0
@@ -465,7 +465,7 @@ class TestWires:
     def test_stepping_the_clock_is_refused_before_anything_is_made(
         self, plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("swath.daemon.sim_plans.make_flight_in_time", stepping_for)
+        monkeypatch.setattr("swath.daemon.simulate.plans.make_flight_in_time", stepping_for)
         code, said = in_process(capsys, "fly", plan, "--wire", "-o", str(tmp_path / "wires"))
         assert (code, said.count("\n")) == (ExitCode.USAGE, 1)
         assert said.startswith(

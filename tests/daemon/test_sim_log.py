@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from swath.daemon.capture_routes import Routes
 from swath.daemon.errors import UserError
+from swath.daemon.exchange.routes import Routes
 from swath.daemon.log.reader import open_logs
-from swath.daemon.replay import timed_units
-from swath.daemon.run import make_wire
-from swath.daemon.sim_log import SimReport, fly_into_log, virtual_boot_id
+from swath.daemon.recorder.run import make_wire
+from swath.daemon.replay.units import timed_units
+from swath.daemon.simulate.into_log import SimReport, fly_into_log, virtual_boot_id
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, official_counts, read_log
 from tests.daemon.standin import PPM, SOURCES, START_NS, Clock, Standin, Unit, aircraft_config

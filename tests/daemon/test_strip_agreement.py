@@ -16,8 +16,8 @@ from pyproj import CRS
 from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.cli import strips, view
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.quicklook import Look, look_at
-from swath.daemon.processing.quicklook_strips import TILE, Overlap
+from swath.daemon.processing.quicklook.run import Look, look_at
+from swath.daemon.processing.quicklook.strips import TILE, Overlap
 from tests.daemon.test_quicklook import EAST_M, NORTH_M, plane, write
 
 pytestmark = pytest.mark.xdist_group("kernels")

@@ -14,14 +14,14 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing import strip_adjust_products
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
-from swath.daemon.processing.flights import Wish
-from swath.daemon.processing.flown import TrajectoryWish
-from swath.daemon.processing.navigation_verdict import Level
-from swath.daemon.processing.setup import Options
-from swath.daemon.processing.strip_adjust_products import write_adjustment
-from swath.daemon.processing.strip_adjust_run import AdjustWish, StripsCorrected, correct_strips
+from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.setup.setup import Options
+from swath.daemon.processing.strips import adjust_products as strip_adjust_products
+from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, correct_strips
+from swath.daemon.processing.strips.adjust_products import write_adjustment
+from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.geodesy.earth import rot_e_from_l

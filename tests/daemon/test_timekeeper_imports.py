@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 LOCK = """
 import sys
-import swath.daemon.run
+import swath.daemon.recorder.run
 from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales import PpsClock
 S = 1_000_000_000

@@ -14,8 +14,8 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.event_marks import PLACED
-from swath.daemon.processing.navigate import NavigateWish, attitude_of_text, navigate_session
+from swath.daemon.processing.navigation.navigate import NavigateWish, attitude_of_text, navigate_session
+from swath.daemon.processing.trajectory.event_marks import PLACED
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.plan.plan import Plan, parse_plan

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.daemon.processing.event_marks import HEADER, PLACED, event_table
-from swath.daemon.processing.navigation_inputs import Mark
+from swath.daemon.processing.navigation.inputs import Mark
+from swath.daemon.processing.trajectory.event_marks import HEADER, PLACED, event_table
 from swath.georef.records import EventMark, TimeScale, TimeTag
 from swath.georef.trajectory.trajectory import Trajectory
 

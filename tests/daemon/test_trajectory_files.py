@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from swath.daemon.errors import UserError
-from swath.daemon.processing import trajectory_files
-from swath.daemon.processing.trajectory_files import (
+from swath.daemon.processing.trajectory import files as trajectory_files
+from swath.daemon.processing.trajectory.files import (
     PARTIAL,
     TrajectoryFiles,
     put_in_place,
@@ -143,7 +143,7 @@ def test_a_disk_that_refuses_leaves_nothing(
         if (tmp_path / f"a.smrmsg{PARTIAL}").exists():
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("swath.daemon.processing.trajectory_files.os.fsync", full)
+    monkeypatch.setattr("swath.daemon.processing.trajectory.files.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_trajectory(files, trajectory, None)
     assert not list(tmp_path.iterdir())

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 from swath.daemon.config import Config
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.errors import ConfigError, UserError
-from swath.daemon.log_parsers import stored_config
-from swath.daemon.processing import navigation_doubts
-from swath.daemon.processing.navigation_doubts import height_findings
-from swath.daemon.processing.navigation_inputs import InputWish, NavigationInputs, read_inputs
-from swath.daemon.processing.navigation_observations import (
+from swath.daemon.log.parsers import stored_config
+from swath.daemon.processing.navigation import doubts as navigation_doubts
+from swath.daemon.processing.navigation.doubts import height_findings
+from swath.daemon.processing.navigation.inputs import InputWish, NavigationInputs, read_inputs
+from swath.daemon.processing.navigation.observations import (
     DEFAULT_SIGMAS,
     Observed,
     fix_observations,
@@ -30,9 +30,9 @@ from swath.daemon.processing.navigation_observations import (
     heading_times,
     ins_observations,
 )
-from swath.daemon.processing.navigation_sources import NavigationSources, noise_of, without_scanners
-from swath.daemon.processing.navigation_times import counted_arrivals, imu_times
-from swath.daemon.processing.outside_positions import OutsidePositions, outside_observations, refuse_shifted
+from swath.daemon.processing.navigation.outside_positions import OutsidePositions, outside_observations, refuse_shifted
+from swath.daemon.processing.navigation.sources import NavigationSources, noise_of, without_scanners
+from swath.daemon.processing.navigation.times import counted_arrivals, imu_times
 from swath.drivers.gnss.nmea.parser import NmeaParser
 from swath.drivers.gnss.nmea.sentences import encode_gga
 from swath.drivers.parser import DeviceSettings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.daemon.processing.flown import _from_device
+from swath.daemon.processing.flights.trajectory_choice import _from_device
 from swath.daemon.processing.ins_point import offset_in_b, point_doubts
 from swath.georef.records import INS_DTYPE
 from swath.georef.trajectory.trajectory import Trajectory

@@ -12,12 +12,12 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from swath.daemon.channels import JsonChannel
 from swath.daemon.cli.main import run_app
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
-from swath.daemon.processing.navigation_inputs import InputWish, read_inputs
-from swath.daemon.processing.navigation_times import imu_times, stretches
+from swath.daemon.log.channels import JsonChannel
+from swath.daemon.processing.navigation.inputs import InputWish, read_inputs
+from swath.daemon.processing.navigation.times import imu_times, stretches
 from swath.drivers.gnss.novatel.encoder import encode_frame
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
@@ -158,7 +158,7 @@ def test_samples_without_a_time_are_a_hole_of_the_trajectory(
         rows["device_time_ns"][(late > 20 * S) & (late < 32 * S)] = -1
         return imu_times(rows, *others)
 
-    with patch("swath.daemon.processing.navigation_inputs.imu_times", silent):
+    with patch("swath.daemon.processing.navigation.inputs.imu_times", silent):
         given = ["--gnss", str(flown.folder / "ppk.pos"), "--no-page"]
         assert run_app(["trajectory", str(flown.log), "-o", str(tmp_path / "a.sbet"), *given]) == 1
     told = json.loads((tmp_path / "a.json").read_text())

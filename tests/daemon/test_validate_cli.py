@@ -19,10 +19,10 @@ from swath.calib.record.record import NAMESPACE, Record, record_json
 from swath.calib.record.values import Value
 from swath.daemon.cli import validate
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing import validate_run
-from swath.daemon.processing.calibration_flight import KeptFlight
+from swath.daemon.processing.calibration.returns import KeptFlight
 from swath.daemon.processing.carried_verdict import Carried
-from swath.daemon.processing.navigation_verdict import Level
+from swath.daemon.processing.trajectory.verdict import Level
+from swath.daemon.processing.validation import run as validate_run
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal, read_calibration
 from tests.calib.cast_flight import Cast, cast_flight
 
@@ -169,7 +169,7 @@ def test_a_wrong_calibration_does_not(log: Path, tmp_path: Path) -> None:
 def test_the_calibrations_own_log_is_no_independent_proof(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from swath.daemon.processing.sidecar import sha256_of
+    from swath.daemon.processing.georeferencing.sidecar import sha256_of
 
     path = file_of(tmp_path / "own.toml", boresight(0.0))
     text = path.read_text()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from swath.daemon.host_clock import read_clock_pair
+from swath.daemon.log.host_clock import read_clock_pair
 from tests.daemon.log_check import read_log
 from tests.daemon.rig import Recorder, free_udp_port, session_table
 

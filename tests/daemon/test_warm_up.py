@@ -34,7 +34,7 @@ FLY = (
     ALL_SIGNATURES
     + """
 from swath.daemon.config.tables import LiveConfig
-from swath.daemon.processing.live import replay
+from swath.daemon.processing.live.session import replay
 from swath.daemon.processing.warm_up import compilations, get_ready, warm_up
 from tests.daemon.test_live import Flown
 
@@ -55,7 +55,7 @@ print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "know
 
 NO_CACHE = """
 import numpy as np
-from swath.daemon.processing.live_grid import CountGrid
+from swath.daemon.processing.live.grid import CountGrid
 from swath.daemon.processing.warm_up import WarmUp, cache_folder
 from tests.drivers.test_compiled import random_slots, returns_table
 from swath.drivers.scanner.slots_compiled import fill

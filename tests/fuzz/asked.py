@@ -16,14 +16,14 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-from swath.daemon import control, control_client
-from swath.daemon.block_queue import BlockQueue
-from swath.daemon.channels import ChannelTable
 from swath.daemon.cli import mark, split
-from swath.daemon.control import LINE_BYTES, Control
 from swath.daemon.errors import one_line
-from swath.daemon.events import Event, Events, Severity
-from swath.daemon.recorder import WriterHealth
+from swath.daemon.log.block_queue import BlockQueue
+from swath.daemon.log.channels import ChannelTable
+from swath.daemon.log.events import Event, Events, Severity
+from swath.daemon.recorder import control, control_client
+from swath.daemon.recorder.control import LINE_BYTES, Control
+from swath.daemon.recorder.writer import WriterHealth
 from swath.drivers.driver import KINDS, all_drivers
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.startup import MAX_REPLY_BYTES, StartupWish

@@ -14,17 +14,17 @@ from unittest.mock import patch
 
 import numpy as np
 
-from swath.daemon.capture_files import Told, find_captures
-from swath.daemon.capture_routes import Routes
 from swath.daemon.checksum_list import NAME, ChecksumList
 from swath.daemon.config import load_config
-from swath.daemon.exporting import MANIFEST, export_session
-from swath.daemon.importing import merge
-from swath.daemon.log.encode import encode_block, encode_json
+from swath.daemon.exchange.capture_files import Told, find_captures
+from swath.daemon.exchange.export import MANIFEST, export_session
+from swath.daemon.exchange.import_ import merge
+from swath.daemon.exchange.routes import Routes
+from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.format import ChannelSpec, LogError
+from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log.writer import PartWriter
-from swath.daemon.sidecar import SUFFIX
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.transports.base import TransportError
 from tests.drivers.recordings import FIXTURES

@@ -14,14 +14,14 @@ from pathlib import Path
 from rich.console import Console
 
 from swath.daemon.cli.monitor import page
+from swath.daemon.exchange.offload import is_growing
+from swath.daemon.log.chunk_index import Listening, index_log, read_chunks
 from swath.daemon.log.follow import LogFollower
 from swath.daemon.log.format import LogError
+from swath.daemon.log.parts import RECORDING_SIGN, read_sign
 from swath.daemon.log.reader import open_logs
-from swath.daemon.monitor import Monitor
-from swath.daemon.offload import is_growing
-from swath.daemon.parts import RECORDING_SIGN, read_sign
-from swath.daemon.processing.live_follow import LiveFollower
-from swath.daemon.processing.log_index import Listening, index_log, read_chunks
+from swath.daemon.monitor.display import Monitor
+from swath.daemon.processing.live.follow import LiveFollower
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.logs import BATCHES, INFO, VALUES, log_seeds, mutate_log
 from tests.fuzz.mcap_parts import MESSAGE, take_apart

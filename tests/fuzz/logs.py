@@ -19,14 +19,14 @@ from mcap.writer import CompressionType, Writer
 from rich.console import Console
 
 from swath.daemon.cli.info import _print_session
-from swath.daemon.log.encode import encode_block, encode_json
 from swath.daemon.log.format import ChannelSpec, LogError, SessionInfo
+from swath.daemon.log.mcap.encode import encode_block, encode_json
+from swath.daemon.log.mcap.scan import Damage, scan
+from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.recover import recover
-from swath.daemon.log.scan import Damage, scan
-from swath.daemon.log.writer import PartWriter
-from swath.daemon.replay import timed_units
-from swath.daemon.statistics import session_statistics
+from swath.daemon.log.statistics import session_statistics
+from swath.daemon.replay.units import timed_units
 from swath.drivers.can_frames import encode_can_frame
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import scan_lines

@@ -14,9 +14,9 @@ import numpy as np
 from pyproj import CRS
 
 from swath.calib.strips.cells import StripRules
-from swath.daemon.processing.outside_positions import outside_observations
-from swath.daemon.processing.quicklook_sidecar import rows_of, warnings_in
-from swath.daemon.processing.strips_inputs import strips_of_files
+from swath.daemon.processing.navigation.outside_positions import outside_observations
+from swath.daemon.processing.quicklook.product_facts import rows_of, warnings_in
+from swath.daemon.processing.strips.inputs import strips_of_files
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory

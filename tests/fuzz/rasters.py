@@ -14,7 +14,7 @@ import numpy as np
 import rasterio
 from rasterio.transform import Affine
 
-from swath.daemon.processing.terrain import read_terrain
+from swath.daemon.processing.setup.terrain import read_terrain
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan, load_plan

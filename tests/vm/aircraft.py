@@ -7,7 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
-from swath.daemon.log.chunks import json_objects
+from swath.daemon.log.mcap.chunks import json_objects
 from swath.daemon.log.reader import open_logs
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight

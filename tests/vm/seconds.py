@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.daemon.events import Event, Events, Severity
-from swath.daemon.host_clock import ClockDiscipline
-from swath.daemon.log.chunks import json_objects
+from swath.daemon.log.events import Event, Events, Severity
+from swath.daemon.log.host_clock import ClockDiscipline
+from swath.daemon.log.mcap.chunks import json_objects
+from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log_parsers import stored_parsers
-from swath.daemon.timekeeper import TimeKeeper
+from swath.daemon.recorder.timekeeper import TimeKeeper
 from swath.drivers.transports.base import UnitBlock
 
 LEAP_S = 18

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.log_parsers import stored_parsers
 from swath.georef.records import ChunkBatch, ImuSamples
 from tests.daemon.log_check import LogContent, read_log
 from tests.vm.aboard_can import BUS_OFF, CONTROLLER, ERROR, RESTARTED, sample_frames

@@ -25,8 +25,8 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.config import load_config
-from swath.daemon.processing.live_points import POINT_DTYPE
-from swath.daemon.sim_wire import CAN_GROUP, free_ports
+from swath.daemon.processing.live.points import POINT_DTYPE
+from swath.daemon.simulate.on_wires import CAN_GROUP, free_ports
 from swath.drivers.transports.spec import parse_transport
 from swath.sim.companions import companion_files, config_text
 from swath.sim.fly import VirtualFlight

@@ -1,0 +1,1 @@
+"""Devices found, identified, checked and set up."""

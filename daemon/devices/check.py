@@ -1,0 +1,366 @@
+"""Opens everything a configuration names for some seconds and says of each what it answers and what is wrong.
+
+Nothing is written, nothing is sent. Every wire has its own thread, so all are heard at the same time.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from shutil import disk_usage
+from typing import Any
+
+import numpy as np
+
+from swath.daemon.config import Config, DeviceEntry
+from swath.daemon.devices.identify import Heard, describe_time, not_understood
+from swath.daemon.log.directory import nearest_there
+from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
+from swath.drivers.driver import find_driver
+from swath.drivers.session import Session
+from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
+from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.spec import TransportSpec, open_transport, parse_pps
+from swath.georef.records import ChunkBatch, TimeMessage
+from swath.georef.timescales import ahead_s, distance_text
+
+SLICE_S = 0.1
+KEPT_BYTES = 1 << 20  # of each wire, to find out what it is if it is not what was configured
+DAMAGED_SHARE = 0.01  # of the messages: more is a wire or a setting, not chance
+CLOCK_RATE_FACTOR = 5.0  # a counter that runs faster or slower by this is read in the wrong unit
+EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
+
+
+@dataclass(slots=True)
+class Span:
+    """How long to listen: ``seconds``, or until ``stop`` is set."""
+
+    seconds: float
+    stop: threading.Event = field(default_factory=threading.Event)
+    _ends_s: float = field(default=math.inf, init=False)
+
+    def is_over(self) -> bool:
+        """Whether nobody listens any more."""
+        return self.stop.is_set() or time.monotonic() > self._ends_s
+
+    def listen(self, session: Session[Any]) -> Iterable[list[Any]]:
+        """What a session hands over until the time is up."""
+        deadline_s = self._ends_s = time.monotonic() + self.seconds
+        while not self.stop.is_set() and (left_s := deadline_s - time.monotonic()) > 0:
+            if got := session.receive(min(SLICE_S, left_s)):
+                yield got
+
+
+@dataclass(slots=True)
+class Report:
+    """What one source answered.
+
+    Attributes:
+        source: ``kind/name``; ``/aux`` behind it for a head's second port; ``log`` for the log directory.
+        opens: the device could be opened.
+        bytes, units: what came in the time.
+        records: decoded records by type (rows, where they come in batches).
+        time: what it says of its time, for the eye.
+        problems: what is wrong, one line each.
+        notes: what is worth knowing and not wrong.
+    """
+
+    source: str
+    protocol: str = ""
+    opens: bool = False
+    bytes: int = 0
+    units: int = 0
+    records: Counter[str] = field(default_factory=Counter)
+    time: str = ""
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, batch: ChunkBatch) -> None:
+        """Count units."""
+        self.units += len(batch.units)
+        self.bytes += int(batch.units.size)
+
+    def plain(self) -> dict[str, Any]:
+        """As plain values, the form of ``--json``."""
+        return {
+            "source": self.source,
+            "protocol": self.protocol,
+            "opens": self.opens,
+            "bytes": self.bytes,
+            "units": self.units,
+            "records": dict(self.records),
+            "time": self.time,
+            "problems": self.problems,
+            "notes": self.notes,
+            "ok": not self.problems,
+        }
+
+
+class Reading:
+    """One device's parser, what it made of the bytes, and what they were. Two ports of a head feed the same parser."""
+
+    def __init__(self, entry: DeviceEntry) -> None:
+        self.entry = entry
+        self.report = Report(entry.source, entry.protocol)
+        self.heard = Heard()
+        self.parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
+        self.kept: list[ChunkBatch] = []
+        self._kept_bytes = 0
+        self._lock = threading.Lock()
+
+    def feed(self, batch: ChunkBatch, *, main: bool) -> None:
+        """Take units of the device's own port, or of its second one."""
+        with self._lock:
+            self.heard.add(self.parser.feed_batch(batch))
+            if main:
+                self.report.add(batch)
+                if self._kept_bytes < KEPT_BYTES:
+                    self._kept_bytes += batch.units.size
+                    self.kept.append(ChunkBatch(batch.source, batch.host_time_ns, batch.units.copy()))
+
+    def finish(self) -> None:
+        """After the last byte: what it says, and what is wrong with it."""
+        self.heard.add(self.parser.close())
+        self.report.records = self.heard.counts
+        if self.report.bytes:
+            self.report.time = describe_time(self.entry, self.heard)
+            self.report.problems += _answer_problems(self)
+            self.report.notes += lock_notes(self.entry, self.heard) + far_notes(self.heard, read_clock_discipline())
+
+
+class Wire:
+    """One port, socket or bus, and who reads of it."""
+
+    def __init__(self, report: Report, spec: TransportSpec, readings: list[Reading], *, main: bool) -> None:
+        self.report = report
+        self._spec = spec
+        self._readings = readings
+        self._main = main
+
+    def listen(self, span: Span) -> None:
+        """Feed the readings until the time is up; then say what is wrong with the wire."""
+        session = Session(lambda: open_transport(self._spec, span.is_over))
+        for blocks in span.listen(session):
+            for block in blocks:
+                batch = _batch(self.report.source, block)
+                for reading in self._readings:
+                    reading.feed(batch, main=self._main)
+                if not self._main:
+                    self.report.add(batch)
+        self._say(session, span.seconds)
+        session.close()
+
+    def _say(self, session: Session[Any], seconds: float) -> None:
+        counters = session.poll_counters()
+        for report in [reading.report for reading in self._readings] if self._main else [self.report]:
+            report.opens = session.openings > 0
+            report.problems += _wire_problems(session, counters, report, seconds)
+            if self._spec.kind == "can" and self._spec.interface == "socketcan":
+                report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
+            if counters.refused:
+                what = "messages or lines that nobody can read; is the adapter's speed right?"
+                if self._spec.kind == "udp":
+                    what = "datagrams of other senders than the configured source"
+                report.notes.append(f"{counters.refused} {what}")
+
+
+def check_everything(config: Config, seconds: float) -> list[Report]:
+    """Listen to all sources of a configuration at once for ``seconds``."""
+    span = Span(seconds)
+    readings = {entry.source: Reading(entry) for entry in config.devices()}
+    reports = [Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()]
+    jobs: list[Callable[[], None]] = [
+        partial(check_pps, report, pps.edge, span) for report, pps in zip(reports, config.pps.values(), strict=True)
+    ]
+    for reading in readings.values():
+        reports.append(reading.report)
+        for wire in _wires(reading, readings):
+            jobs.append(partial(wire.listen, span))
+            if wire.report is not reading.report:
+                reports.append(wire.report)
+    _run(jobs, span)
+    for reading in readings.values():
+        reading.finish()
+    return [*reports, check_directory(Path(config.session.directory), config.session.reserve_mb)]
+
+
+def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
+    """The wires of a device; devices inside its stream read along, and have none of their own."""
+    entry = reading.entry
+    if entry.transport.kind == "gnss":
+        return
+    inside = [other for other in readings.values() if _is_inside(other.entry, entry)]
+    yield Wire(reading.report, entry.transport, [reading, *inside], main=True)
+    if entry.auxiliary is not None:
+        yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading], main=False)
+
+
+def _is_inside(inner: DeviceEntry, outer: DeviceEntry) -> bool:
+    return inner.transport.kind == "gnss" and f"gnss/{inner.transport.address}" == outer.source
+
+
+def _run(jobs: list[Callable[[], None]], span: Span) -> None:
+    with ThreadPoolExecutor(max_workers=max(1, len(jobs)), thread_name_prefix="check") as pool:
+        try:
+            for future in [pool.submit(job) for job in jobs]:
+                future.result()
+        finally:
+            span.stop.set()  # an interrupt does not wait for the rest of the time
+
+
+def check_directory(directory: Path, reserve_mb: float) -> Report:
+    """Whether logs can be written there, and how much room is left."""
+    report = Report("log")
+    existing, permitted = nearest_there(directory)
+    if not permitted:
+        report.problems.append(
+            f"session.directory {directory}: user {os.geteuid()} may not enter {existing}; ask as root, or as the user "
+            f"that records, or give a directory that he may enter"
+        )
+        return report
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            report.opens = True
+    except OSError as error:
+        report.problems.append(f"session.directory {directory}: cannot be written: {error.strerror}")
+    free_mb = disk_usage(existing).free / 1e6
+    report.notes.append(f"{directory}: {free_mb / 1000:.1f} GB free")
+    if free_mb <= reserve_mb:
+        report.problems.append(f"session.directory {directory}: {free_mb:.0f} MB free, reserve_mb is {reserve_mb:g}")
+    return report
+
+
+def check_pps(report: Report, edge: str, span: Span) -> None:
+    """Count the edges of the PPS source that the report's protocol names."""
+    session: Session[RawEdge] = Session(lambda: parse_pps(report.protocol, edge=edge))
+    edges: list[RawEdge] = []
+    for got in span.listen(session):
+        edges += got
+    session.close()
+    if refused := session.poll_counters().refused:
+        report.notes.append(f"{refused} lines that are no edge; want 'realtime_ns sequence', both whole numbers")
+    report.opens, report.units = session.openings > 0, len(edges)
+    report.records["edges"] = len(edges)
+    if session.last_error:
+        report.problems.append(f"went away: {session.last_error}" if report.opens else session.last_error)
+    elif not edges:
+        report.problems.append(
+            f"no {edge} edge in {span.seconds:g} s; is the PPS wired, and does the receiver put it out?"
+        )
+    stamps = np.array([item.realtime_ns for item in edges], dtype=np.int64)
+    if len(stamps) > 1:
+        spacing_s = float(np.median(np.diff(stamps))) * 1e-9
+        report.time = f"every {spacing_s:.4f} s"
+        if abs(spacing_s - round(spacing_s)) > EDGE_SPACING_TOLERANCE_S or spacing_s < 0.5:
+            report.problems.append(f"edges are {spacing_s:.4f} s apart, want 1 s: noise, or another pulse")
+    if any(not item.kernel_stamp for item in edges):
+        report.notes.append("stamped after a wake-up, not by the kernel: tens of microseconds")
+
+
+def _batch(source: str, block: UnitBlock) -> ChunkBatch:
+    now_ns = time.time_ns()
+    stamps = np.full(len(block.units), now_ns, dtype=np.int64)
+    if block.kernel_realtime_ns is not None:
+        stamps = np.where(block.kernel_realtime_ns > 0, block.kernel_realtime_ns, now_ns).astype(np.int64)
+    return ChunkBatch(source, stamps, block.units)
+
+
+def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:
+    """What is wrong with the wire itself."""
+    if not report.opens:
+        yield session.last_error or "not opened in the time; listen longer"
+        return
+    if session.last_error:
+        yield f"went away: {session.last_error}"
+    if not report.bytes:
+        yield f"silent: opened, but no byte in {seconds:g} s; is it powered, wired and sending here?"
+    granted, asked = counters.receive_buffer_bytes, counters.receive_buffer_asked_bytes
+    if 0 < granted < asked:
+        yield (
+            f"receive buffer: asked for {asked} bytes, got {granted}; "
+            f"`sysctl -w net.core.rmem_max={asked}`, for good in /etc/sysctl.d"
+        )
+    if counters.lost_kernel:
+        yield f"the kernel dropped {counters.lost_kernel} units"
+    if counters.error_frames or counters.bus_off:
+        yield f"CAN trouble: {counters.error_frames} error frames, {counters.bus_off} times bus-off"
+
+
+def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
+    """Whether the interface runs at the configured bit rate; None: it has none (vcan) or cannot be asked."""
+    wanted = spec.options.get("bitrate")
+    if wanted is None or actual is None or int(wanted) == actual:
+        return []
+    command = f"ip link set {spec.channel} down && ip link set {spec.channel} up type can bitrate {wanted}"
+    return [f"{spec.channel} runs at {actual} bit/s, configured is {wanted}; `{command}`"]
+
+
+def _answer_problems(reading: Reading) -> list[str]:
+    """What is wrong with what came."""
+    entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
+    good = counters.messages.total()
+    other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
+    if other is not None:
+        return [other]
+    found: list[str] = []
+    if not heard.counts and entry.kind != "corrections":  # those are not decoded, but for a station now and then
+        names = ", ".join(f"{name} {count}" for name, count in counters.messages.most_common(5))
+        found.append(f"speaks {entry.protocol}, but sends nothing that is decoded ({names})")
+    bad = counters.bad_checksums + counters.bad_messages
+    if bad > DAMAGED_SHARE * good:
+        found.append(f"{bad} of {bad + good} messages damaged")
+    return found + _time_problems(entry, heard)
+
+
+def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:
+    """Say where a scanner is not locked to its PPS or nothing tells whether it is: whether its stamps can be used."""
+    if entry.kind != "scanner" or not heard.counts["DeviceClockSamples"]:
+        return []
+    if heard.sees_pps:
+        void = heard.time_messages and heard.valid_time is None
+        return ["the sentences at its input are void: want their receiver to have a fix"] if void else []
+    if heard.sees_pps is not None:
+        unlocked = "it says that it is not locked to a pulse; want the receiver's PPS wired to it"
+        return [] if entry.pps is not None else [unlocked]
+    clock = entry.settings.config.get("clock", "auto")
+    if clock != "auto":
+        return [f'nothing tells whether it is locked; its stamps are taken as configured (clock = "{clock}")']
+    taken = "its stamps will be used only if they are found to be UTC or TAI by their arrival, or clock says so"
+    if TimeMessage not in find_driver(entry.kind, entry.protocol).yields:
+        return [f"nothing tells whether its clock is set by PTP or a pulse; {taken}"]
+    port = "none came at auxiliary" if entry.auxiliary is not None else "want auxiliary"
+    ports = "Velodyne port 8308, Hesai 10110"
+    return [f"no position packet ({ports}) tells whether it is locked to its PPS: {port}; without, {taken}"]
+
+
+def far_notes(heard: Heard, discipline: ClockDiscipline) -> list[str]:
+    """Say that a device's time is hours or days from this computer's clock: either may be the wrong one."""
+    message = heard.valid_time
+    ahead = None if message is None else ahead_s(message.time, message.host_time_ns)
+    if ahead is None:
+        return []
+    text = distance_text(ahead, kept=discipline.disciplined, clock="this computer's clock")
+    return [text] if text else []
+
+
+def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
+    """A GNSS must say a valid time, a counter must run like time, a device that says whether it sees its PPS see it."""
+    if entry.kind == "gnss":
+        if heard.time_messages == 0:
+            return ["no time message: the clock cannot be set by it; switch one on"]
+        return [] if heard.valid_time is not None else ["its time is not valid (yet)"]
+    rate = heard.imu_clock_rate
+    if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
+        return [f"its counter runs {rate:.3g} times as fast as time: is tick_hz right?"]
+    if entry.pps is not None and heard.sees_pps is False:
+        return [f"does not see its PPS ({entry.pps})"]
+    return []

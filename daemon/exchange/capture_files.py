@@ -1,0 +1,199 @@
+"""What the files given to `swath import` are, and which device each belongs to."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.exchange.captures import Capture, has_times
+from swath.daemon.exchange.export import MANIFEST
+from swath.daemon.exchange.routes import Port, Routes
+from swath.daemon.exchange.sidecar import SUFFIX
+from swath.daemon.log.format import LogError, safe_attachment_path
+from swath.drivers.captures.opening import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
+from swath.drivers.transports.base import TransportError
+
+_LOOKED_AT_BYTES = 65_536
+_LOOKED_AT_LINES = 10
+_MAX_MANIFEST_BYTES = 1 << 20
+_KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "pps": "pps"}
+_NO_CAPTURE = {  # what files begin with that hold devices' bytes in a way of their own
+    b"SQLite format 3\0": "a ROS 2 bag, or another SQLite file",
+    b"#ROSBAG V": "a ROS 1 bag",
+    b"\x89MCAP0\r\n": "a log, or a ROS 2 bag in MCAP",
+    b"LOGG": "a BLF file of Vector",
+}
+_WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE or kind/name:<UDP port>=FILE"
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the command line says besides files.
+
+    Attributes:
+        named: ``kind/name[/aux][:selector]=FILE``, as given.
+        start_ns, baud: by source, "" for all: when a serial file without times begins, and how fast it came.
+        keep_copies: packets that were captured twice stay.
+    """
+
+    named: Sequence[str] = ()
+    start_ns: Mapping[str, int] = field(default_factory=dict)
+    baud: Mapping[str, float] = field(default_factory=dict)
+    keep_copies: bool = False
+
+
+def find_captures(routes: Routes, files: Sequence[Path], told: Told) -> list[Capture]:
+    """Every file with its kind and device.
+
+    Raises:
+        UserError: all that is wrong, a line each: no device, no times, or, where that is all, what cannot be read.
+    """
+    found: dict[tuple[Path, str, str | None], Capture] = {}
+    wrong: list[str] = [
+        f"{source}: is no source of the configuration; there are: {', '.join(routes.ports) or 'none'}"
+        for source in dict.fromkeys([*told.start_ns, *told.baud])
+        if source and source not in routes.ports
+    ]
+    unread = 0
+    items: list[str | Path] = [*told.named, *files]
+    for item in items:
+        try:
+            for capture in _named(routes, item) if isinstance(item, str) else _found(routes, item):
+                _settle(capture, told)
+                source = capture.port.source if capture.port is not None else ""
+                found[capture.path, source, capture.selector] = capture
+        except (UserError, TransportError) as error:
+            wrong.append(one_line(str(error)))
+            unread += isinstance(error, TransportError)
+    if not found and not wrong:
+        wrong.append("nothing to import: give captures, or the folder of an export")
+    if wrong:
+        raise UserError("\n".join(wrong), ExitCode.IO if unread == len(wrong) else ExitCode.USAGE)
+    return list(found.values())
+
+
+def _named(routes: Routes, text: str) -> list[Capture]:
+    """``--source kind/name:selector=FILE``."""
+    name, equals, file = text.partition("=")
+    source, _, selector = name.partition(":")
+    if not equals or not file or not source:
+        raise UserError(f"--source {text}: {_WANTED}")
+    path = Path(file)
+    port = _port(routes, source, f"--source {text}")
+    kind = _kind(read_beginning(path, _LOOKED_AT_BYTES)[0])
+    wanted = _KIND_OF_PORT[port.kind]
+    if (kind == "pcap") != (wanted == "pcap"):
+        forms = {
+            "pcap": "a pcap file",
+            "candump": "a log of candump -L",
+            "serial": "its bytes",
+            "pps": "lines of edges",
+        }
+        raise UserError(f"{path}: is {forms[kind]}; {source} comes by {port.kind}: want {forms[wanted]}")
+    return [Capture(path, wanted, port, selector or None)]
+
+
+def _port(routes: Routes, source: str, where: str) -> Port:
+    port = routes.ports.get(source)
+    if port is None:
+        known = ", ".join(routes.ports) or "none"
+        raise UserError(f"{where}: {source} is no source of the configuration; there are: {known}")
+    return port
+
+
+def _found(routes: Routes, path: Path) -> list[Capture]:
+    """A file whose units say themselves whose they are, or the folder of an export."""
+    if path.is_dir():
+        return _of_export(routes, path)
+    head, damage = read_beginning(path, _LOOKED_AT_BYTES)
+    kind = _kind(head)
+    if kind == "serial":
+        if damage:
+            raise TransportError(f"{path}: cannot be read: {damage}")
+        if other := next((what for magic, what in _NO_CAPTURE.items() if head.startswith(magic)), ""):
+            raise UserError(f"{path}: is {other}; want pcap, candump -L or a device's bytes")
+        if any(map(is_shown_candump, _first_lines(head))):
+            raise UserError(f"{path}: is what candump shows for people to read; want what candump -L (or -l) writes")
+        raise UserError(
+            f"{path}: neither pcap nor candump -L; if it is a device's bytes, say --source kind/name={path}"
+        )
+    if routes.described(kind) == "none":
+        raise UserError(f"{path}: the configuration has no {'UDP port' if kind == 'pcap' else 'CAN bus'} for it")
+    return [Capture(path, kind)]
+
+
+def _kind(head: bytes) -> str:
+    """By the beginning: pcap, candump, else the bytes of a serial line."""
+    if is_pcap(head):
+        return "pcap"
+    return "candump" if any(map(is_candump, _first_lines(head))) else "serial"
+
+
+def _first_lines(head: bytes) -> list[str]:
+    return [line.strip() for line in head.decode("ascii", "replace").splitlines()[:_LOOKED_AT_LINES]]
+
+
+def _settle(capture: Capture, told: Told) -> None:
+    """What the command line says of a file: its times, and whether copies stay."""
+    capture.keep_copies = told.keep_copies
+    if capture.kind != "serial" or has_times(capture.path):
+        return
+    assert capture.port is not None
+    source, options = capture.port.source, capture.port.options
+    start_ns = told.start_ns.get(source, told.start_ns.get(""))
+    if start_ns is None:
+        raise UserError(
+            f"{capture.path}: says no times, and no {capture.path.name}.tag or table of arrivals lies beside it; "
+            "give --start"
+        )
+    baud = told.baud.get(source, told.baud.get("", float(options.get("baud", 0))))
+    parity = options.get("parity", "N") != "N"
+    bits = 1 + int(options.get("bytesize", 8)) + parity + float(options.get("stopbits", 1))
+    capture.time = BareTime(start_ns, baud, bits)
+
+
+# --- the folder of an export ----------------------------------------------------------------------------------------
+
+
+def _of_export(routes: Routes, folder: Path) -> list[Capture]:
+    """The files that its manifest names; of a folder of exports, those of all."""
+    folders = [folder] if (folder / MANIFEST).exists() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
+    if not folders:
+        raise UserError(f"{folder}: is a folder without {MANIFEST}; give captures, or the folder of an export")
+    return [_exported(routes, one, name, entry) for one in folders for name, entry in _manifest(one / MANIFEST).items()]
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as stream:
+            files = json.loads(stream.read(_MAX_MANIFEST_BYTES))["files"]
+        if isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values()):
+            return files
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise UserError(f"{path}: is no manifest of `swath export`")
+
+
+def _exported(routes: Routes, folder: Path, name: str, entry: dict[str, Any]) -> Capture:
+    kind, source = entry.get("kind"), entry.get("source")
+    try:
+        path = safe_attachment_path(folder, name)
+    except LogError as error:
+        raise UserError(f"{folder / MANIFEST}: names {name!r}, which is not in its folder") from error
+    if not os.path.isfile(path) or name.endswith(SUFFIX):
+        raise UserError(f"{path}: {MANIFEST} names it and it is not there")
+    if kind == "pcap":
+        return Capture(path, "pcap")
+    if kind not in _KIND_OF_PORT.values() or not isinstance(source, str):
+        raise UserError(f"{folder / MANIFEST}: does not say what {name} is")
+    port = _port(routes, source, str(path))
+    if _KIND_OF_PORT[port.kind] != kind:
+        raise UserError(f"{path}: {source} comes by {port.kind} in this configuration, and the file is of kind {kind}")
+    return Capture(path, kind, port)

@@ -1,0 +1,141 @@
+"""A file that `swath import` reads: what it is, whose units it holds, and the units themselves."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.exchange.routes import Port, Routes
+from swath.daemon.exchange.sidecar import complete, cut_by_sidecar, sidecar_of
+from swath.drivers.captures.base import (
+    LATEST_NS,
+    Address,
+    CapturedUnit,
+    CaptureTally,
+    read_lines,
+    until_damage,
+)
+from swath.drivers.captures.opening import (
+    BareTime,
+    chunk_table,
+    read_bare,
+    read_candump,
+    read_pcap,
+    read_serial,
+    read_tagged,
+)
+from swath.drivers.captures.pcap_writer import NOBODY
+
+
+@dataclass(frozen=True, slots=True)
+class ImportUnit:
+    """One unit on its way into a log; ``peer`` is a datagram's sender."""
+
+    time_ns: int
+    port: Port
+    data: bytes
+    peer: Address | None = None
+
+
+@dataclass(slots=True)
+class Capture:
+    """A file, what it is, and what was found in it.
+
+    Attributes:
+        kind: "pcap", "candump", "serial" or "pps".
+        port: whose units it holds; None where the units say it themselves.
+        selector: the CAN interface, or the UDP port number, of which alone units are taken.
+        time: when the bytes of a serial file without times came.
+        units: taken, by source. passed: of no device, by what they were.
+    """
+
+    path: Path
+    kind: str
+    port: Port | None = None
+    selector: str | None = None
+    time: BareTime | None = None
+    keep_copies: bool = False
+    tally: CaptureTally = field(default_factory=CaptureTally)
+    units: Counter[str] = field(default_factory=Counter)
+    passed: Counter[str] = field(default_factory=Counter)
+
+    def read(self, routes: Routes) -> Iterator[ImportUnit]:
+        """Units that belong to a device, in the file's order; what is wrong with the file stands in ``tally``."""
+        for unit in until_damage(self._captured(), self.tally):
+            if not 0 <= unit.time_ns <= LATEST_NS:
+                self.tally.damaged(f"{self.path}: a unit of {len(unit.data)} bytes has no time between 1970 and 2262")
+                continue
+            port = self._port_of(unit, routes)
+            if port is None:
+                continue
+            peer = unit.source if unit.source != NOBODY else None
+            self.units[port.source] += 1
+            yield ImportUnit(unit.time_ns, port, unit.data, peer)
+
+    def _captured(self) -> Iterator[CapturedUnit]:
+        if self.kind == "pcap":
+            units = read_pcap(self.path, tally=self.tally, drop_copies=not self.keep_copies)
+            return complete(units, self.path)
+        if self.kind == "candump":
+            return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
+        if self.kind == "pps":
+            assert self.port is not None
+            return complete(_edges(self.path, self.port.edge, self.tally), self.path)
+        if sidecar_of(self.path).exists():
+            return cut_by_sidecar(self.path)
+        if chunk_table(self.path) is not None:
+            return read_serial(self.path, tally=self.tally)
+        if tag_of(self.path).exists():
+            return read_tagged(self.path, tag_of(self.path), self.tally)
+        assert self.time is not None
+        return read_bare(self.path, self.time, self.tally)
+
+    def _port_of(self, unit: CapturedUnit, routes: Routes) -> Port | None:
+        if self.port is not None and self.selector is None:
+            return self.port
+        told = str(unit.destination[1]) if unit.destination is not None else unit.channel
+        if self.port is not None:
+            found = self.port if told == self.selector else None
+        else:
+            found = routes.of_datagram(unit) if self.kind == "pcap" else routes.of_frame(unit)
+        if found is None:
+            self.passed[f"port {told}" if unit.destination is not None else told] += 1
+        return found
+
+    def plain(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "file": str(self.path),
+            "kind": self.kind,
+            "units": dict(self.units),
+            "of_no_device": dict(self.passed),
+            "passed_over": {what: count for what, count in self.tally.passed.items() if count},
+            "damage": self.tally.damage,
+            "first_damage": self.tally.first_damage or None,
+        }
+
+
+def tag_of(path: Path) -> Path:
+    """Where RTKLIB put the time tags of a stream, which may have been gzipped since."""
+    return path.with_name(path.name.removesuffix(".gz") + ".tag")
+
+
+def has_times(path: Path) -> bool:
+    """Whether something beside a serial file says when its bytes came."""
+    return sidecar_of(path).exists() or chunk_table(path) is not None or tag_of(path).exists()
+
+
+def _edges(path: Path, edge: str, tally: CaptureTally) -> Iterator[CapturedUnit]:
+    """Lines ``realtime_ns sequence`` as messages of ``/pps``."""
+    for number, line in read_lines(path, tally):
+        fields = line.split()
+        if len(fields) != 2 or not all(text.isdecimal() and int(text) <= LATEST_NS for text in fields):
+            tally.damaged(f"{path}: line {number} is no edge; want realtime_ns sequence")
+            continue
+        time_ns, sequence = map(int, fields)
+        value = {"edge_time_ns": time_ns, "sequence": sequence, "edge": edge}
+        yield CapturedUnit(time_ns, json.dumps(value, separators=(",", ":")).encode(), "pps")

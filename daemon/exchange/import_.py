@@ -1,0 +1,124 @@
+"""Captures into an ordinary log: as a recorder would have written it, with the captures' stamps as log times.
+
+Files are merged by time, each read in its own order and never whole.
+"""
+
+from __future__ import annotations
+
+import heapq
+import platform
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from swath import __version__
+from swath.daemon.config import Config
+from swath.daemon.exchange.captures import Capture, ImportUnit
+from swath.daemon.exchange.log_maker import MadeLog, session_name
+from swath.daemon.exchange.routes import Routes
+from swath.daemon.log.events import Severity
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.recorder.run import read_boot_id
+
+
+def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:
+    """Units of all files, the earliest of those that are next first; each file keeps its own order."""
+    streams = [capture.read(routes) for capture in captures]
+    waiting = []
+    for number, stream in enumerate(streams):
+        unit = next(stream, None)
+        if unit is not None:
+            waiting.append((unit.time_ns, number, unit))
+    heapq.heapify(waiting)
+    while waiting:
+        _, number, unit = waiting[0]
+        yield unit
+        following = next(streams[number], None)
+        if following is None:
+            heapq.heappop(waiting)
+        else:
+            heapq.heapreplace(waiting, (following.time_ns, number, following))
+
+
+def import_session_info(name: str, first_ns: int) -> SessionInfo:
+    """Session of captures that begin at ``first_ns``: host time is their wall clock."""
+    boot_id = read_boot_id()
+    return SessionInfo(
+        session_id=session_name(name, first_ns, boot_id),
+        software=f"swath {__version__}",
+        host=platform.node(),
+        boot_id=boot_id,
+        realtime_ns=first_ns,
+        monotonic_ns=first_ns,
+        origin="import",
+    )
+
+
+class ImportLog(MadeLog):
+    """The log of an import; raises as `MadeLog` does."""
+
+    def __init__(self, config: Config, directory: Path, first_ns: int) -> None:
+        super().__init__(config, directory, import_session_info(config.session.name, first_ns), "import")
+        self.event(Severity.INFO, "session_started", f"session {self.info.session_id}, imported from captures")
+
+    def add(self, unit: ImportUnit) -> None:
+        """One unit; raises OSError when the disk refuses a chunk."""
+        self.go_on(unit.time_ns)
+        source = self.sources.get(unit.port.source) or self.add_source(unit.port)
+        self.add_unit(source, unit.peer, unit.time_ns, unit.data)
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """What came of an import; ``session_id`` and ``paths`` are empty where no capture held a unit."""
+
+    session_id: str
+    paths: list[Path]
+    units: dict[str, int]
+
+
+def import_captures(
+    config: Config,
+    routes: Routes,
+    captures: list[Capture],
+    directory: Path,
+    progress: Callable[[int], None] = lambda _: None,
+) -> ImportReport:
+    """Make a log of captures.
+
+    Args:
+        config: stored in the log, and what its devices are.
+        routes: of the same configuration.
+        captures: read here, once; what was found in them stands in each.
+        directory: of the log; made if need be.
+        progress: called with the number of units so far, now and then.
+
+    Raises:
+        UserError: the log is there already.
+        OSError: it cannot be written; nothing is left of it.
+    """
+    log: ImportLog | None = None
+    try:
+        for number, unit in enumerate(merge(captures, routes)):
+            log = log or ImportLog(config, directory, unit.time_ns)
+            log.add(unit)
+            if number % 10_000 == 0:
+                progress(number)
+        if log is None:
+            return ImportReport("", [], {})
+        for capture in captures:
+            _note(log, capture)
+        log.finish()
+    except BaseException:
+        if log is not None:
+            log.give_up()
+        raise
+    return ImportReport(log.info.session_id, log.paths, log.units())
+
+
+def _note(log: ImportLog, capture: Capture) -> None:
+    told = ", ".join(f"{count} units of {source}" for source, count in capture.units.items()) or "no unit"
+    log.event(Severity.INFO, "capture_imported", f"{capture.path.name}: {told}")
+    if capture.tally.damage:
+        text = f"{capture.tally.damage} places of {capture.path.name}; the first: {capture.tally.first_damage}"
+        log.event(Severity.WARNING, "capture_damaged", text)

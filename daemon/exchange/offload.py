@@ -1,0 +1,326 @@
+"""Copies finished logs to another disk and proves each copy by reading it back. Nothing is deleted or overwritten."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.checksum_list import NAME, ChecksumList
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.durable import try_sync_directory
+from swath.daemon.log.format import MAGIC
+from swath.daemon.log.parts import read_sign
+from swath.daemon.log.reader import RECOVERED
+
+PARTIAL = ".partial"
+BLOCK_BYTES = 4 << 20
+SYNC_BYTES = 64 << 20  # so much is handed to the disk before it is waited for
+SAME_TIME_S = 2.0  # a copy has its log's time, as far as its file system keeps it: FAT does to two seconds
+SIGN_BELIEVED_S = 60.0  # of a file system without locks: a log named as growing is, while it does
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+Progress = Callable[[str, int, int], None]  # name, bytes done, bytes in all: the copy and reading it back
+
+
+class CopyDiffersError(Exception):
+    """What was read back, or stands there, is not what the log holds; one line."""
+
+
+class NoRoomError(Exception):
+    """The destination is full; one line."""
+
+
+@dataclass(slots=True)
+class Copied:
+    """A log whose copy has been read back.
+
+    Attributes:
+        resumed_bytes: that an earlier, interrupted run had copied.
+    """
+
+    name: str
+    bytes: int
+    sha256: str
+    resumed_bytes: int
+
+
+@dataclass(slots=True)
+class OffloadReport:
+    """What was done, and what was not.
+
+    Attributes:
+        there: names of logs whose checked copy was there already.
+        recording: names of logs that are being recorded.
+        left_open: names of copied logs that a crash left open and nobody has repaired.
+        deletable: logs whose copies were read back and agreed.
+        differ, failed: lines, one a log.
+        stopped: why the logs after it were not looked at; "" when all were.
+    """
+
+    directory: Path
+    destination: Path
+    copied: list[Copied] = field(default_factory=list)
+    there: list[str] = field(default_factory=list)
+    recording: list[str] = field(default_factory=list)
+    left_open: list[str] = field(default_factory=list)
+    deletable: list[Path] = field(default_factory=list)
+    differ: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    stopped: str = ""
+
+    def plain(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "directory": str(self.directory),
+            "destination": str(self.destination),
+            "copied": [
+                {"name": one.name, "bytes": one.bytes, "sha256": one.sha256, "resumed_bytes": one.resumed_bytes}
+                for one in self.copied
+            ],
+            "there": self.there,
+            "recording": self.recording,
+            "left_open": self.left_open,
+            "may_be_deleted": [str(path) for path in self.deletable],
+            "differ": self.differ,
+            "failed": self.failed,
+            "stopped": self.stopped or None,
+        }
+
+
+def offload(
+    directory: Path,
+    destination: Path,
+    *,
+    verify: bool = False,
+    same_disk: bool = False,
+    progress: Progress | None = None,
+) -> Generator[OffloadReport, None, None]:
+    """Copy log after log; gives the growing report after each.
+
+    Args:
+        directory: of the logs.
+        destination: a folder that is there, on another disk.
+        verify: read copies that are there already again.
+        same_disk: the destination may be on the logs' own disk.
+        progress: is told how far a log is.
+
+    Raises:
+        UserError: the destination cannot be used, or another run is at work there.
+    """
+    report = OffloadReport(directory, destination)
+    with _taken(directory, destination, same_disk):
+        sums = _sums_of(destination)
+        for path in sorted(directory.glob("*.mcap")):
+            if is_growing(path):
+                report.recording.append(path.name)
+            else:
+                _offload_one(path, report, sums, verify, progress or _nothing)
+            yield report
+            if report.stopped:
+                return
+
+
+def _sums_of(destination: Path) -> ChecksumList:
+    try:
+        return ChecksumList(destination)
+    except OSError as error:
+        text = f"{destination / NAME}: {error.strerror}; want another folder, or to be the user who copied there before"
+        raise UserError(text, ExitCode.IO) from error
+
+
+def _nothing(name: str, done: int, total: int) -> None:
+    """Tells nobody."""
+
+
+@contextlib.contextmanager
+def _taken(directory: Path, destination: Path, same_disk: bool) -> Iterator[None]:
+    """The destination, for one run at a time."""
+    if not destination.is_dir():
+        raise UserError(f"{destination}: no such directory; is the disk mounted?", ExitCode.IO)
+    if destination.samefile(directory):
+        raise UserError(f"{destination}: is where the logs are; give a folder on another disk", ExitCode.USAGE)
+    if not same_disk and destination.stat().st_dev == directory.stat().st_dev:
+        # the empty folder that another disk is mounted at looks like that disk
+        text = f"{destination}: is on the same disk as {directory}; is the other disk mounted?"
+        raise UserError(f"{text} --same-disk copies all the same", ExitCode.IO)
+    if not os.access(destination, os.R_OK | os.W_OK | os.X_OK):
+        raise UserError(f"{destination}: cannot be written: mounted read-only, or not permitted", ExitCode.IO)
+    folder = os.open(destination, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks has none to ask for
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"{destination}: another swath offload is at work there", ExitCode.IO) from None
+        yield
+    finally:
+        os.close(folder)
+
+
+def is_growing(path: Path) -> bool:
+    """Whether a log is being recorded."""
+    if is_being_written(path):
+        return True
+    sign = read_sign(path.parent)
+    if sign is None or sign.path != path:
+        return False
+    with contextlib.suppress(FileNotFoundError):
+        return time.time() - path.stat().st_mtime < SIGN_BELIEVED_S
+    return False
+
+
+def _offload_one(path: Path, report: OffloadReport, sums: ChecksumList, verify: bool, progress: Progress) -> None:
+    try:
+        if (report.destination / path.name).exists():
+            _check_there(path, report, sums, verify, progress)
+        else:
+            _copy_new(path, report, sums, progress)
+        left_open = _is_left_open(path)
+    except CopyDiffersError as error:
+        report.differ.append(str(error))
+    except NoRoomError as error:
+        report.stopped = str(error)
+    except OSError as error:
+        report.failed.append(f"{error.filename or path}: {error.strerror or error}")
+    else:
+        report.deletable.append(path)
+        if left_open:
+            report.left_open.append(path.name)
+
+
+def _is_left_open(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - len(MAGIC)))
+        repaired = path.with_name(path.name.removesuffix(".mcap") + RECOVERED).exists()
+        return file.read() != MAGIC and not repaired
+
+
+def _check_there(path: Path, report: OffloadReport, sums: ChecksumList, verify: bool, progress: Progress) -> None:
+    """A copy is there: it was read back when it was made, or is compared now.
+
+    One of another time may be of another log with this name, of an import made anew for example.
+    """
+    copy, size = report.destination / path.name, path.stat().st_size
+    known = sums.sums.get(path.name)
+    differs = CopyDiffersError(f"{copy}: is there and is not {path}; nothing was overwritten")
+    if copy.stat().st_size != size:
+        raise differs
+    if known is None or verify or abs(copy.stat().st_mtime - path.stat().st_mtime) > SAME_TIME_S:
+        digest = digest_of(path, lambda done: progress(path.name, done, 2 * size))
+        if digest_of(copy, lambda done: progress(path.name, size + done, 2 * size)) != digest:
+            raise differs
+        if known != digest:
+            sums.add(path.name, digest)
+    report.there.append(path.name)
+
+
+def _copy_new(path: Path, report: OffloadReport, sums: ChecksumList, progress: Progress) -> None:
+    copy, size = report.destination / path.name, path.stat().st_size
+    partial = copy.with_name(copy.name + PARTIAL)
+    had = partial.stat().st_size if partial.exists() else 0
+    free = shutil.disk_usage(report.destination).free
+    if free < size - had:
+        raise NoRoomError(_no_room(report, path, size - had, free))
+    try:
+        digest, resumed = _copy_and_read_back(path, partial, progress)
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise NoRoomError(_no_room(report, path, size, shutil.disk_usage(report.destination).free)) from error
+    times = path.stat()
+    os.utime(partial, ns=(times.st_atime_ns, times.st_mtime_ns))
+    partial.rename(copy)
+    try_sync_directory(report.destination)
+    sums.add(path.name, digest)
+    report.copied.append(Copied(path.name, size, digest, resumed))
+
+
+def _no_room(report: OffloadReport, path: Path, needed: int, free: int) -> str:
+    room = f"{path.name} needs {needed / 1e6:,.0f} MB, {free / 1e6:,.0f} MB are free"
+    return (
+        f"{report.destination}: no space left: {room}; "
+        "make room or give another disk, the same command goes on from here"
+    )
+
+
+def _copy_and_read_back(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:
+    """SHA-256 of the log and how much of the copy was there; what an interruption left wrong is copied anew."""
+    digest, resumed = _copy(path, partial, progress)
+    size = path.stat().st_size
+    for had in (resumed, 0):
+        if digest_of(partial, lambda done: progress(path.name, size + done, 2 * size)) == digest:
+            return digest, had
+        partial.unlink()
+        if not had:
+            break
+        digest, _ = _copy(path, partial, progress)
+    raise CopyDiffersError(f"{partial}: was read back otherwise than it was written; that disk is not to be trusted")
+
+
+def _copy(path: Path, partial: Path, progress: Progress) -> tuple[str, int]:
+    """Copy what the partial copy lacks; the sum is of all that was read of the log."""
+    target = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    try:
+        with path.open("rb", buffering=0) as source:
+            size = os.fstat(source.fileno()).st_size
+            had = min(os.fstat(target).st_size, size)
+            os.ftruncate(target, had)
+            digest, at = hashlib.sha256(), 0
+            for block in _blocks(source.fileno()):
+                digest.update(block)
+                if at + len(block) > had:
+                    _write(target, block[max(0, had - at) :], max(at, had))
+                at += len(block)
+                progress(path.name, at, 2 * size)
+                if at % SYNC_BYTES == 0:
+                    _let_go(target)
+            _let_go(target)
+            os.fsync(target)
+    finally:
+        os.close(target)
+    if at != size:
+        raise OSError(errno.EIO, f"{at} bytes were read instead of {size}", str(path))
+    return digest.hexdigest(), had
+
+
+def _write(fd: int, data: bytes, at: int) -> None:
+    while data:
+        written = os.pwrite(fd, data, at)
+        data, at = data[written:], at + written
+
+
+def _let_go(fd: int) -> None:
+    """Bring to the disk what was written, and give its memory back: the recorder's cache is not to be pushed out."""
+    os.fdatasync(fd)
+    os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def _blocks(fd: int) -> Iterator[bytes]:
+    """A file from its beginning, its memory given back behind."""
+    at = 0
+    while block := os.pread(fd, BLOCK_BYTES, at):
+        yield block
+        os.posix_fadvise(fd, at, len(block), os.POSIX_FADV_DONTNEED)
+        at += len(block)
+
+
+def digest_of(path: Path, progress: Callable[[int], None]) -> str:
+    """SHA-256 of a file as it is on the disk: what of it was in memory is dropped first; raises OSError."""
+    digest, done = hashlib.sha256(), 0
+    with path.open("rb", buffering=0) as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        for block in _blocks(file.fileno()):
+            digest.update(block)
+            done += len(block)
+            progress(done)
+    return digest.hexdigest()

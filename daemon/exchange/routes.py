@@ -1,0 +1,102 @@
+"""Which device of a configuration the units of a capture belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from swath.daemon.config import Config
+from swath.daemon.log.format import ChannelSpec
+from swath.daemon.recorder.receivers import Wire
+from swath.daemon.recorder.run import make_wire
+from swath.drivers.captures.base import CapturedUnit
+from swath.drivers.transports.spec import TransportSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A wire of the configuration: a device's port, or a PPS source.
+
+    Attributes:
+        source: ``kind/name``, with ``/aux`` for a second port.
+        kind: "serial", "can", "udp" or "pps".
+        spec: its transport; None for PPS.
+        channel: how its units are described in the log, without a sender.
+        edge: of a PPS source, which edge is the second.
+    """
+
+    source: str
+    kind: str
+    spec: TransportSpec | None
+    channel: ChannelSpec
+    edge: str = ""
+
+    @property
+    def options(self) -> dict[str, str]:
+        """Of the transport."""
+        return self.spec.options if self.spec is not None else {}
+
+
+def _port(wire: Wire, spec: TransportSpec) -> Port:
+    channel = ChannelSpec(wire.topic, wire.encoding, wire.metadata, None, wire.chunk_class)
+    return Port(wire.source, spec.kind, spec, channel)
+
+
+def _ports(config: Config) -> Iterator[Port]:
+    for name, pps in config.pps.items():
+        channel = ChannelSpec(f"/pps/{name}", "json", {}, "swath.Pps", "other")
+        yield Port(f"pps/{name}", "pps", None, channel, pps.edge)
+    for device in config.devices():
+        for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
+            if spec is not None and spec.kind != "gnss":
+                yield _port(make_wire(device, spec, suffix), spec)
+
+
+@dataclass(slots=True)
+class Routes:
+    """The ports of a configuration, by what a capture says of a unit."""
+
+    ports: dict[str, Port]
+    _udp: dict[int, list[Port]] = field(default_factory=dict)
+    _can: dict[str, Port | None] = field(default_factory=dict)  # None: two buses are called so
+
+    @classmethod
+    def of(cls, config: Config) -> Routes:
+        """Those of a configuration."""
+        routes = cls({port.source: port for port in _ports(config)})
+        for port in routes.ports.values():
+            if port.spec is not None and port.kind == "udp":
+                routes._udp.setdefault(port.spec.port, []).append(port)
+            elif port.spec is not None and port.kind == "can":
+                routes._can[port.spec.channel] = None if port.spec.channel in routes._can else port
+        return routes
+
+    def of_datagram(self, unit: CapturedUnit) -> Port | None:
+        """By the port it was sent to, and by the sender where the configuration wants a certain one.
+
+        Of several sources on one port number, each bound to its own address or group, the receiver's address decides.
+        """
+        assert unit.source is not None
+        assert unit.destination is not None
+        found = self._udp.get(unit.destination[1])
+        if found is None or (len(found) == 1 and "source" not in found[0].options):
+            return found[0] if found else None
+        found = [port for port in found if port.options.get("source", unit.source[0]) == unit.source[0]]
+        if len(found) > 1:
+            found = [port for port in found if _bound_to(port) == unit.destination[0]]
+        return found[0] if found else None
+
+    def of_frame(self, unit: CapturedUnit) -> Port | None:
+        """By the interface."""
+        return self._can.get(unit.channel)
+
+    def described(self, kind: str) -> str:
+        """The ports or buses there are, for people."""
+        if kind == "pcap":
+            return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
+        return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"
+
+
+def _bound_to(port: Port) -> str:
+    assert port.spec is not None
+    return port.spec.options.get("group", port.spec.host)

@@ -1,0 +1,1 @@
+"""The MCAP container: chunks, records, index, writer."""

@@ -1,0 +1,230 @@
+"""What logs hold, in numbers: counts, rates, gaps, losses, time status, damage. `swath info` shows it."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from swath.daemon.log.mcap.chunks import LogBatch, json_objects
+from swath.daemon.log.parsers import stored_parsers
+from swath.daemon.log.reader import Session
+from swath.daemon.replay.units import source_of_topic
+from swath.drivers.parser import Parser
+from swath.georef.records import ChunkBatch, Int64Array
+
+USUAL_SHARE = 0.95  # intervals up to this quantile are usual, bursts and pauses between them alike
+GAP_MIN_NS = 1 << 27  # 0.134 s: a scanner whose laser is off still speaks ten times a second
+MAX_MARKS = 10_000  # nobody marks more in a flight; a stranger's log may say anything
+MAX_WORDS = 32
+_ACCOUNT = ("units", "written", "lost_kernel", "lost_queue", "lost_write")
+_TROUBLE = ("bus_off", "error_frames", "line_errors", "refused")
+
+
+@dataclass(slots=True)
+class Intervals:
+    """Time between units, in bins of powers of two of a nanosecond: bounded memory for any length of log."""
+
+    bins: Int64Array = field(default_factory=lambda: np.zeros(64, np.int64))
+    longest_ns: int = 0
+    longest_at_ns: int = 0
+    _last_ns: int | None = None
+
+    def add(self, times_ns: Int64Array) -> None:
+        """Times of the next units."""
+        if self._last_ns is not None:
+            times_ns = np.concatenate([[self._last_ns], times_ns])
+        self._last_ns = int(times_ns[-1])
+        steps = np.maximum(np.diff(times_ns), 0)
+        if not len(steps):
+            return
+        self.bins += np.bincount(np.frexp(steps.astype(np.float64))[1], minlength=64)[:64]
+        widest = int(steps.argmax())
+        if steps[widest] > self.longest_ns:
+            self.longest_ns, self.longest_at_ns = int(steps[widest]), int(times_ns[widest])
+
+    def gaps(self) -> int:
+        """Intervals in a higher bin than the usual ones, so up to twice as long or longer, and above `GAP_MIN_NS`."""
+        total = int(self.bins.sum())
+        if total < 3:
+            return 0
+        usual_bin = int(np.searchsorted(self.bins.cumsum(), USUAL_SHARE * total))
+        first = max(usual_bin + 1, int(np.frexp(float(GAP_MIN_NS))[1]))
+        return int(self.bins[first:].sum())
+
+
+@dataclass(slots=True)
+class SourceNumbers:
+    """One source of a session."""
+
+    units: int = 0
+    bytes: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    intervals: Intervals = field(default_factory=Intervals)
+    status: dict[str, Any] | None = None
+    time_states: Counter[str] = field(default_factory=Counter)
+    account_errors: int = 0
+    miscounted: int = 0
+    parser: Parser | None = None
+    records: Counter[str] = field(default_factory=Counter)
+
+    def add(self, times_ns: Int64Array, units: Any) -> None:
+        """Units that were read."""
+        self.units += len(times_ns)
+        self.bytes += int(units.size)
+        self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
+        self.last_ns = int(times_ns[-1])
+        self.intervals.add(times_ns)
+
+    def add_status(self, status: dict[str, Any]) -> None:
+        """A status: its equation must hold, and ``written`` be what has been read before it, unless some is missing."""
+        self.status = status
+        units, written, *lost = (_count(status, key) for key in _ACCOUNT)
+        self.account_errors += units != written + sum(lost)
+        self.miscounted += written != self.units
+        if "time_state" in status:
+            _count_word(self.time_states, status["time_state"])
+
+    def plain(self, *, complete: bool) -> dict[str, Any]:
+        """For ``--json``; of a complete log every status must agree with the units read before it."""
+        first, last = self.first_ns, self.last_ns
+        duration_s = (last - first) * 1e-9 if first is not None and last is not None else 0.0
+        status = self.status or {}
+        numbers: dict[str, Any] = {
+            "units": self.units,
+            "bytes": self.bytes,
+            "rate_hz": round((self.units - 1) / duration_s, 3) if duration_s > 0 else None,
+            "longest_gap_s": round(self.intervals.longest_ns * 1e-9, 6),
+            "longest_gap_at_ns": self.intervals.longest_at_ns or None,
+            "gaps": self.intervals.gaps(),
+            "lost": {key: _count(status, key) for key in _ACCOUNT[2:]},
+            "trouble": {key: count for key in _TROUBLE if (count := _count(status, key))},
+            "account_errors": self.account_errors + (self.miscounted if complete else 0),
+            "state": status.get("state"),
+            "has_status": self.status is not None,
+        }
+        if self.time_states:
+            numbers["time_state"] = status.get("time_state")
+            numbers["time_sigma_ns"] = status.get("time_sigma_ns")
+            numbers["time_states"] = dict(self.time_states)
+        if self.parser is not None:
+            counters = self.parser.counters
+            numbers["decoded"] = {
+                "messages": dict(counters.messages),
+                "records": dict(self.records),
+                "bad_checksums": counters.bad_checksums,
+                "bad_messages": counters.bad_messages,
+                "bytes_skipped": counters.bytes_skipped,
+                "errors": dict(counters.errors),
+            }
+        return numbers
+
+
+@dataclass(slots=True)
+class EventNumbers:
+    """Events of a session: how many of each severity, the operator's marks, the last that are no mere information."""
+
+    severities: Counter[str] = field(default_factory=Counter)
+    marks: list[dict[str, Any]] = field(default_factory=list)
+    last: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=10))
+
+    def add(self, event: dict[str, Any]) -> None:
+        """The next event."""
+        _count_word(self.severities, event.get("severity"))
+        if event.get("code") == "mark" and len(self.marks) < MAX_MARKS:
+            self.marks.append(event)
+        if event.get("severity") != "info":
+            self.last.append(event)
+
+
+def session_statistics(
+    session: Session, *, decode: bool = True, progress: Callable[[int], None] | None = None
+) -> dict[str, Any]:
+    """All numbers of a session, in one pass over its parts.
+
+    Args:
+        session: as `open_logs` gives it.
+        decode: run the sources' parsers, for their messages, checksum errors and the devices' own sequence gaps.
+        progress: called with the bytes of every batch.
+    """
+    attachments = session.attachments()
+    parsers, troubles = stored_parsers(attachments) if decode else ({}, [])
+    sources: dict[str, SourceNumbers] = {}
+    events = EventNumbers()
+    first_ns: int | None = None
+    last_ns = 0
+    for batch in session.batches():
+        start, end = int(batch.log_time_ns.min()), int(batch.log_time_ns.max())
+        first_ns = start if first_ns is None else min(first_ns, start)
+        last_ns = max(last_ns, end)
+        _take(batch, sources, events, parsers)
+        if progress is not None:
+            progress(batch.rows.size)
+    for numbers in sources.values():
+        if numbers.parser is not None:
+            numbers.records.update(type(record).__name__ for record in numbers.parser.close())
+    complete = not session.missing_parts and not session.damage
+    return {
+        "session_id": session.session_id,
+        "software": session.info.software,
+        "host": session.info.host,
+        "origin": session.info.origin or "recording",
+        "start_ns": first_ns,
+        "duration_s": round((last_ns - first_ns) * 1e-9, 3) if first_ns is not None else 0.0,
+        "bytes": sum(part.path.stat().st_size for part in session.parts),
+        "parts": [part.path.name for part in session.parts],
+        "missing_parts": session.missing_parts,
+        "growing": None if session.growing is None else session.growing.name,
+        "attachments": sorted(attachments),
+        "sources": {source: numbers.plain(complete=complete) for source, numbers in sorted(sources.items())},
+        "events": dict(events.severities),
+        "marks": events.marks,
+        "last_events": list(events.last),
+        "damage": [
+            {
+                "file": entry.path.name,
+                "offset": entry.damage.offset,
+                "length": entry.damage.length,
+                "what": entry.damage.what,
+                "messages": entry.damage.messages,
+            }
+            for entry in session.damage
+        ],
+        "notes": troubles,
+    }
+
+
+def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbers, parsers: dict[str, Parser]) -> None:
+    topic = batch.channel.topic
+    source = source_of_topic(topic)
+    if source is not None:
+        numbers = sources.setdefault(source, SourceNumbers())
+        numbers.add(batch.log_time_ns, batch.units)
+        parser = parsers.get(source.removesuffix("/aux"))
+        if parser is not None:
+            numbers.parser = parser
+            for record in parser.feed_batch(ChunkBatch(source, batch.log_time_ns, batch.units)):
+                rows = getattr(record, "rows", None)
+                numbers.records[type(record).__name__] += 1 if rows is None else len(rows)
+    elif topic.startswith("/status/"):
+        numbers = sources.setdefault(topic.removeprefix("/status/"), SourceNumbers())
+        for _, value in json_objects(batch):
+            numbers.add_status(value)
+    elif topic == "/events":
+        for _, value in json_objects(batch):
+            events.add(value)
+
+
+def _count_word(counts: Counter[str], word: object) -> None:
+    """One of a few words; a stranger's many are one."""
+    key = str(word)[:64]
+    counts[key if key in counts or len(counts) < MAX_WORDS else "other"] += 1
+
+
+def _count(status: dict[str, Any], key: str) -> int:
+    value = status.get(key)
+    return value if isinstance(value, int) else 0

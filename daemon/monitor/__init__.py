@@ -1,0 +1,1 @@
+"""What a recorder says of itself, shown."""

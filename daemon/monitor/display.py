@@ -1,0 +1,241 @@
+"""Looks at a recorder by the log that grows and by nothing else: how every source does, the disk, the last events."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.format import LogError, SessionInfo
+from swath.daemon.log.mcap.chunks import LogBatch, json_objects
+from swath.daemon.log.parsers import stored_config, stored_drivers
+from swath.daemon.monitor.source import Decoding, SourceWatch, decoded_trouble
+from swath.daemon.recorder.health import duration_text, source_trouble
+from swath.daemon.recorder.run import read_boot_id
+from swath.daemon.replay.units import source_of_topic
+
+TAIL_S = 5.0
+EVENTS_KEPT = 50
+STALE_S = 5.0  # a status comes each second; a disk may take its time
+LITTLE_LEFT_S = 900.0
+RECORDING, DEGRADED, NOT_RECORDING = "recording", "degraded", "not recording"
+
+
+class Monitor:
+    """Follows what is recorded in a directory; `poll` reads on, `snapshot` says how things are."""
+
+    def __init__(self, directory: Path, *, decode: bool = True) -> None:
+        """``decode``: run the sources' parsers, for rates of records, damaged messages and gaps."""
+        self._directory = directory
+        self._decode = decode
+        self._follower = LogFollower(directory, TAIL_S, every_part=False)
+        self._part: PartFollower | None = None
+        self._sources: dict[str, SourceWatch] = {}
+        self._inside: dict[str, list[str]] = {}  # devices by the stream that they lie in
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
+        self._notes: list[str] = []
+        self._reserve_bytes = 0
+        self._damaged = 0
+        self._newest_ns = 0
+        self._began_s = time.monotonic()
+        self._grown_s: float | None = None  # when a newer message was seen than was there at the beginning
+
+    def close(self) -> None:
+        """Close the log."""
+        self._follower.close()
+
+    # ------------------------------------------------------------------ reading
+
+    def poll(self) -> None:
+        """Take what has been recorded since the last call; where nothing ever was since, the end of what was."""
+        begun, newest_ns = self._part is not None, self._newest_ns
+        for batch in self._follower.poll():
+            if self._follower.part is not self._part:
+                self._begin_part(self._follower.part)
+            self._take(batch)
+        if begun and self._newest_ns != newest_ns:
+            self._grown_s = time.monotonic()
+        if self._part is None and self._follower.part is None:
+            self._read_latest()
+
+    def _begin_part(self, part: PartFollower | None) -> None:
+        before, self._part = self._part, part
+        if before is not None:
+            self._damaged += before.damaged
+        if part is None or (before is not None and before.info.session_id == part.info.session_id):
+            return
+        self._sources.clear()
+        self._newest_ns = self._damaged = 0
+        drivers, self._notes = stored_drivers(part.attachments) if self._decode else ({}, [])
+        for source, make_parser in drivers.items():
+            self._sources[source] = SourceWatch(source, Decoding(make_parser))
+        self._reserve_bytes, self._inside = 0, {}
+        try:
+            config = stored_config(part.attachments)
+        except LogError:
+            config = None  # another version's: the notes say so
+        if config is not None:
+            self._reserve_bytes = int(config.session.reserve_mb * 1e6)
+            for kind, name, table in config.device_tables():
+                if table.transport.startswith("gnss:"):
+                    stream = f"gnss/{table.transport.removeprefix('gnss:')}"
+                    self._inside.setdefault(stream, []).append(f"{kind}/{name}")
+
+    def _take(self, batch: LogBatch) -> None:
+        topic = batch.channel.topic
+        self._newest_ns = max(self._newest_ns, int(batch.log_time_ns[-1]))
+        source = source_of_topic(topic)
+        if source is not None:
+            self._watch(source).add_units(batch)
+            for other in [source.removesuffix("/aux")] if source.endswith("/aux") else self._inside.get(source, ()):
+                self._watch(other).decode(batch)
+        elif topic.startswith("/status/"):
+            watch = self._watch(topic.removeprefix("/status/"))
+            for time_ns, value in json_objects(batch):
+                watch.add_status(time_ns, value)
+        elif topic == "/events":
+            self._events.extend(value for _, value in json_objects(batch))
+
+    def _watch(self, source: str) -> SourceWatch:
+        return self._sources.setdefault(source, SourceWatch(source, None))
+
+    def _read_latest(self) -> None:
+        """Events of the newest log of the directory, which say why nothing is recorded now."""
+        paths = sorted(self._directory.glob("*.mcap"), key=_modified, reverse=True)
+        for path in paths[:1]:
+            try:
+                part = PartFollower(path)
+            except (LogError, OSError):
+                return
+            self._events.clear()
+            for batch in part.tail(TAIL_S):
+                if batch.channel.topic == "/events":
+                    self._events.extend(value for _, value in json_objects(batch))
+            part.close()
+
+    # ------------------------------------------------------------------ saying
+
+    @property
+    def is_undecided(self) -> bool:
+        """Whether growth would still show that a log is recorded whose recorder cannot be asked."""
+        waiting = self._grown_s is None and time.monotonic() - self._began_s < STALE_S
+        return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
+
+    def snapshot(self) -> dict[str, Any]:
+        """How things are now, as plain values: the form of ``--json``."""
+        now_ns = None if self._part is None else self._now_ns(self._part.info)
+        why_not = self._why_not_recording(now_ns)
+        sources = {} if now_ns is None else self._plain_sources(now_ns)
+        rate = sum(values["bytes_per_s"] or 0.0 for values in sources.values())
+        room = self._room(rate)
+        troubles = self._troubles(sources, room) if why_not is None else [why_not]
+        verdict = NOT_RECORDING if why_not is not None else DEGRADED if troubles else RECORDING
+        found: dict[str, Any] = {
+            "verdict": verdict,
+            "directory": str(self._directory),
+            "session_id": None if self._part is None else self._part.info.session_id,
+            "part": None if self._part is None else self._part.number,
+            "troubles": troubles,
+            "sources": sources,
+            "bytes_per_s": round(rate),
+            **room,
+            "damaged_chunks": self._damaged_chunks,
+            "events": list(self._events),
+            "notes": self._notes,
+        }
+        return found | {"sentence": _sentence(found)}
+
+    @property
+    def _damaged_chunks(self) -> int:
+        return self._damaged + (0 if self._part is None else self._part.damaged)
+
+    def _now_ns(self, session: SessionInfo) -> int:
+        """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
+        own = _is_of_this_boot(session.boot_id)
+        return time.monotonic_ns() + session.realtime_ns - session.monotonic_ns if own else self._newest_ns
+
+    def _plain_sources(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        inside = {source: stream for stream, sources in self._inside.items() for source in sources}
+        found = {}
+        for source, watch in sorted(self._sources.items()):
+            if watch.status:
+                found[source] = watch.plain(now_ns)
+            elif source in inside:
+                found[source] = watch.plain(now_ns) | {"state": f"in {inside[source]}"}
+        return found
+
+    def _room(self, bytes_per_s: float) -> dict[str, Any]:
+        try:
+            disk = os.statvfs(self._directory)
+            free = disk.f_bavail * disk.f_frsize
+        except OSError:  # gone, as a disk that was pulled
+            free = 0
+        left_s = max(0, free - self._reserve_bytes) / bytes_per_s if bytes_per_s > 0 else None
+        hours = None if left_s is None else round(left_s / 3600, 2)
+        return {"free_bytes": free, "reserve_bytes": self._reserve_bytes, "hours_left": hours}
+
+    def _why_not_recording(self, now_ns: int | None) -> str | None:
+        sign = self._follower.sign
+        if sign is None:
+            last = self._events[-1] if self._events else None
+            told = "" if last is None else f"; last event: {last.get('code')}: {last.get('text')}"
+            return f"nothing is being recorded in {self._directory}{told}"
+        if self._part is None or now_ns is None:
+            return f"{sign.path.name} should grow and cannot be read (yet)"
+        own = _is_of_this_boot(sign.boot_id)  # locks of another computer need not be seen here
+        if own and sign.path == self._part.path and not is_being_written(sign.path):
+            return f"the recorder of {sign.path.name} is gone, and its log has no end"
+        if own:
+            age_s = (now_ns - self._newest_ns) * 1e-9
+        elif self._grown_s is not None:
+            age_s = time.monotonic() - self._grown_s
+        else:
+            looked_s = time.monotonic() - self._began_s
+            return f"{sign.path.name}, of another computer or of before a restart, has not grown for {looked_s:.0f} s"
+        if self._newest_ns and age_s > STALE_S:
+            return f"nothing has been written for {age_s:.0f} s"
+        return None
+
+    def _troubles(self, sources: dict[str, dict[str, Any]], room: dict[str, Any]) -> list[str]:
+        troubles = []
+        for source, values in sources.items():
+            status = self._sources[source].status
+            words = [source_trouble(source, status) if status else ""]
+            if "decoded" in values and (told := decoded_trouble(values["decoded"])):
+                words.append(told if words[0] else f"{source} {told}")
+            troubles.append(", ".join(filter(None, words)))
+        if self._damaged_chunks:
+            troubles.append(f"{self._damaged_chunks} chunks of the log DAMAGED")
+        hours = room["hours_left"]
+        if hours is not None and hours * 3600 < LITTLE_LEFT_S:
+            troubles.append(f"room for {duration_text(hours * 3600)} only")
+        return list(filter(None, troubles))
+
+
+def _is_of_this_boot(boot_id: str) -> bool:
+    return boot_id == read_boot_id()
+
+
+def _modified(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # gone meanwhile
+        return 0.0
+
+
+def _sentence(found: dict[str, Any]) -> str:
+    """The line of ``--once``."""
+    told = "; ".join(found["troubles"])
+    if found["verdict"] == NOT_RECORDING:
+        return f"NOT RECORDING: {told}"
+    count = len(found["sources"])
+    coming = f"all {count} sources are coming in" if count else "begins"
+    room = f"{found['free_bytes'] / 1e9:.1f} GB free"
+    if found["hours_left"] is not None:
+        room += f" ({duration_text(found['hours_left'] * 3600)})"
+    word = "recording" if found["verdict"] == RECORDING else "DEGRADED: recording"
+    return f"{word} {found['session_id']} part {found['part']}: {told or coming}; {room}"

@@ -1,0 +1,1 @@
+"""`swath calibrate` and `swath plan-calibration`."""

@@ -1,0 +1,150 @@
+"""What a user gives beside the logs: surveyed control, points picked in the strips, and polygons that planes fill.
+
+The last two are in the flight's coordinate system, ``output.crs``, as the strips' own points are.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.control.doubts import doubts
+from swath.calib.control.points import in_t, read_control
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight
+from swath.calib.ties.picked import picked_ties, read_picked
+from swath.daemon.errors import UserError
+from swath.daemon.processing.calibration.returns import KeptFlight
+from swath.daemon.text_files import text_of
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS = ("WKT", "name")
+FARTHEST = 1e9  # in any unit of a map
+_POLYGON = re.compile(r"^POLYGON\s*(?:Z\s*)?\(\(([^()]*)\)\)$", re.IGNORECASE)
+_WANT = 'want "POLYGON ((x y, x y, x y, x y))", one ring, no holes'
+
+
+class PolygonError(ValueError):
+    """A file of polygons that cannot be used; one line for the user."""
+
+
+def control_of(path: Path, flight: Flight, suffered: Collection[str]) -> tuple[tuple[ControlPoint, ...], list[str]]:
+    """Surveyed points in the flight's frame, and what is doubtful of them, a line each.
+
+    Args:
+        path: CSV as of `swath.calib.control.points.read_control`.
+        flight: with its points placed as well as is known.
+        suffered: kinds of doubts about the whole (`swath.calib.control.doubts.Doubt`) that are told only.
+
+    Raises:
+        UserError: it cannot be read, or is doubtful as a whole; ControlError: it is no such file.
+    """
+    points = in_t(read_control(text_of(path), str(path)), flight.frame)
+    found = doubts(flight, points)
+    refusing = [f"{path}: {one.text}" for one in found if one.refuses and one.kind not in suffered]
+    if refusing:
+        raise UserError(refusing[0])
+    return points, [f"{path}: {one.text}" for one in found]
+
+
+def ties_of(path: Path, kept: KeptFlight) -> Features:
+    """Tie points that were picked in the strips' points as they lie with the calibrations to start from.
+
+    Raises:
+        UserError: the file cannot be read, or none of it is a tie point; PickedError: it is no such file.
+    """
+    picked = read_picked(text_of(path), str(path))
+    places_t = _t_from_map(kept, np.stack([one.place for one in picked]))
+    found = picked_ties(kept.flight, [replace(one, place=at) for one, at in zip(picked, places_t, strict=True)])
+    if not found.ties:
+        why = ", ".join(f"{count} {reason}" for reason, count in found.refused.most_common(3))
+        raise UserError(f"{path}: no tie point is left ({why}); want places in output.crs, as the strips' points are")
+    return found
+
+
+def read_polygons(text: str, name: str) -> dict[str, FloatArray]:
+    """A CSV with the columns WKT and name, as GIS programs write layers of polygons.
+
+    Args:
+        text: of the file.
+        name: of the file, for messages.
+
+    Returns:
+        By name, corners (k, 2) in the file's coordinates, not closed.
+
+    Raises:
+        PolygonError: not such a file; line and what would be right.
+    """
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    try:
+        return _rings(reader, name)
+    except csv.Error as error:
+        raise PolygonError(f"{name}: line {reader.reader.line_num}: no CSV: {error}") from None
+
+
+def _rings(reader: csv.DictReader[str], name: str) -> dict[str, FloatArray]:
+    missing = [column for column in COLUMNS if column not in (reader.fieldnames or ())]
+    if missing:
+        raise PolygonError(f"{name}: line 1: no column {missing[0]}; want the columns {', '.join(COLUMNS)}")
+    found: dict[str, FloatArray] = {}
+    for row in reader:
+        where, key = f"{name}: line {reader.line_num}", (row["name"] or "").strip()
+        if not key or key in found:
+            wrong = f"{' '.join(key.split())} is there twice" if key else "is missing"
+            raise PolygonError(f"{where}: name: {wrong}; want one each")
+        found[key] = _ring(row["WKT"] or "", where)
+    if not found:
+        raise PolygonError(f"{name}: no polygons; want at least one")
+    return found
+
+
+def _ring(text: str, where: str) -> FloatArray:
+    match = _POLYGON.match(text.strip())
+    if match is None:
+        raise PolygonError(f"{where}: WKT: got {text.strip()[:40]!r}; {_WANT}")
+    corners = []
+    for corner in match[1].split(","):
+        try:
+            x, y = (float(word) for word in corner.split()[:2])
+        except ValueError:
+            x = y = math.nan
+        if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+            raise PolygonError(f"{where}: WKT: got the corner {corner.strip()!r}; {_WANT}")
+        corners.append((x, y))
+    if len(corners) > 1 and corners[0] == corners[-1]:
+        corners.pop()
+    if len(corners) < 3:
+        raise PolygonError(f"{where}: WKT: got {len(corners)} corners; want at least three")
+    return np.array(corners)
+
+
+def rings_of(path: Path, kept: KeptFlight) -> dict[str, FloatArray]:
+    """By name, corners (k, 2) east and north in t; UserError, PolygonError: as of `text_of`, `read_polygons`."""
+    polygons = read_polygons(text_of(path), str(path))
+    height = _height_on_map(kept)
+    rings = {}
+    for name, ring in polygons.items():
+        rings[name] = _t_from_map(kept, np.column_stack([ring, np.full(len(ring), height)]))[:, :2]
+    return rings
+
+
+def _height_on_map(kept: KeptFlight) -> float:
+    """Of the ground somewhere in the middle; that it is not so everywhere moves a corner by millimetres."""
+    mapping = kept.logged[0].setup.mapping
+    swath = kept.flight.swaths[len(kept.flight.swaths) // 2]
+    point_e = kept.flight.frame.e_from_t(np.asarray(swath.points_t[len(swath) // 2], np.float64)[np.newaxis])
+    return float(point_e[0, 2] if mapping is None else mapping.map_from_e(point_e)[0, 2])
+
+
+def _t_from_map(kept: KeptFlight, points_map: FloatArray) -> FloatArray:
+    mapping = kept.logged[0].setup.mapping
+    return kept.flight.frame.t_from_e(points_map if mapping is None else mapping.e_from_map(points_map))

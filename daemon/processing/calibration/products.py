@@ -1,0 +1,435 @@
+"""What `swath calibrate` writes: a calibration file a scanner; where wanted report, record and outcome."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swath import __version__
+from swath.calib.calibration_file import CalibrationFileError, Header, calibration_text
+from swath.calib.need import POINT, Need, need_of
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import ANGLES
+from swath.calib.profiles.check import Check
+from swath.calib.record.values import Plain
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import SeenFrom
+from swath.calib.strips.signatures import signatures
+from swath.calib.summary import Finding, ReportInput
+from swath.calib.validation.methods import Asked, validate
+from swath.calib.verdict import DEG, Verdict, held_words, judge
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.processing.calibration.model import in_words, key_of
+from swath.daemon.processing.calibration.record import instruments_of
+from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrateWish, paths_of
+from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
+from swath.daemon.processing.flights.read import trajectory_verdicts_of
+from swath.daemon.processing.georeferencing.sidecar import sha256_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
+from swath.daemon.processing.trajectory.files import write_whole
+from swath.daemon.processing.trajectory.verdict import Level
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+MAP_CELLS = 400  # across a map of differences
+BEYOND = 3.0  # sigmas, of strips and calibration together, beyond which strips contradict it
+
+
+@dataclass(frozen=True)
+class Told:
+    """The outcome as values for scripts, and as lines for people."""
+
+    record: dict[str, Any]
+    lines: list[str]
+
+
+def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
+    """Write all of it; what was there before is replaced last.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    tell("strips before and after", 0, 1)
+    before, after = before_and_after(done.kept.flight, done.flight, done.kept.logged[0].setup.mapping)
+    inputs = _inputs(wish, done)
+    headers = {name: _header(done, name, inputs) for name in done.adjusted.calibrations}
+    tell("checks", 0, 1)
+    carried = trajectory_verdicts_of(done.kept.logged)
+    findings = (
+        *trajectory_says(carried),
+        *done.findings,
+        *strips_say(done, after.cells.frame.cell_m),
+        *validation_says(done),
+    )
+    report = replace(_report(wish, done, headers, before, after, inputs), findings=findings)
+    verdict = judge(report)
+    source = done.kept.logged[0].source
+    headers = {
+        name: replace(_judged(header, done, name, verdict), trajectory=source) for name, header in headers.items()
+    }
+    try:
+        texts = {name: calibration_text(_named(done, name, headers), header) for name, header in headers.items()}
+    except CalibrationFileError as error:
+        raise UserError(str(error)) from error
+    files: dict[Path, bytes] = {path: texts[name].encode() for name, path in paths_of(wish, headers).items()}
+    record = _record(done, headers, before, after, inputs) | {
+        "model": in_words(wish.model),
+        "ibrc_knots": list(wish.model.ibrc_knots),
+        "verdict": _verdict_entry(verdict),
+        "need": _need_entry(report.need),
+        "carried": verdict_entry(carried, accepted=wish.logs.accept_verdict),
+    }
+    if wish.report is not None:
+        tell("report", 0, 1)
+        files |= _report_files(wish.report, done, report, wish.facts)
+        files[wish.report / OUTCOME] = (json.dumps(record, indent=2) + "\n").encode()
+    _write(files)
+    written = [str(path) for path in files]
+    reasons = [f"also: {reason.what}" for reason in verdict.reasons[1:]]
+    return Told(
+        record | {"files": written},
+        [
+            *first_lines(record["carried"]),
+            *_lines(done, wish.model.ibrc_knots, before, after),
+            *(verdict.sentence, *reasons, *written),
+        ],
+    )
+
+
+def trajectory_says(carried: Sequence[Carried]) -> list[Finding]:
+    """Return the verdicts on the trajectories, before all that was found with them: parameters took up their errors."""
+    change = "mend the trajectory, then calibrate anew"
+    return [Finding(one.sentence, change, math.inf, unusable=one.level is Level.UNUSABLE) for one in carried]
+
+
+def strips_say(done: Calibrated, cell_m: float) -> list[Finding]:
+    """Return effects that strips still show and that neither their sigmas nor the calibration's explain.
+
+    Args:
+        done: the outcome.
+        cell_m: side of the cells in which strips are compared.
+    """
+    seen = signatures(differences(done.flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(done.flight), done.prior)
+    found = []
+    for one in seen.found:
+        if one.level != "significant":
+            continue
+        known = max(float(each.all_sigmas[INDEX[one.effect.parameter]]) for each in done.adjusted.calibrations.values())
+        excess = abs(one.value) / (BEYOND * math.hypot(one.sigma, known))
+        if excess > 1.0:
+            change = "look at swath strips: a strip of its own kind, a bad trajectory, too few strips to part effects"
+            found.append(Finding(f"strips still show {one.words}", change, excess))
+    return found
+
+
+def validation_says(done: Calibrated) -> list[Finding]:
+    """Return the tests of a validation that the calibration fails on its own planes and control.
+
+    They have been adjusted with it, so what fails here fails in spite of that.
+    """
+    asked = Asked(done.control or None)
+    outcome = validate(done.flight, done.features, done.adjusted.calibrations, asked, done.prior)
+    change = "look at swath validate: its planes and pairs say where the calibration does not hold"
+    return [Finding(f"validation: {one.sentence}", change) for one in outcome.methods if one.passed is False]
+
+
+def _judged(header: Header, done: Calibrated, name: str, verdict: Verdict) -> Header:
+    """Return the header with the verdict on all, and what of this scanner was asked for and held."""
+    held = tuple(key_of(one.name)[0] for one in done.adjusted.held if one.scanner == name and one.name in INDEX)
+    reasons = tuple(one_line(reason.what) for reason in verdict.reasons)
+    return replace(header, verdict=verdict.level.words.lower(), verdict_reasons=reasons, held=held)
+
+
+def _named(done: Calibrated, name: str, headers: Mapping[str, Header]) -> Any:
+    return replace(done.adjusted.calibrations[name], id=headers[name].id, method=headers[name].method)
+
+
+def _write(files: Mapping[Path, bytes]) -> None:
+    try:
+        write_whole(files)
+    except OSError as error:
+        raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
+    """Name and SHA-256 of every file that went in; logs first."""
+    paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
+    given = (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons, wish.model_file)
+    paths += [path for path in given if path is not None]
+    return [(path.name, sha256_of(path)) for path in paths]
+
+
+def _header(done: Calibrated, name: str, inputs: list[tuple[str, str]]) -> Header:
+    now = dt.datetime.now(dt.UTC).replace(microsecond=0)
+    found = done.adjusted.calibrations[name]
+    digest = hashlib.sha256(found.parameters.tobytes() + "".join(sha for _, sha in inputs).encode()).hexdigest()
+    # a session may lack a scanner: its settings are those of its first, as of the heads
+    config = next(flight.setup.config for flight in done.kept.logged if name in flight.setup.scanners)
+    table = config.scanner[name]
+    logs = tuple(entry for entry in inputs if entry[0].endswith(".mcap"))
+    return Header(
+        id=f"{now:%Y-%m-%dT%H:%M:%SZ}-{digest[:4]}",
+        created=now,
+        method=method_of(done),
+        scanner_model=table.model,
+        scanner_serial=table.serial,
+        installation=config.profile.installation,
+        logs=logs,
+        variance_factor=done.adjusted.variance_factor,
+        redundancy=done.adjusted.redundancy,
+    )
+
+
+def method_of(done: Calibrated) -> str:
+    """The word of a calibration file for what it was made of."""
+    kinds = {"control" if plane.control else "planes" for plane in done.features.planes}
+    kinds |= {"tie_points" for _ in done.features.ties[:1]}
+    return kinds.pop() if len(kinds) == 1 else "combined"
+
+
+def _record(
+    done: Calibrated,
+    headers: Mapping[str, Header],
+    before: FlightStrips,
+    after: FlightStrips,
+    inputs: list[tuple[str, str]],
+) -> dict[str, Any]:
+    """For scripts."""
+    adjusted = done.adjusted
+    return {
+        "format": "swath.calibration",
+        "version": 1,
+        "software": f"swath {__version__}",
+        "calibrations": {name: header.id for name, header in headers.items()},
+        "unknowns": [
+            {"name": name, "start": start, "value": value, "sigma": sigma}
+            for name, start, value, sigma in zip(
+                adjusted.names,
+                adjusted.start.tolist(),
+                adjusted.values.tolist(),
+                adjusted.sigmas.tolist(),
+                strict=True,
+            )
+        ],
+        "correlation": adjusted.correlation.tolist(),
+        "held": [
+            {"scanner": one.scanner, "name": one.name, "why": one.why, "remedy": one.remedy} for one in adjusted.held
+        ],
+        "considered": [_considered_entry(adjusted, column) for column in range(len(adjusted.considered))],
+        "prealigned": {
+            name: {angle: found.value(angle) for angle in ANGLES} for name, found in done.prealigned.items()
+        },
+        "variance_factor": adjusted.variance_factor,
+        "redundancy": adjusted.redundancy,
+        "global_test": adjusted.global_test,
+        "iterations": adjusted.iterations,
+        "matchings": adjusted.matchings,
+        "groups": [
+            {"group": group.group, "observations": group.observations, "variance_factor": group.variance_factor}
+            for group in adjusted.groups
+        ],
+        "strips": {"before": strips_entry(before), "after": strips_entry(after)},
+        "profiles": profiles_entry(done.check),
+        "refused": dict(done.features.refused),
+        "notes": list(done.notes),
+        "inputs": [{"name": name, "sha256": digest} for name, digest in inputs],
+    }
+
+
+def _considered_entry(adjusted: Adjusted, column: int) -> dict[str, Any]:
+    """Return what was held, how well it is known, and by how much one sigma of it moves what was estimated; SI."""
+    one, moved = adjusted.considered[column], adjusted.movements[:, column]
+    told = {"told": one.told, "told_sigma": one.told_sigma} if math.isfinite(one.told) else {}
+    moves = dict(zip(adjusted.names, moved.tolist(), strict=True))
+    return {"scanner": one.scanner, "name": one.name, "value": one.value, "sigma": one.sigma, **told, "moves": moves}
+
+
+def _need_entry(need: Need | None) -> dict[str, Any] | None:
+    """Return what is wanted and what the calibration leaves in points; SI."""
+    return None if need is None else finite(asdict(need))
+
+
+def strips_entry(strips: FlightStrips) -> dict[str, Any]:
+    """Height differences of all pairs together, and pair by pair, and the quality level by them."""
+    told = strips.agreement.numbers or {}
+    every = {"n": told.get("cells", 0)} | {key: told.get(key) for key in ("mean_m", "std_m", "rms_m")}
+    pairs = [
+        {"first": first, "second": second, "n": one.count, "mean_m": one.mean_m, "std_m": one.std_m, "rms_m": one.rms_m}
+        for (first, second), one in strips.pairs().items()
+    ]
+    return {"all": every, "pairs": pairs, "quality": finite(strips.agreement.record())}
+
+
+def profiles_entry(check: Check) -> dict[str, Any]:
+    """What profiles say beside the adjustment, and each of them; SI."""
+    profiles = [
+        {
+            "kind": one.kind,
+            "scanner": one.scanner,
+            "strips": list(one.names),
+            "separation_m": one.separation_m,
+            "baseline_m": one.baseline_m,
+            "found": one.found,
+            "pieces": one.pieces,
+            "formula": one.formula,
+        }
+        for one in check.profiles
+    ]
+    compared = [asdict(one) | {"normalised": one.normalised} for one in check.comparisons]
+    missing = [{"scanner": scanner, "kind": kind, "why": why} for (scanner, kind), why in check.missing.items()]
+    return {"comparisons": compared, "missing": missing, "profiles": profiles}
+
+
+def _verdict_entry(verdict: Verdict) -> dict[str, Any]:
+    reasons = [{"level": one.level.name.lower(), "what": one.what, "remedy": one.change} for one in verdict.reasons]
+    return {"level": verdict.level.name.lower(), "sentence": verdict.sentence, "reasons": reasons}
+
+
+def _report(
+    wish: CalibrateWish,
+    done: Calibrated,
+    headers: Mapping[str, Header],
+    before: FlightStrips,
+    after: FlightStrips,
+    inputs: list[tuple[str, str]],
+) -> ReportInput:
+    return ReportInput(
+        flight=done.flight,
+        features=done.features,
+        adjusted=done.adjusted,
+        headers=headers,
+        before=before.pairs(),
+        after=after.pairs(),
+        differences=difference_map(before, after, _middle_on_map(done), MAP_CELLS),
+        measure=after.agreement.measure,
+        level=level_words(after),
+        check=done.check,
+        inputs=inputs,
+        settings=_settings(wish, done),
+        need=need_of(done.flight, done.adjusted.calibrations, done.adjusted.trajectory, _wanted(done)),
+        notes=[note for note in done.notes if note not in done.adjusted.notes],  # which the report has anyway
+    )
+
+
+def _middle_on_map(done: Calibrated) -> list[float]:
+    """East and north of the flight's middle, from which maps count."""
+    mapping, frame = done.kept.logged[0].setup.mapping, done.flight.frame
+    return [0.0, 0.0] if mapping is None else mapping.map_from_e(frame.origin_e[np.newaxis])[0, :2].tolist()
+
+
+def level_words(strips: FlightStrips) -> str:
+    """The quality level that strips keep, in words."""
+    agreement = strips.agreement
+    if not agreement.judged:
+        return f"too few cells for a quality level ({agreement.cells:,} in {agreement.places} places)"
+    return f"strips keep {agreement.best or 'no quality level'}"
+
+
+def _wanted(done: Calibrated) -> dict[str, float]:
+    """Return what the configuration wants, SI, by parameter's name."""
+    factors = {parameter.key: (parameter.name, parameter.factor) for parameter in PARAMETERS} | {
+        "point_m": (POINT, 1.0)
+    }
+    wanted = done.kept.logged[0].setup.config.calibration.wanted.model_dump(exclude_none=True)
+    return {factors[key][0]: sigma * factors[key][1] for key, sigma in wanted.items()}
+
+
+def _report_files(folder: Path, done: Calibrated, report: ReportInput, facts: Mapping[str, Plain]) -> dict[Path, bytes]:
+    """The page, the same on paper, and a record a scanner as XML and JSON with its matrices beside it."""
+    from swath.calib.record.record import RecordInput, record_json, record_of, record_xml
+    from swath.daemon.processing.calibration.report.page import html, pdf
+    from swath.daemon.processing.calibration.report.profiles import pictures
+
+    report = replace(report, profiles=pictures(done.check, done.kept.flight, done.control))
+    files = {folder / "report.html": html(report).encode(), folder / "report.pdf": pdf(report)}
+    for name, header in report.headers.items():
+        matrices, known = f"{name}.record.npz", instruments_of(done.kept)
+        one = RecordInput(
+            done.flight, done.features, done.adjusted, name, header, facts, report.settings, matrices, known
+        )
+        record = record_of(one)
+        files[folder / f"{name}.record.xml"] = record_xml(record).encode()
+        files[folder / f"{name}.record.json"] = record_json(record).encode()
+        files[folder / matrices] = _npz(record.arrays())
+    return files
+
+
+def _npz(arrays: Mapping[str, Any]) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
+    air = done.kept.logged[0].setup.config.atmosphere
+    return {
+        "Swath": __version__,
+        "model": in_words(wish.model),
+        "observed": ", ".join(wish.observe) + (", control" if done.control else ""),
+        "trajectory": "; ".join(trajectory.name for trajectory in done.flight.trajectories),
+        "trajectory errors": "; ".join(done.prior.notes) or f"{len(done.prior)} knots",
+        "atmosphere": f"ranges {air.ranges}, refraction {air.refraction}",
+    }
+
+
+# ---------------------------------------------------------------------- for people
+
+
+def _lines(done: Calibrated, knots: Sequence[float], before: FlightStrips, after: FlightStrips) -> list[str]:
+    adjusted = done.adjusted
+    lines = [f"{'parameter':34}{'start':>14}{'found':>14}{'sigma':>12}"]
+    lines += _parameter_lines(adjusted, knots)
+    for held in adjusted.held:
+        remedy = f"; {held.remedy}" if held.remedy else ""
+        lines.append(f"not estimated: {held.scanner} {key_of(held.name, knots)[0]}: {held.why}{remedy}")
+    lines += [f"held: {words}" for words in held_words(adjusted)]
+    lines += _prealigned_lines(done)
+    planes, ties = len(done.features.planes), len(done.features.ties)
+    seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
+    control = sum(len(plane.control) for plane in done.features.planes)
+    used = f", {control} of {len(done.control)} control points" if done.control else ""
+    fit = f"redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"
+    lines.append(f"{' and '.join(seen)}{used}, {fit}")
+    rms = [f"{strips.rms_m:.3f} m" if math.isfinite(strips.rms_m) else "nothing" for strips in (before, after)]
+    lines.append(f"strips differ by {rms[0]} (RMSDz) before, {rms[1]} after; {level_words(after)}")
+    lines.append(after.agreement.measure)
+    lines += _profile_lines(done.check)
+    return [*lines, *(f"note: {note}" for note in done.notes)]
+
+
+def _prealigned_lines(done: Calibrated) -> list[str]:
+    """Return where iterations began, which is not the start that was given."""
+    starts = done.kept.flight.starts()
+    lines = []
+    for name, found in done.prealigned.items():
+        away = [f"{key_of(angle)[0]} {found.value(angle) * DEG:.3f}" for angle in ANGLES]
+        if any(abs(found.value(angle) - starts[name].value(angle)) > 1e-6 for angle in ANGLES):
+            lines.append(f"pre-aligned: {name}: {', '.join(away)}")
+    return lines
+
+
+def _profile_lines(check: Check) -> list[str]:
+    told = [f"{one.scanner}.{key_of(one.parameter)[0]} {one.normalised:+.1f}" for one in check.comparisons]
+    return [f"profiles less adjustment, in sigmas: {', '.join(told)}"] if told else []
+
+
+def _parameter_lines(adjusted: Adjusted, knots: Sequence[float]) -> list[str]:
+    lines = []
+    for name, start, value, sigma in zip(
+        adjusted.names, adjusted.start.tolist(), adjusted.values.tolist(), adjusted.sigmas.tolist(), strict=True
+    ):
+        scanner, _, bare = name.partition(".")
+        key, factor = key_of(bare, knots)
+        lines.append(f"{scanner + '.' + key:34}{start / factor:14.5f}{value / factor:14.5f}{sigma / factor:12.5f}")
+    return lines

@@ -1,0 +1,1 @@
+"""The calibration's report: pages, pictures, tables."""

@@ -1,0 +1,284 @@
+"""What a report says in tables: rows of words, the same for the page and for paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.labels import (
+    Unknown,
+    decimals_of,
+    is_undetermined,
+    length,
+    number,
+    plain,
+    share,
+    thousands,
+    unknown,
+    words_of,
+)
+from swath.calib.outcome import Held, Residuals
+from swath.calib.summary import ReportInput
+from swath.calib.verdict import held_words
+from swath.daemon.processing.calibration.report.pictures import SUSPECT
+from swath.georef.scanner.calibration import INDEX, PARAMETERS
+
+MOST_ROWS = 25
+INSIGNIFICANT = 2.0
+OBSERVED = {"range_m": "one range", "ties": "one coordinate of a tie point", "control": "one control point"}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of words.
+
+    Attributes:
+        title: above it; empty: it follows what stands there.
+        heads, rows: words; every row has as many as heads.
+        under: what to know of it.
+        left: columns whose words stand at the left and may wrap.
+        hashes: columns of long hexadecimal numbers.
+        pale: rows that are set back.
+        stacked: on narrow screens one cell stands below the other.
+    """
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    under: str = ""
+    left: tuple[int, ...] = (0,)
+    hashes: tuple[int, ...] = ()
+    pale: frozenset[int] = frozenset()
+    stacked: bool = False
+
+
+def parameter_tables(report: ReportInput) -> list[Table]:
+    """One a scanner: start, estimate, change, sigma, significance; what was held is set back."""
+    names = list(report.adjusted.calibrations)
+    return [_parameters(report, scanner, several=len(names) > 1) for scanner in names]
+
+
+def _parameters(report: ReportInput, scanner: str, *, several: bool) -> Table:
+    adjusted = report.adjusted
+    rows: list[list[str]] = []
+    for i, name in enumerate(adjusted.names):
+        one = unknown(name)
+        if one.scanner == scanner and one.is_parameter:
+            values = (
+                float(table[i]) for table in (adjusted.start, adjusted.values, adjusted.sigmas, adjusted.prior_sigmas)
+            )
+            rows.append(_estimated(one, *values))
+    estimated = len(rows)
+    held = {one.name: one for one in adjusted.held if one.scanner == scanner}
+    calibration = adjusted.calibrations[scanner]
+    for parameter in PARAMETERS:
+        if parameter.name in held:
+            one = unknown(f"{scanner}.{parameter.name}")
+            told = number(calibration.value(parameter.name) * one.factor, ".6g")
+            why = "not determined" if is_undetermined(held[parameter.name]) else "held"
+            sigma = float(calibration.held_sigmas[INDEX[parameter.name]]) * one.factor
+            plausible = number(sigma, f".{decimals_of(sigma)}f") if sigma > 0.0 else "–"
+            rows.append([one.words, one.unit, told, plausible, told, why, "–", "–"])
+    heads = ("parameter", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
+    honest = adjusted.trajectory is not None
+    words = "errors of the trajectory included" if honest else "too small: without what the trajectory's errors share"
+    under = f"Sigmas are one standard deviation, {words}, and what held parameters may have wrong."
+    for told in held_words(adjusted):
+        under += f" {told[0].upper()}{told[1:]}."
+    if any(row[6].endswith("·") for row in rows):
+        under += f" · the change is below {INSIGNIFICANT:g} sigmas: the start may have been as good."
+    title = f"Parameters of {scanner}" if several else "Parameters"
+    return Table(title, heads, rows, under, pale=frozenset(range(estimated, len(rows))))
+
+
+def _estimated(one: Unknown, start: float, value: float, sigma: float, prior: float) -> list[str]:
+    digits = decimals_of(sigma * one.factor)
+    start, value, sigma, prior = (one.factor * number_ for number_ in (start, value, sigma, prior))
+    pattern = f".{digits}f"
+    ratio = abs(value - start) / sigma if sigma > 0.0 else math.inf
+    told = thousands(ratio, 0) if ratio >= 100.0 else number(ratio, ".1f")
+    told += " ·" if ratio < INSIGNIFICANT else ""
+    change = number(value - start, f"+{pattern}")
+    told_value, told_sigma, told_start = (number(x, pattern) for x in (value, sigma, start))
+    return [
+        one.words,
+        one.unit,
+        told_value,
+        told_sigma,
+        told_start,
+        change,
+        told,
+        number(prior, f".{decimals_of(prior)}f"),
+    ]
+
+
+def entries_table(report: ReportInput) -> Table | None:
+    """Unknowns that are entries of tables: IBRC, beams, range offsets."""
+    adjusted = report.adjusted
+    rows = []
+    for i, name in enumerate(adjusted.names):
+        one = unknown(name)
+        if not one.is_parameter:
+            values = (
+                float(table[i]) for table in (adjusted.start, adjusted.values, adjusted.sigmas, adjusted.prior_sigmas)
+            )
+            row = _estimated(one, *values)
+            rows.append([f"{one.scanner}: {row[0]}", *row[1:]])
+    heads = ("entry", "unit", "estimate", "sigma", "start", "change", "change / sigma", "sigma before")
+    return Table("Tables of the calibration", heads, rows) if rows else None
+
+
+def held_table(report: ReportInput) -> Table | None:
+    """What this flight does not determine, and what would."""
+    several = len(report.adjusted.calibrations) > 1
+    held = [one for one in report.adjusted.held if is_undetermined(one)]
+    if not held:
+        return None
+    rows = [
+        [
+            words_of(one.scanner, one.name, several=several),
+            _would_be(one),
+            _alike(one),
+            plain(one.why, several=several),
+            plain(one.remedy, several=several),
+        ]
+        for one in held
+    ]
+    heads = ("parameter", "sigma it would have", "not to be told apart from", "why", "what would determine it")
+    under = "Held at the values they had before; what the calibration gives holds as far as these are right."
+    return Table("Not determined by this flight", heads, rows, under, left=(0, 2, 3, 4), stacked=True)
+
+
+def _would_be(held: Held) -> str:
+    one = unknown(f"{held.scanner}.{held.name}")
+    sigma = held.sigma * one.factor
+    return f"{number(sigma, f'.{decimals_of(sigma)}f')} {one.unit}" if math.isfinite(sigma) else "none"
+
+
+def _alike(held: Held) -> str:
+    names = [(name if "." in name else f"{held.scanner}.{name}", value) for name, value in held.with_others]
+    rows = [(unknown(name), value) for name, value in names]
+    return ", ".join(f"{one.words} ({number(value, '+.2f')})" for one, value in rows) or "–"
+
+
+def strips_table(report: ReportInput) -> Table | None:
+    """Height differences by pair of strips."""
+    if not report.after:
+        return None
+    rows = []
+    pairs = sorted(report.after, key=lambda pair: -report.after[pair].rms_m)
+    for pair in pairs[:MOST_ROWS]:
+        before, after = report.before.get(pair), report.after[pair]
+        early = "–" if before is None else number(100.0 * before.rms_m, ".1f")
+        told = [number(100.0 * x, ".1f") for x in (after.rms_m, after.mean_m, after.std_m, after.max_m)]
+        rows.append([f"{pair[0]} – {pair[1]}", thousands(after.count), early, *told])
+    heads = ("strips", "compared", "RMSDz before", "RMSDz after", "mean", "std", "largest")
+    measure = f" {report.measure}." if report.measure else ""
+    return Table("", heads, rows, f"Centimetres.{measure}{_more(len(pairs))}")
+
+
+def _more(count: int) -> str:
+    return f" The {MOST_ROWS} worst of {count}." if count > MOST_ROWS else ""
+
+
+def groups_table(report: ReportInput) -> Table:
+    """Fit of each group of observations."""
+    rows = [
+        [
+            group.group,
+            thousands(group.observations),
+            thousands(group.redundancy, 1),
+            number(group.variance_factor, ".3f"),
+            length(group.rms_m),
+            f"{thousands(group.rejected)} ({share(group.rejected / max(group.observations, 1))})",
+        ]
+        for group in report.adjusted.groups
+    ]
+    heads = ("observations", "number", "redundancy", "variance factor", "RMS residual", "rejected")
+    return Table("Fit by group of observations", heads, rows)
+
+
+def outlier_tables(report: ReportInput) -> list[Table]:
+    """Where rejected observations lie, and the largest that were kept."""
+    rejected, suspects = [], []
+    for group in report.adjusted.residuals:
+        out = group.weight <= 0.0
+        if out.any():
+            count = np.bincount(group.feature[out], minlength=1)
+            of = np.bincount(group.feature, minlength=len(count))
+            for index in np.argsort(-count, kind="stable")[: MOST_ROWS // 2].tolist():
+                if count[index]:
+                    name = _feature(report, group, index)
+                    told = f"{thousands(count[index])} of {thousands(of[index])}"
+                    rejected.append([name, group.group, told, _strips(report, group, out & (group.feature == index))])
+        kept = np.flatnonzero(~out & (np.abs(group.normalised) > SUSPECT))
+        for row in kept[np.argsort(-np.abs(group.normalised[kept]), kind="stable")][:8].tolist():
+            one = np.zeros(len(out), np.bool_)
+            one[row] = True
+            value, w = length(float(group.misclosure_m[row])), number(float(group.normalised[row]), "+.1f")
+            suspects.append(
+                [_feature(report, group, int(group.feature[row])), group.group, value, w, _strips(report, group, one)]
+            )
+    tables = []
+    if rejected:
+        tables.append(Table("", ("where", "group", "rejected", "strips"), rejected, left=(0, 3)))
+    if suspects:
+        heads = ("where", "group", "residual", "w", "strip")
+        under = (
+            f"The largest normalised residuals that were kept; |w| above {SUSPECT:g} has one sound one in a thousand."
+        )
+        tables.append(Table("", heads, suspects, under, left=(0, 4)))
+    return tables
+
+
+def _feature(report: ReportInput, group: Residuals, index: int) -> str:
+    known = report.features.ties if group.group == "ties" else report.features.planes
+    return known[index].name if 0 <= index < len(known) else str(index)
+
+
+def _strips(report: ReportInput, group: Residuals, rows: NDArray[np.bool_]) -> str:
+    swaths = np.unique(group.swath[rows])
+    return ", ".join(report.flight.swaths[index].name if index >= 0 else "control" for index in swaths.tolist())
+
+
+def refused_table(report: ReportInput) -> Table | None:
+    """Why candidates were not taken."""
+    rows = [[reason, thousands(count)] for reason, count in report.features.refused.most_common()]
+    return Table("", ("candidates not taken", "number"), rows) if rows else None
+
+
+def control_table(report: ReportInput) -> Table | None:
+    """Misclosures, and what leaving a point out would change."""
+    if not report.adjusted.control:
+        return None
+    several = len(report.adjusted.calibrations) > 1
+    rows = []
+    for point in report.adjusted.control:
+        told = "–"
+        if point.influence:
+            name, moved = max(point.influence.items(), key=lambda item: abs(item[1]))
+            one = unknown(name)
+            told = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
+        fit = (
+            number(100.0 * point.misclosure_m, "+.1f"),
+            number(100.0 * point.sigma_m, ".1f"),
+            number(point.normalised, "+.2f"),
+        )
+        rows.append([point.name, *fit, told])
+    values = np.array([point.misclosure_m for point in report.adjusted.control])
+    rms, mean = (length(float(x)) for x in (np.sqrt(np.mean(values**2)), values.mean()))
+    under = f"{len(values)} points: RMS {rms}, mean {mean}. "
+    under += "Each was used; at the right, what leaving it out would change most."
+    heads = ("point", "misclosure cm", "sigma cm", "w", "left out, changes most")
+    return Table("", heads, rows, under, left=(0, 4))
+
+
+def detectable_table(report: ReportInput) -> Table | None:
+    """Smallest errors that would be found."""
+    rows = [[OBSERVED.get(name, name), length(value)] for name, value in report.adjusted.least_detectable.items()]
+    under = "An error of this size in one observation is found with probability 0.8 (significance 0.001)."
+    return Table("Smallest errors that would be found", ("observation", "size"), rows, under) if rows else None

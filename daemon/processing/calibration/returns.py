@@ -1,0 +1,319 @@
+"""From logs to a `swath.calib.flight.Flight`: all returns of the strips, as measured, kept in files that are mapped.
+
+The first pass and the strips are those of `swath georef`; then each strip is a job, whose returns are kept as they came
+beside their points in t.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, from_smoother, knots_of
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.daemon.config.config import Config
+from swath.daemon.config.tables import ScannerConfig
+from swath.daemon.errors import UserError
+from swath.daemon.processing.flights.read import Flight as LoggedFlight
+from swath.daemon.processing.flights.read import Wish, note_times, read_flights
+from swath.daemon.processing.points.feed import LogFeed
+from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
+from swath.daemon.processing.points.workers import run_jobs
+from swath.daemon.processing.setup.models import motion_of
+from swath.georef.georeference import Georeferencer
+from swath.georef.points import ByteArray, Fate, Points
+from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.scanner.uncertainty import Noise
+from swath.georef.stream.stream import GivenMotion
+from swath.georef.strips import Segment, segments
+from swath.georef.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from swath.georef.navigation.cross_covariance import ErrorChain
+
+KNOT_S = 0.2  # between knots of the trajectory's errors
+TRAJECTORY_MARGIN_NS = 2_000_000_000
+PLACED_ROWS = 1 << 18
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+COLUMNS: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {  # a file each
+    "rows": (RETURN_DTYPE, ()),
+    "time_ns": (np.dtype(np.int64), ()),
+    "points_t": (np.dtype(np.float64), (3,)),
+    "encoder_rate": (np.dtype(np.float64), ()),
+    "encoder_acceleration": (np.dtype(np.float64), ()),
+}
+
+
+@dataclass(frozen=True)
+class KeepPlan(JobPlan):
+    """Of jobs that keep returns: the frame of their points."""
+
+    frame: Tangent
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFlight:
+    """What was read.
+
+    Attributes:
+        flight: for the adjustment; its arrays are mapped from files in the folder.
+        logged: the sessions behind it, in the order of ``flight.trajectories``.
+        results: of the jobs.
+    """
+
+    flight: Flight
+    logged: list[LoggedFlight]
+    results: list[JobResult]
+
+    @property
+    def notes(self) -> list[str]:
+        """Holes in what was asked for, then doubts of what is there, a line each."""
+        holes = [line for flight in self.logged for line in flight.holes]
+        return [*holes, *dict.fromkeys(line for flight in self.logged for line in flight.doubts)]
+
+
+def refuse_without_noise(kept: KeptFlight) -> None:
+    """UserError where returns of a scanner are said to be exact: by its noise an adjustment weighs them."""
+    for head in kept.flight.heads:
+        noise = head.noise
+        if not max(noise.range_m, noise.angle_rad, noise.divergence_rad):
+            raise UserError(
+                f"{kept.logged[0].log}: scanner.{head.name}: range_sigma_m, angle_sigma_deg and divergence_mrad are "
+                "all 0; want the scanner's own: an adjustment weighs returns by them"
+            )
+
+
+def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
+    """Return the joint covariance of trajectories that were smoothed here; None: one was not, or in several legs."""
+    chains: list[ErrorChain] = []
+    knots = knots_of(kept.flight, KNOT_S)
+    for number, flight in enumerate(kept.logged):
+        legs = [] if flight.navigated is None else flight.navigated.legs
+        if len(legs) != 1:
+            return None
+        chains.append(legs[0].solved.error_chain(knots.time_ns[knots.flown == number]))
+    return from_smoother(kept.flight, chains, KNOT_S)
+
+
+def read_flight(
+    wish: Wish, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
+) -> KeptFlight:
+    """Read logs.
+
+    Args:
+        wish: as of `swath georef`; what it says of products does not count.
+        folder: for the files, which are as large as 104 bytes a return.
+        tell: is told how far it is.
+        check: as of `read_flights`.
+
+    Raises:
+        UserError: as of `read_flights`; StripError, MappingError, LogError, OSError.
+    """
+    logged = read_flights(wish, tell, check)
+    frame = Tangent.at(_middle(logged[0]))
+    plans = [KeepPlan(flight.index, flight.setup, flight.clocks.clocks, frame) for flight in logged]
+    jobs = [job for number, flight in enumerate(logged) for job in _jobs(flight, number, folder)]
+    total = sum(job.size for job in jobs)
+    results = run_jobs(
+        plans,
+        jobs,
+        workers=wish.workers,
+        scheduler=None,
+        progress=lambda done: tell("returns", done, total),
+        do=keep_job,
+    )
+    note_times(logged, results)
+    heads = _heads(logged)
+    swaths = [
+        swath
+        for job, result in zip(jobs, results, strict=True)
+        for swath in _swaths(job, result, heads, logged[job.session])
+    ]
+    trajectories = tuple(flight.trajectory for flight in logged if flight.trajectory is not None)
+    return KeptFlight(Flight(frame, heads, trajectories, tuple(swaths)), logged, results)
+
+
+def _middle(flight: LoggedFlight) -> NDArray[np.float64]:
+    assert flight.trajectory is not None
+    within = flight.trajectory.between(*flight.span)
+    middle: NDArray[np.float64] = within.position_e[len(within) // 2]
+    return middle
+
+
+def _jobs(flight: LoggedFlight, number: int, folder: Path) -> list[Job]:
+    tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
+    return [_job(flight, number, tile, folder) for tile in tiles if tile.strip]
+
+
+def _job(flight: LoggedFlight, number: int, tile: Segment, folder: Path) -> Job:
+    assert flight.trajectory is not None
+    places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
+    begin, end = flight.gps_from_host([tile.start_ns, tile.end_ns]).tolist()
+    reach = MARGIN_NS + TRAJECTORY_MARGIN_NS
+    return Job(number, tile, places, flight.trajectory.between(begin - reach, end + reach), folder)
+
+
+def _heads(logged: Sequence[LoggedFlight]) -> tuple[Head, ...]:
+    """Of all sessions, which are of one installation; a scanner's settings are those of its first.
+
+    What a gimbal's angles were is of the time of all.
+    """
+    found: dict[str, Head] = {}
+    for flight in logged:
+        for name in flight.setup.scanners:
+            model = flight.setup.georeferencer(name).model
+            table = flight.setup.config.scanner[name]
+            noise = Noise(
+                table.range_sigma_m, np.radians(table.angle_sigma_deg), divergence_rad=1e-3 * table.divergence_mrad
+            )
+            start = _under(flight.setup.config, table, model.calibration)
+            head = Head(name, start, model.geometry, noise, model.range_gate, model.mount, model.air)
+            there = found.setdefault(name, head)
+            if len(there.mount.stages) != len(head.mount.stages):
+                raise UserError(
+                    f"{flight.log}: scanner.{name}.gimbal: has {len(head.mount.stages)} stages, in {logged[0].log} "
+                    f"{len(there.mount.stages)}; want logs of one installation"
+                )
+            if there is not head:
+                found[name] = replace(there, mount=there.mount.joined(head.mount))
+    return tuple(found.values())
+
+
+def _under(config: Config, table: ScannerConfig, calibration: Calibration) -> Calibration:
+    """A calibration with the settings it is used under, so that one estimated from it is refused under others."""
+    factor = calibration.mirror_factor if table.mirror_factor is None else table.mirror_factor
+    air = config.atmosphere
+    return replace(calibration, ranges=air.ranges, refraction=air.refraction, mirror_factor=factor)
+
+
+def _swaths(job: Job, result: JobResult, heads: Sequence[Head], flight: LoggedFlight) -> list[Swath]:
+    assert job.path is not None
+    several = len(flight.setup.scanners) > 1
+    made = []
+    for number, head in enumerate(heads):
+        if head.name not in result.fates:
+            continue
+        columns: dict[str, Any] = {
+            name: _mapped(_file(job.path, job.segment.strip, head.name, name), dtype, shape)
+            for name, (dtype, shape) in COLUMNS.items()
+        }
+        if not len(columns["rows"]):
+            continue
+        strip = job.segment.strip
+        name = f"{head.name} {strip:02d}" if several else f"{strip:02d}"
+        made.append(Swath(name, number, strip, job.session, **columns))
+    return made
+
+
+def _file(folder: Path, strip: int, scanner: str, column: str) -> Path:
+    return folder / f"{strip:03d}.{scanner}.{column}"
+
+
+def _mapped(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> Any:
+    if not path.stat().st_size:
+        return np.empty((0, *shape), dtype)
+    return np.memmap(path, dtype, "r").reshape(-1, *shape)
+
+
+def replaced(
+    flight: Flight, calibrations: Mapping[str, Calibration], folder: Path, name: str, workers: int | None = None
+) -> Flight:
+    """`Flight.placed`, with the points in mapped files of this name, which are made anew.
+
+    Strips are placed by so many threads, by default one a processor: nearly all of it goes on without the interpreter.
+    """
+
+    def placed(number: int) -> Swath:
+        swath = flight.swaths[number]
+        calibration = calibrations[flight.heads[swath.head].name]
+        path = folder / f"{number:03d}.{name}.points_t"
+        path.unlink(missing_ok=True)  # whoever still has the old one mapped keeps it
+        with path.open("wb") as file:
+            for start in range(0, len(swath), PLACED_ROWS):
+                points_t = flight.place(swath, calibration, slice(start, start + PLACED_ROWS))
+                file.write(np.ascontiguousarray(points_t).data)
+        return replace(swath, points_t=_mapped(path, *COLUMNS["points_t"]))
+
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        swaths = tuple(pool.map(placed, range(len(flight.swaths))))
+    return replace(flight, swaths=swaths)
+
+
+# ---------------------------------------------------------------------- a strip
+
+
+class _Keeper(Georeferencer):
+    """Stands where points are made: places returns in t and keeps them, with their points, as they came.
+
+    Range offsets by pulse rate are nobody's unknowns: the ranges that are kept have them, so that who places returns
+    anew need not know their rates.
+    """
+
+    def __init__(self, georeferencer: Georeferencer, frame: Tangent, given: GivenMotion, files: dict[str, BinaryIO]):
+        super().__init__(georeferencer.model)
+        self._frame, self._given, self._files = frame, given, files
+
+    def georeference(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory) -> tuple[Points, ByteArray]:
+        """No points; the fate of every row."""
+        given, rows = self._given, self._with_offsets_by_rate(rows)
+        rays = self.model.rays(
+            rows, time_ns, trajectory, encoder_rate=given.rate, encoder_acceleration=given.acceleration
+        )
+        if self.model.air is not None:
+            self.model.air.apply(rays.origin_e, rays.points_e)
+        kept = rays.fate == Fate.GEOREFERENCED
+        values = {
+            "rows": rows,
+            "time_ns": time_ns,
+            "points_t": self._frame.t_from_e(rays.points_e),
+            "encoder_rate": given.rate,
+            "encoder_acceleration": given.acceleration,
+        }
+        for name, column in values.items():
+            self._files[name].write(np.ascontiguousarray(column[kept]).tobytes())
+        return Points.empty(0, with_sigmas=False), rays.fate
+
+    def _with_offsets_by_rate(self, rows: StructArray) -> StructArray:
+        if self.rates is None or all(row.prf_hz is None for row in self.model.calibration.range_offsets):
+            return rows
+        rows = rows.copy()
+        for start, stop, prf_hz, _ in self.rates.runs(rows["pulse_id"]):
+            part = slice(start, stop)
+            rows["range_m"][part] += self.model.offsets_by_rate_m(rows[part], prf_hz)
+        return rows
+
+
+def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:
+    """Keep a strip's returns in files of the job's folder.
+
+    Raises:
+        OSError: the log cannot be read or a file not be written.
+    """
+    result = JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns)
+    assert job.trajectory is not None
+    assert job.path is not None
+    stream = plan.setup.office_stream(plan.clocks, job.trajectory)
+    opened: list[BinaryIO] = []
+    try:
+        for name in stream.scanners:
+            files: dict[str, BinaryIO] = {
+                column: _file(job.path, job.segment.strip, name, column).open("wb") for column in COLUMNS
+            }
+            opened += files.values()
+            chain = stream.chain(name)
+            chain.given, chain.motion = GivenMotion(), motion_of(plan.setup.config.scanner[name])
+            chain.georeferencer = _Keeper(plan.setup.georeferencer(name), plan.frame, chain.given, files)
+        feed_job(plan, job, result, LogFeed(plan.setup, stream), lambda placed: None, tell)
+    finally:
+        for file in opened:
+            file.close()
+    return result

@@ -1,0 +1,384 @@
+"""`swath calibrate`: from the logs of a calibration flight to parameters, their sigmas and the proof.
+
+    returns of the strips as measured, and the trajectory's own joint covariance     calibration_flight
+    coarse boresight, so that the same roof is found in every strip                  swath.calib.prealign
+    planes, tie points, control                                                      swath.calib.planes.search, …
+    adjustment, with correspondences found anew until they stay                      swath.calib.adjust
+    height differences of strips, before and after; files, record, report            calibrate_products
+
+All files are made out of sight and put in their place at the end: what looks like a calibration is one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from swath.calib.adjust import adjust
+from swath.calib.control.doubts import doubts
+from swath.calib.control.points import ControlError, control_planes, in_t, read_control
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.trajectory_prior import TrajectoryPrior, gauss_markov
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.labels import number, unknown
+from swath.calib.outcome import Adjusted
+from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
+from swath.calib.parameters import Wish as Model
+from swath.calib.plane_settings import PlaneError, PlaneSettings
+from swath.calib.planes.given import given_planes
+from swath.calib.planes.matching import rematch
+from swath.calib.planes.returns import limited
+from swath.calib.planes.search import find_planes
+from swath.calib.prealign import PrealignError, PrealignSettings, prealigned
+from swath.calib.profiles.check import Check, check
+from swath.calib.record.values import Plain
+from swath.calib.summary import Finding
+from swath.calib.ties.picked import PickedError
+from swath.calib.ties.picked import carried as carried_points
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration.inputs import PolygonError, rings_of, ties_of
+from swath.daemon.processing.calibration.returns import (
+    KeptFlight,
+    read_flight,
+    refuse_without_noise,
+    replaced,
+    smoothed_prior,
+)
+from swath.daemon.processing.carried_verdict import told_before
+from swath.daemon.processing.flights.read import Wish, trajectory_verdicts_of
+from swath.daemon.processing.strips.compare import refuse_installations
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.text_files import text_of
+from swath.georef.mapping.frame import MappingError
+from swath.georef.scanner.calibration import Calibration
+from swath.georef.strips import StripError
+from swath.georef.trajectory.trajectory import TrajectoryError
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+COARSE_RAD = math.radians(0.05)  # to which heights of strips, laid on each other, tell an angle at best
+COARSE_SIGMAS = 3.0
+OUTCOME = "calibration.json"  # of a report
+# Enough to bring strips together, and for a trajectory of which only sigmas are known: what errors do from one patch to
+# the next is assumed there, and thousands of returns would be taken for better than that is.
+PLANES = PlaneSettings(most_points=25)
+# Where the smoother's own covariance says what errors do: without control the range offset is told by noise averaged
+# over all the ground there is. Beyond 400 returns a patch it is the attitude between two knots that counts.
+EVERY = PlaneSettings(most_points=400, most_planes=4000, ground_planes=100)
+ROWS_MOST = 4_000_000  # in all: some seconds a pass, and 300 MB
+REFUSED = (
+    ControlError,
+    FlightError,
+    MappingError,
+    NormalError,
+    ParameterError,
+    PickedError,
+    PlaneError,
+    PolygonError,
+    PrealignError,
+    StripError,
+    TrajectoryError,
+)
+
+
+@dataclass(frozen=True)
+class CalibrateWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs: what is read and how; what it says of products does not count.
+        output: the calibration file; of several scanners a folder for theirs.
+        model: what is estimated.
+        model_file: that says so; None: none does.
+        control: CSV of surveyed points.
+        ties: CSV of points picked in several strips; beside what is observed.
+        polygons: CSV of polygons that planes fill; instead of those that would be found.
+        observe: planes or ties, and markings: what is looked for.
+        report: folder for the report, the record and the pictures; None: none.
+        facts: of the record what only people know, by ``CLASS.attribute``.
+        limit_deg, limit_m: how far boresight and range offset may lead from where they began.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Wish
+    output: Path
+    model: Model = field(default_factory=Model)
+    model_file: Path | None = None
+    control: Path | None = None
+    ties: Path | None = None
+    polygons: Path | None = None
+    observe: tuple[str, ...] = ("planes",)
+    report: Path | None = None
+    facts: Mapping[str, Plain] = field(default_factory=dict)
+    limit_deg: float = 5.0
+    limit_m: float = 10.0
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What came of it.
+
+    Attributes:
+        kept: the flight as read.
+        flight: placed with the calibrations found.
+        prealigned: by scanner, what the adjustment's iterations began with.
+        findings: what the pre-alignment says against angles that are held, for the verdict.
+        check: what profiles say of the outcome.
+        notes: for people, a line each.
+    """
+
+    kept: KeptFlight
+    flight: Flight
+    features: Features
+    prior: TrajectoryPrior
+    prealigned: Mapping[str, Calibration]
+    adjusted: Adjusted
+    control: tuple[ControlPoint, ...]
+    check: Check
+    notes: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
+
+
+def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+    """Calibrate.
+
+    Args:
+        wish: what is asked for.
+        folder: for the returns, some 150 bytes each, while it goes on.
+        tell: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    with told_in_a_line(folder, *REFUSED):
+        return _calibrate(wish, folder, tell)
+
+
+def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+    _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
+    kept = read_flight(wish.logs, folder, tell, lambda scanners: check_scanners(scanners, wish.model))
+    _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
+    check_wish(kept.flight, wish.model)
+    with told_before(trajectory_verdicts_of(kept.logged), *REFUSED):
+        return _calibrated(wish, kept, folder, tell)
+
+
+def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
+    _refuse_one_strip(kept)
+    points = _control(wish, kept.flight)
+    workers = wish.logs.workers
+    tell("pre-alignment", 0, 1)
+    first, away = _aligned(kept.flight, wish.model.fix)
+    doubted = {name: abs(apart) for name, apart in away.items()}
+    flight = replaced(kept.flight, first, folder, "aligned", workers)
+    notes = _doubts(flight, points)
+    tell("planes", 0, 1)
+    rings = None if wish.polygons is None else rings_of(wish.polygons, kept)
+    picked = Features() if wish.ties is None else ties_of(wish.ties, kept)
+
+    def search(settings: PlaneSettings = PLANES) -> Features:
+        if rings is not None:
+            return given_planes(flight, rings, settings)
+        with ThreadPoolExecutor(workers) as pool:
+            return find_planes(flight, settings, pool.map)
+
+    def match() -> Features:
+        with ThreadPoolExecutor(workers) as pool:
+            return rematch(flight, planes, PLANES, pool.map)
+
+    def observed() -> Features:
+        return Features.joined([_features(wish, flight, planes, points), carried_points(picked, kept.flight, flight)])
+
+    planes, searched = search(), 1
+    refuse_no_planes(str(wish.logs.logs[0] if rings is None else wish.polygons), planes)
+    features = observed()
+    prior = prior_of(kept)
+
+    def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
+        nonlocal flight, planes, features, searched
+        tell("planes again", 0, 1)
+        flight = replaced(kept.flight, calibrations, folder, "matched", workers)
+        # once more: roofs at a swath's edges that the pre-alignment left apart lie on each other now
+        again = searched == 1 or rings is not None
+        planes, searched = search() if again else match(), searched + 1
+        features = observed()
+        return features
+
+    def everything(calibrations: Mapping[str, Calibration]) -> Features | None:
+        nonlocal flight, planes, features
+        if not len(prior.walk_rad2) or "ties" in wish.observe:
+            return None
+        tell("all planes", 0, 1)
+        flight = replaced(kept.flight, calibrations, folder, "entire", workers)
+        planes = limited(search(EVERY), ROWS_MOST)
+        features = observed()
+        return features
+
+    tell("adjustment", 0, 1)
+    adjusted = adjust(
+        flight, features, wish.model, prior, rematch=found_anew, first=first, doubted=doubted, entire=everything
+    )
+    _refuse_far(wish, kept.flight, adjusted)
+    refuse_lost_control(wish.control, features)
+    flight = replaced(kept.flight, adjusted.calibrations, folder, "calibrated", workers)
+    tell("profiles", 0, 1)
+    checked = check(flight, adjusted, prior, points)
+    told = (*kept.notes, *notes, *adjusted.notes)
+    findings = prealigned_otherwise(away, adjusted)
+    return Calibrated(kept, flight, features, prior, first, adjusted, points, checked, told, findings)
+
+
+def _aligned(flight: Flight, fixed: frozenset[str]) -> tuple[dict[str, Calibration], dict[str, float]]:
+    """Return a coarse boresight by scanner, and by how much it contradicts the start, by name, SI.
+
+    The range offset stays, which heights of strips alone hardly tell. A coarse angle contradicts the start where it is
+    away from it by more than heights of strips may be wrong.
+    """
+    starts = flight.starts()
+    coarse = prealigned(flight, PrealignSettings(held=fixed))
+    first, away = {}, {}
+    for name, found in coarse.calibrations.items():
+        first[name] = found.changed(range_offset_m=starts[name].value("range_offset_m"))
+        for angle, sigma in zip(ANGLES, coarse.sigmas[name].tolist(), strict=False):
+            apart = found.value(angle) - starts[name].value(angle)
+            if abs(apart) > max(COARSE_SIGMAS * sigma, COARSE_RAD):
+                away[f"{name}.{angle}"] = apart
+    return first, away
+
+
+def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple[Finding, ...]:
+    """Return what the pre-alignment says against angles that the adjustment held at their start.
+
+    Args:
+        away: by name, as ``left.kappa_rad``, by how much it contradicts the start, SI.
+        adjusted: the outcome.
+    """
+    found = []
+    for held in adjusted.held:
+        apart = away.get(f"{held.scanner}.{held.name}")
+        if apart is not None:
+            words, told = unknown(f"{held.scanner}.{held.name}").words, number(math.degrees(apart), "+.2f")
+            what = f"the pre-alignment puts {words} {told}° from the start at which it is held"
+            change = "fly the lines that determine it, or start from a calibration that holds"
+            found.append(Finding(what, change, abs(apart) / COARSE_RAD, unusable=True))
+    return tuple(found)
+
+
+def _refuse_existing(wish: CalibrateWish, files: Iterable[Path]) -> None:
+    """UserError where a file is there that may not be replaced."""
+    for path in files:
+        if path.exists() and not wish.overwrite:
+            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+
+
+def paths_of(wish: CalibrateWish, scanners: Iterable[str]) -> dict[str, Path]:
+    """Where each scanner's calibration goes."""
+    names = list(scanners)
+    if len(names) == 1 and not wish.output.is_dir():
+        return dict.fromkeys(names, wish.output)
+    return {name: wish.output / f"{name}.toml" for name in names}
+
+
+def _refuse_one_strip(kept: KeptFlight) -> None:
+    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    log = kept.logged[0].log
+    if not strips and (holes := [line for flight in kept.logged for line in flight.holes]):
+        raise UserError("\n".join(holes))
+    if len(strips) < 2:
+        raise UserError(
+            f"{log}: {len(strips) or 'no'} strip with returns; a calibration compares strips: want at least two that "
+            "overlap, better opposite, crossing and parallel ones at two heights"
+        )
+    refuse_installations(kept.logged)
+    refuse_without_noise(kept)
+
+
+def refuse_no_planes(log: str, planes: Features) -> None:
+    """UserError where strips have no plane in common."""
+    if planes.planes:
+        return
+    why = ", ".join(f"{count:,} {reason}" for reason, count in planes.refused.most_common(3))
+    raise UserError(
+        f"{log}: no plane is seen by two strips ({why or 'no candidates'}); want strips that overlap over roofs and "
+        "open ground, with some 2 returns a square metre"
+    )
+
+
+def refuse_lost_control(control: Path | None, features: Features) -> None:
+    """UserError where control is given, and none of it says anything."""
+    if control is None or any(plane.control for plane in features.planes):
+        return
+    why = ", ".join(f"{count:,} {reason}" for reason, count in features.refused.items() if "control" in reason)
+    raise UserError(f"{control}: no point lies on ground that a strip shows as a plane ({why or 'no returns'})")
+
+
+# ---------------------------------------------------------------------- observations
+
+
+def _control(wish: CalibrateWish, flight: Flight) -> tuple[ControlPoint, ...]:
+    if wish.control is None:
+        return ()
+    return in_t(read_control(text_of(wish.control), str(wish.control)), flight.frame)
+
+
+def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
+    """What is doubtful of control; UserError where it cannot be used at all.
+
+    That all its heights differ alike is only a doubt here: so does a range offset, which is to be found; what is more
+    than that may be, is refused in the end (`_refuse_far`).
+    """
+    found = doubts(flight, points)
+    whole = [doubt.text for doubt in found if doubt.kind not in ("point", "height")]
+    if whole:
+        raise UserError("\n".join(whole))
+    return tuple(doubt.text for doubt in found)
+
+
+def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
+    """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
+    found = [planes]
+    if "ties" in wish.observe:
+        from swath.calib.ties.intersections import find_ties
+
+        found = [find_ties(flight, planes)]
+    if points:
+        found.append(control_planes(flight, points))
+    if "markings" in wish.observe:
+        from swath.calib.ties.markings import find_markings
+
+        found.append(find_markings(flight))
+    return Features.joined(found)
+
+
+def prior_of(kept: KeptFlight) -> TrajectoryPrior:
+    """The trajectory's errors before: exactly, of those that were smoothed here, or by their sigmas."""
+    return smoothed_prior(kept) or gauss_markov(kept.flight)
+
+
+# ---------------------------------------------------------------------- results
+
+
+def _refuse_far(wish: CalibrateWish, flight: Flight, adjusted: Adjusted) -> None:
+    """Nothing is written that led away from what anybody would believe."""
+    log = wish.logs.logs[0]
+    if not adjusted.converged:
+        raise UserError(f"{log}: the adjustment does not converge; look at the strips with swath view first")
+    for head in flight.heads:
+        found = adjusted.calibrations[head.name]
+        for name in ANGLES:
+            away_deg = math.degrees(found.value(name) - head.start.value(name))
+            if abs(away_deg) > wish.limit_deg:
+                raise UserError(
+                    f"{log}: {head.name}: {name.removesuffix('_rad')} would change by {away_deg:.2f}°, more than "
+                    f"--limit-deg {wish.limit_deg:g}; is the installation matrix right?"
+                )
+        away_m = found.value("range_offset_m") - head.start.value("range_offset_m")
+        if abs(away_m) > wish.limit_m:
+            raise UserError(
+                f"{log}: {head.name}: the range offset would change by {away_m:.2f} m, more than --limit-m "
+                f"{wish.limit_m:g}; are the control's heights ellipsoidal, and of this datum?"
+            )

@@ -1,0 +1,1 @@
+"""Which logs and which trajectory belong together."""

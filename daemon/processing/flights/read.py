@@ -1,0 +1,366 @@
+"""The first pass over logs: all but the returns is read; of these it is noted where they stand; strips are cut."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.log.chunk_index import Listening, LogIndex, index_log
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing import refusals
+from swath.daemon.processing.carried_verdict import (
+    Carried,
+    calibration_verdicts,
+    file_verdicts,
+    navigated_verdicts,
+    verdict_entry,
+)
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, choose_trajectory
+from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
+from swath.daemon.processing.points.feed import LogClocks, read_clocks
+from swath.daemon.processing.points.workers import refuse_in_import
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.text_files import text_of
+from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
+from swath.georef.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from swath.daemon.config.config import Config
+    from swath.daemon.processing.navigation.navigate import Navigated
+    from swath.daemon.processing.points.jobs import JobResult
+    from swath.georef.timescales import ClockStatus
+
+    Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+INTENSITY_FACTOR = 257.0  # eight bits, 0 … 255, fill the field of 16
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the command line asks for.
+
+    Attributes:
+        logs, output: where from, where to.
+        trajectory: see `TrajectoryWish`.
+        options: over the logs' configuration.
+        config: instead of the logs' own; None: theirs.
+        strips: ``auto``, ``whole``, or a CSV file's name.
+        rules: what a strip is.
+        workers, scheduler: where the work is done.
+        sigmas: three sigmas with each point.
+        copc: COPC files.
+        scale: of the coordinates, in the coordinate system's units.
+        overwrite: products of an earlier run are replaced.
+        write_dropped: returns that are left out are written too, flagged or in a list.
+        accept_verdict: what is judged not to be used is no problem.
+    """
+
+    logs: Sequence[Path]
+    output: Path
+    trajectory: TrajectoryWish = field(default_factory=TrajectoryWish)
+    options: Options = field(default_factory=Options)
+    config: Config | None = None
+    strips: str = "auto"
+    rules: StripRules = field(default_factory=StripRules)
+    workers: int = 1
+    scheduler: str | None = None
+    sigmas: bool = True
+    copc: bool = False
+    scale: float = 0.001
+    overwrite: bool = False
+    write_dropped: bool = False
+    accept_verdict: bool = False
+
+    def record(self) -> dict[str, Any]:
+        """For the sidecar: what it was, but for what does not matter to the points."""
+        return {
+            "trajectory": None if self.trajectory.file is None else str(self.trajectory.file),
+            "trajectory_at": self.trajectory.at,
+            "week": self.trajectory.week,
+            "crs": self.options.crs,
+            "datum": self.options.datum,
+            "epoch": self.options.epoch,
+            "force_crs": self.options.force_crs,
+            "calibrations": {name: file for name, (_, file) in self.options.calibrations.items()},
+            "strips": self.strips,
+            "sigmas": self.sigmas,
+            "copc": self.copc,
+            "scale": self.scale,
+            "write_dropped": self.write_dropped,
+            "intensity_factor": INTENSITY_FACTOR,
+        }
+
+
+@dataclass
+class Flight:
+    """A session on its way.
+
+    Attributes:
+        span: GPS time of its first and last return; host_span likewise in log time.
+        trajectory: the body's.
+        solutions: of the device's INS that it is made of, by what became of them.
+        navigated: what the trajectory was smoothed from; None: it comes from elsewhere.
+        strips: spans of log time, and the number of the first.
+        lost: units that the recorder lost, by source.
+        verdicts: on its calibrations and its trajectory, those that are not good; `trajectory_verdicts` of them on the
+            latter, and `source` where that is from: ``navigated``, ``ins`` or ``file``.
+        troubles: with time or trajectory, a line each.
+        holes: what will be missing, a line each.
+    """
+
+    session: Session
+    setup: Setup
+    clocks: LogClocks
+    index: LogIndex
+    span: tuple[int, int]
+    host_span: tuple[int, int]
+    trajectory: Trajectory | None = None
+    solutions: dict[str, int] = field(default_factory=dict)
+    navigated: Navigated | None = None
+    strips: list[Span] = field(default_factory=list)
+    first_number: int = 1
+    lost: dict[str, int] = field(default_factory=dict)
+    troubles: list[str] = field(default_factory=list)
+    holes: list[str] = field(default_factory=list)
+    verdicts: list[Carried] = field(default_factory=list)
+    trajectory_verdicts: list[Carried] = field(default_factory=list)
+    source: str = ""
+
+    @property
+    def log(self) -> Path:
+        """The session's first part, which stands for it in messages."""
+        return self.session.parts[0].path
+
+    @property
+    def doubts(self) -> list[str]:
+        """Doubts of its data, its time and its trajectory, a line each."""
+        lost = [f"{self.log}: the recorder lost {count:,} units of {source}" for source, count in self.lost.items()]
+        return [*lost, *self.troubles]
+
+    @property
+    def clock(self) -> str | None:
+        """The source that shows the host's time."""
+        devices = self.clocks.clocks.host.plan.devices
+        return next((plan.clock for plan in devices.values()), None)
+
+    def status(self, host_ns: int) -> ClockStatus | None:
+        """Of that clock."""
+        return None if self.clock is None else self.clocks.clocks.host.status(self.clock, host_ns)
+
+    def gps_from_host(self, host_ns: Any) -> Any:
+        """GPS ns (n,) of log times."""
+        assert self.clock is not None
+        gps_ns, _ = self.clocks.clocks.host.gps_from_host(self.clock, np.asarray(host_ns, np.int64))
+        return gps_ns
+
+    def host_from_gps(self, gps_ns: Sequence[int]) -> list[int]:
+        """Log times of GPS times, to the nanosecond or so: the clocks differ by parts in a million."""
+        wanted = np.asarray(gps_ns, np.int64)
+        host_ns = wanted - self.span[0] + self.host_span[0]
+        for _ in range(3):
+            host_ns = host_ns + wanted - self.gps_from_host(host_ns)
+        found: list[int] = host_ns.tolist()
+        return found
+
+
+def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None) -> list[Flight]:
+    """The flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
+
+    Args:
+        wish: which logs, and how.
+        tell: is told how far it is.
+        check: is called with the names of all scanners before anything long is done; what it raises goes on.
+
+    Raises:
+        UserError: they cannot be georeferenced, or not together.
+        LogError, OSError: a log cannot be read.
+        StripError, MappingError: in one line.
+    """
+    refuse_in_import()
+    passed_over: list[str] = []
+    sessions = open_logs(wish.logs, passed_over)
+    setups = [_setup(wish, session) for session in sessions]
+    logs = [session.parts[0].path for session in sessions]
+    configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
+    for session in sessions:
+        refusals.refuse_no_name(session.session_id, session.parts[0].path)
+    check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
+    refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
+    flights: list[Flight] = []
+    for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
+        tell("clocks and trajectory", number, len(sessions))
+        flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
+    flights[0].holes += [f"passed over: {line}" for line in passed_over]
+    refusals.refuse_overlap({flight.log: flight.span for flight in flights})
+    flights.sort(key=lambda flight: flight.span)  # sessions come by their hosts' clocks, which may be wrong
+    for flight in flights:
+        _choose(wish, flight)
+    _number_strips(wish, flights)
+    return flights
+
+
+def _setup(wish: Wish, session: Session) -> Setup:
+    if wish.config is None:
+        try:
+            setup = Setup.of_log(session.attachments(), wish.options)
+        except UserError as error:
+            lines = refusals.of_log(session.parts[0].path, error.message.splitlines(), wish.options)
+            raise UserError("\n".join(lines), error.exit_code) from error
+    else:
+        setup = Setup.of_config(wish.config, wish.options)
+    crs = wish.options.crs or setup.config.output.crs
+    if crs is None:
+        raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
+    refusals.refuse_geocentric(crs)
+    return setup
+
+
+def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
+    log = session.parts[0].path
+    listening = Listening(session)
+    clocks = read_clocks(listening, setup, positions=positions)
+    session.growing = listening.growing
+    try:
+        setup.take_angles(clocks.angles)
+    except ConfigError as error:
+        raise UserError("\n".join(f"{log}: {line}" for line in error.lines)) from error
+    index = index_log(session)
+    first, last = index.spans()
+    if not len(first):
+        raise UserError(f"{log}: no scanner's data in the log")
+    clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
+    clocks.remarks += clocks.clocks.remarks
+    flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
+    flight.lost = listening.lost()
+    status, trouble = flight.status(flight.host_span[1]), clocks.clocks.trouble(flight.clock)
+    refusals.refuse_no_time(log, flight.clock, status, setup.config, clocks.remarks, trouble)
+    flight.troubles += [f"{log}: {remark}" for remark in [*clocks.remarks, *stamp_lines(clocks.clocks)]]
+    begin, end = flight.gps_from_host(flight.host_span).tolist()
+    flight.span = (begin, end)
+    return flight
+
+
+def _choose(wish: Wish, flight: Flight) -> None:
+    """The flight's trajectory; the mapping's operation for where it was."""
+    status = flight.status(flight.host_span[1])
+    leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
+    chosen = choose_trajectory(wish.trajectory, flight.setup, flight.session, flight.clocks, flight.span, leap_seconds)
+    flight.trajectory, flight.solutions, flight.navigated = chosen.trajectory, chosen.solutions, chosen.navigated
+    flight.troubles += [doubt for doubt in chosen.doubts if doubt not in flight.troubles]
+    _judge(wish, flight)
+    assert flight.setup.mapping is not None
+    within = flight.trajectory.between(*flight.span)
+    places_e = within.position_e[:: max(1, len(within) // 100)]
+    flight.setup.mapping.settle(places_e)
+    misfit = flight.setup.mapping.misfit(places_e)
+    if misfit and not wish.options.force_crs:
+        lines = refusals.of_log(flight.log, [misfit], wish.options)
+        raise UserError(f"{lines[0]}; --force-crs takes it as it is", ExitCode.USAGE)
+    flight.troubles += [misfit] if misfit else []
+
+
+def _judge(wish: Wish, flight: Flight) -> None:
+    """The verdicts that what is made of the flight has to carry."""
+    if wish.trajectory.file is not None:
+        flight.trajectory_verdicts, flight.source = file_verdicts(wish.trajectory.file, flight.span)
+    elif flight.navigated is not None:
+        flight.trajectory_verdicts, flight.source = list(navigated_verdicts(flight.navigated)), "navigated"
+    else:
+        flight.source = "ins"
+    flight.verdicts = [*flight.trajectory_verdicts, *calibration_verdicts(flight.setup, flight.source)]
+
+
+def verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
+    """Return the verdicts on all flights, each once."""
+    return list(dict.fromkeys(one for flight in flights for one in flight.verdicts))
+
+
+def trajectory_verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
+    """Return the verdicts on the trajectories of all flights, each once."""
+    return list(dict.fromkeys(one for flight in flights for one in flight.trajectory_verdicts))
+
+
+def verdict_of(wish: Wish, flights: Sequence[Flight]) -> dict[str, Any]:
+    """Return the verdict on a run, as its record says it: each reason once."""
+    return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)
+
+
+def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
+    """Each flight's strips in log time, numbered through."""
+    given = None if wish.strips in ("auto", "whole") else _given_strips(wish.strips)
+    number = 1
+    for flight in flights:
+        flight.strips, flight.first_number = _strips(wish, flight, given), number
+        number += len(flight.strips)
+    if given is not None:
+        refusals.note_strips_elsewhere(wish.strips, given, flights)
+    if number == 1:
+        raise UserError(
+            f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
+            "want --strips whole, or --strips FILE with their times"
+        )
+
+
+def note_times(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
+    """Note in each flight's holes why returns of its strips have no time, a line a scanner."""
+    for number, flight in enumerate(flights):
+        own = [result for result in results if result.session == number and result.strip]
+        status, clocks = flight.status(flight.host_span[1]), flight.clocks.clocks
+        for name in flight.setup.scanners:
+            fates: Counter[str] = Counter()
+            refused: Counter[str] = Counter()
+            for result in own:
+                fates.update(result.fates.get(name, {}))
+                refused.update(result.time_refused.get(name, {}))
+            source = f"scanner/{name}"
+            stamps, trouble = clocks.stamps.get(source), clocks.trouble(source)
+            line = refusals.time_trouble(name, fates, refused, status, stamps, trouble)
+            flight.holes += [f"{flight.log}: {line}"] if line else []
+
+
+def _given_strips(name: str) -> list[Span]:
+    if not Path(name).exists():
+        raise UserError(f"--strips {name}: no such file; want auto, whole or a CSV file", ExitCode.IO)
+    return read_strips(text_of(Path(name), "a CSV file with start_gps_ns,end_gps_ns"), name)
+
+
+def _strips(wish: Wish, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
+    laser = laser_spans(*flight.index.spans(), wish.rules)
+    if wish.strips == "whole":
+        return laser
+    spans = _straight(wish, flight) if given is None else given
+    host = flight.host_from_gps([time_ns for span in spans for time_ns in span])
+    here = list(zip(host[::2], host[1::2], strict=True))
+    if given is None:
+        return cut(here, laser, wish.rules)
+    return [(start, end) for start, end in here if start < flight.host_span[1] and end > flight.host_span[0]]
+
+
+def _straight(wish: Wish, flight: Flight) -> list[Span]:
+    """Straight flight in GPS time, and where the trajectory says nothing.
+
+    Before a device's own INS is aligned there is nothing to be had: that is told, and no strip.
+    """
+    trajectory = flight.trajectory
+    assert trajectory is not None
+    (begin, end), (first, last) = flight.span, trajectory.span
+    unknown = [(start, stop) for start, stop in trajectory.gaps().tolist()]
+    outside = [(start, stop) for start, stop in ((begin, first), (last, end)) if start < stop]
+    if wish.trajectory.file is not None:
+        unknown += outside
+    else:
+        flight.troubles += [
+            f"{flight.log}: {(stop - start) / 1e9:.1f} s of the log have no INS solution: no strips there"
+            for start, stop in outside
+            if stop - start >= wish.rules.min_strip_s * 1e9
+        ]
+    roll, _, heading = trajectory.attitude()
+    return straight_spans(trajectory.time_ns, heading, roll, wish.rules, unknown)

@@ -1,0 +1,196 @@
+"""Which trajectory a session is georeferenced with: of a file, of the device's own INS, or of IMU and GNSS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.given_trajectory import Given, judge_given, points_of
+from swath.daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
+from swath.daemon.processing.trajectory.files import smrmsg_beside
+from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.stream.path import SHORTEST_TRAJECTORY
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
+
+if TYPE_CHECKING:
+    from swath.daemon.log.reader import Session
+    from swath.daemon.processing.navigation.navigate import Navigated
+    from swath.daemon.processing.points.feed import LogClocks
+    from swath.daemon.processing.setup.setup import Setup
+
+Vector = tuple[float, float, float]
+FROM_LOG = "INS solution in the log"
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryWish:
+    """What the command line says of the trajectory.
+
+    Attributes:
+        file: None: the device's own.
+        week: GPS week of a file that says none; None: the one that fits the log.
+        at: the point it is of: body, antenna, scanner, or ``x,y,z`` from the body's origin in b, metres.
+        navigate: without a file IMU and GNSS are navigated and smoothed where the log has both, whatever the device's
+            own INS said.
+        force: a file that does not belong to the log is taken all the same, and warned of.
+    """
+
+    file: Path | None = None
+    week: int | None = None
+    at: str = "body"
+    navigate: bool = False
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        """UserError where a file is forced that nobody named."""
+        if self.force and self.file is None:
+            raise UserError("--force-trajectory: there is no file to be taken; want --trajectory too", ExitCode.USAGE)
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The body's trajectory of a session.
+
+    Attributes:
+        trajectory: attitude refers to the ellipsoid's normal, whatever it referred to (``[attitude]``).
+        doubts: about it, a line each.
+        solutions: of the device's INS, by what became of them (`swath.georef.trajectory.buffer`); none of a file.
+        navigated: what it was smoothed from; None: it comes from elsewhere.
+    """
+
+    trajectory: Trajectory
+    doubts: list[str]
+    solutions: dict[str, int]
+    navigated: Navigated | None = None
+
+
+def choose_trajectory(
+    wish: TrajectoryWish,
+    setup: Setup,
+    session: Session,
+    clocks: LogClocks,
+    span: tuple[int, int],
+    leap_seconds: int | None,
+) -> Chosen:
+    """For a session whose returns lie in a span of GPS time; ``leap_seconds``, as the log knows them, for files in UTC.
+
+    Raises:
+        UserError: there is none, it cannot be read, or it is of another time.
+    """
+    log = session.parts[0].path
+    doubts: list[str] = []
+    solutions: dict[str, int] = {}
+    navigated: Navigated | None = None
+    both = setup.imu_source is not None and bool(setup.config.gnss)
+    offset = offset_of(wish.at, setup)
+    try:
+        if wish.file is None:
+            trajectory, solutions = _from_device(setup, clocks)
+            if (wish.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
+                navigated = _navigated(setup, session, solutions)
+                trajectory = navigated.trajectory()
+                findings = [finding.text for leg in navigated.legs for finding in leg.findings]
+                doubts = [*navigated.doubts, *navigated.holes, *findings]
+        else:
+            trajectory = _from_file(wish, wish.file, span, leap_seconds)
+            doubts = refuse_other_motion(clocks, trajectory, str(wish.file), log)
+        refuse_no_overlap(trajectory, str(wish.file or trajectory.name), span, log)
+        trajectory.require_attitude()
+        if navigated is None:
+            doubts += attitude_doubts(trajectory, str(wish.file or f"{log}: {FROM_LOG}"))
+        if setup.deflection_rad is not None:
+            trajectory = trajectory.with_deflection(*setup.deflection_rad)
+        if offset is not None and navigated is not None:
+            doubts.append(f"{log}: navigated from IMU and GNSS, which is the body's trajectory: no --trajectory-at")
+        elif offset is not None:
+            trajectory = trajectory.at_body(offset)
+        if wish.file is not None:
+            doubts += _belonging(wish, wish.file, trajectory, setup, clocks, log)
+    except TrajectoryError as error:
+        named = str(error) if str(log) in str(error) else f"{error} ({log})"
+        raise UserError(named) from error
+    return Chosen(trajectory, doubts, solutions, navigated)
+
+
+def _belonging(
+    wish: TrajectoryWish, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
+) -> list[str]:
+    """Return what is doubtful of a file's trajectory against the log; UserError where it does not belong to it."""
+    offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
+    given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
+    found = judge_given(given, setup, clocks, log)
+    if found.refused and not wish.force:
+        raise UserError("\n".join(f"{line}; --force-trajectory takes it as it is" for line in found.refused))
+    return [*found.refused, *found.warnings]
+
+
+def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
+    smrmsg = smrmsg_beside(file)
+    return read_trajectory(
+        file.read_bytes(),
+        str(file),
+        span_ns=span,
+        week=wish.week,
+        leap_seconds=leap_seconds,
+        smrmsg=None if smrmsg is None else smrmsg.read_bytes(),
+    )
+
+
+def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:
+    """What the device's own INS said, and what became of its solutions."""
+    buffer = TrajectoryBuffer(setup.protocol(setup.ins_source), name=FROM_LOG)
+    buffer.append(clocks.ins_rows)
+    solutions = buffer.snapshot().with_velocities()
+    return solutions, {what: count for what, count in sorted(buffer.counts.items()) if count}
+
+
+def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
+    """Smoothed from IMU and GNSS."""
+    from swath.daemon.processing.navigation.inputs import InputWish
+    from swath.daemon.processing.navigation.navigate import NavigateWish, navigate_session
+
+    log = session.parts[0].path
+    if setup.imu_source is None or not setup.config.gnss:
+        told = f"{setup.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"
+        missing = "no receiver" if setup.imu_source is not None else "no IMU"
+        raise UserError(f"{log}: {told}, and {missing} to make one; want --trajectory FILE", ExitCode.USAGE)
+    try:
+        return navigate_session(session, NavigateWish(InputWish(config=setup.config)))
+    except UserError as error:
+        hint = "; or give --trajectory FILE"
+        raise UserError("\n".join(f"{line}{hint}" for line in error.message.splitlines()), error.exit_code) from error
+
+
+def offset_of(at: str, setup: Setup) -> Vector | None:
+    """Where a trajectory's point is, from the body's origin in b; None: there. The scanner's is its calibration's.
+
+    Raises:
+        UserError: it is no such point.
+    """
+    if at == "body":
+        return None
+    if at == "antenna":
+        arms = [gnss.lever_arm_m for gnss in setup.config.gnss.values()]
+        if not arms:
+            raise UserError("--trajectory-at antenna: the configuration has no [gnss.…]", ExitCode.USAGE)
+        return _vector(arms[0])
+    if at == "scanner":
+        heads = [setup.calibrations[name].lever_arm_b for name in setup.scanners]
+        if len(heads) != 1:
+            raise UserError(f"--trajectory-at scanner: there are {len(heads)} scanners; want x,y,z", ExitCode.USAGE)
+        return _vector(heads[0].tolist())
+    try:
+        x, y, z = (float(part) for part in at.split(","))
+    except ValueError:
+        raise UserError(
+            f'--trajectory-at: got "{at}", want body, antenna, scanner or x,y,z in metres', ExitCode.USAGE
+        ) from None
+    return (x, y, z)
+
+
+def _vector(values: Sequence[float]) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

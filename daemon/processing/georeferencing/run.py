@@ -1,0 +1,272 @@
+"""`swath georef`: from logs and a trajectory to one file a strip, the trajectory and the sidecar.
+
+Two passes. The first reads all but the returns: clocks, the INS, turn rates; of the returns it only notes where they
+stand. Then the time is cut into segments, and each is a job (daemon/processing/points/jobs.py). All is written out of
+sight and put in its place at the end, the sidecar last.
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+
+from swath import __version__
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.durable import sync_file, try_sync_directory
+from swath.daemon.processing import refusals
+from swath.daemon.processing.flights.read import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
+from swath.daemon.processing.georeferencing.sidecar import (
+    count_unread,
+    reasons_text,
+    run_record,
+    sha256_of,
+    write_sidecar,
+)
+from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
+from swath.daemon.processing.points.workers import run_jobs
+from swath.daemon.processing.quicklook.product_facts import read_sidecar, sessions_in
+from swath.daemon.processing.trajectory.files import TrajectoryFiles, put_in_place, write_trajectory
+from swath.daemon.processing.unread import unread_lines
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.drivers.driver import find_driver
+from swath.georef.formats.las import LasSettings
+from swath.georef.mapping.frame import MappingError
+from swath.georef.strips import Segment, StripError, segments
+from swath.georef.timescales.gps_time import table_leap_seconds, utc_from_gps
+
+DROPPED = ".dropped.csv.gz"
+ENDINGS = (".laz", DROPPED)  # of a strip's files
+OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
+TRAJECTORY_MARGIN_NS = 2_000_000_000
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was made: the sidecar's content, and where it is."""
+
+    record: dict[str, Any]
+    sidecar: Path
+
+
+def georeference(wish: Wish, tell: Tell) -> Report:
+    """Make the products.
+
+    Raises:
+        UserError: they cannot be made, one line; nothing that looks like a product is left then.
+    """
+    with told_in_a_line(wish.output, StripError, JobError, MappingError):
+        flights = read_flights(wish, tell)
+        names = [flight.session.session_id for flight in flights]
+        with _out_of_sight(wish, names) as (partial, into_place):
+            return _make(wish, flights, names[0], partial, into_place, tell)
+
+
+# ---------------------------------------------------------------------- jobs
+
+
+def _jobs(wish: Wish, flight: Flight, number: int, partial: Path) -> list[Job]:
+    tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
+    return [_job(wish, flight, number, tile, partial) for tile in tiles]
+
+
+def _job(wish: Wish, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
+    places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
+    if not tile.strip:
+        return Job(number, tile, places)
+    assert flight.trajectory is not None
+    begin, end = flight.gps_from_host([tile.start_ns, tile.end_ns]).tolist()
+    reach = MARGIN_NS + TRAJECTORY_MARGIN_NS
+    trajectory = flight.trajectory.between(begin - reach, end + reach)
+    name = f"{flight.session.session_id}_strip{tile.strip:02d}"
+    path = partial / (name + (".copc.laz" if wish.copc else ".laz"))
+    dropped = partial / f"{name}{DROPPED}" if wish.write_dropped else None
+    return Job(number, tile, places, trajectory, path, dropped)
+
+
+def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
+    """Of scanners, by name, the same in all files: a session may lack one that another has."""
+    return {name: number for number, name in enumerate(sorted({n for one in flights for n in one.setup.scanners}))}
+
+
+def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]) -> SessionPlan:
+    setup = flight.setup
+    assert setup.mapping is not None
+    protocols = {name: setup.config.scanner[name].protocol for name in setup.scanners}
+    near, _ = utc_from_gps(flight.span[0], 0)
+    day, _ = utc_from_gps(flight.span[0], table_leap_seconds(near)[0])
+    las = LasSettings(
+        wkt=setup.mapping.wkt,
+        offset=origin,
+        scale=(wish.scale, wish.scale, wish.scale),
+        sigmas=wish.sigmas,
+        creation_date=day,
+        software=f"swath {__version__}",
+        system_identifier=" ".join(protocols.values()),
+        provenance=json.dumps(
+            {
+                "software": f"swath {__version__}",
+                "session": flight.session.session_id,
+                "calibrations": {name: calibration.id for name, calibration in setup.calibrations.items()},
+            }
+        ),
+    )
+    eight_bit = [name for name, protocol in protocols.items() if find_driver("scanner", protocol).eight_bit_intensity]
+    factors = dict.fromkeys(eight_bit, INTENSITY_FACTOR)
+    return SessionPlan(flight.index, setup, flight.clocks.clocks, las, factors, numbers, wish.copc)
+
+
+def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
+    """Offset of all files: the middle of the trajectory, rounded; heights have none."""
+    flight = flights[0]
+    assert flight.trajectory is not None
+    assert flight.setup.mapping is not None
+    within = flight.trajectory.between(*flight.span)
+    middle = within.position_e[len(within) // 2]
+    east, north, _ = np.round(flight.setup.mapping.map_from_e(middle[np.newaxis])[0] / OFFSET_STEP) * OFFSET_STEP
+    return float(east), float(north), 0.0
+
+
+# ---------------------------------------------------------------------- second pass, and what is written
+
+
+@contextmanager
+def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
+    """A folder for what is not finished, and what puts it in its place; it goes whatever happens. Names of sessions."""
+    output, name = wish.output, names[0]
+    _refuse_existing(wish, names)
+    output.mkdir(parents=True, exist_ok=True)
+    partial = output / f"{name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+
+    def into_place(files: list[Path]) -> None:
+        for file in files:
+            sync_file(file)
+        for one in names:
+            (output / f"{one}.json").unlink(missing_ok=True)
+            for old in _strips(output, one):
+                old.unlink()
+        for file in files:
+            file.replace(output / file.name)
+        try_sync_directory(output)
+
+    try:
+        yield partial, into_place
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _strips(folder: Path, name: str) -> list[Path]:
+    """Files of a session's strips that are there."""
+    return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
+
+
+def _refuse_existing(wish: Wish, names: Sequence[str]) -> None:
+    """UserError where products of the sessions are there, or a trajectory of theirs that is read."""
+    for name in names:
+        files = TrajectoryFiles.in_folder(wish.output, name, csv=True)
+        trajectories = [path for path in (files.csv, files.sbet, files.smrmsg) if path is not None and path.exists()]
+        read = wish.trajectory.file
+        if read is not None and read.exists() and any(path.samefile(read) for path in trajectories):
+            raise UserError(
+                f"{read}: is read, and would be replaced by what is used of it; want another folder", ExitCode.USAGE
+            )
+        there = [path for path in (wish.output / f"{name}.json", *_strips(wish.output, name)) if path.exists()]
+        if (there or trajectories) and not wish.overwrite:
+            first = [*there, *trajectories][0]
+            raise UserError(
+                f"{first}: is there from an earlier run; want another folder, or --overwrite", ExitCode.USAGE
+            )
+    _refuse_parts(wish.output, names)
+
+
+def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
+    """UserError where a part of a run would be replaced, whose sidecar would then tell of files that are gone."""
+    for path in sorted(folder.glob("*.json")):
+        sessions = sessions_in(read_sidecar(path))
+        others = [session for session in sessions if session not in names]
+        if others and len(others) < len(sessions):
+            text = f"{path}: is of one run with {', '.join(others)}; want all its sessions at once, or another folder"
+            raise UserError(text, ExitCode.USAGE)
+
+
+def _make(
+    wish: Wish,
+    flights: Sequence[Flight],
+    name: str,
+    partial: Path,
+    into_place: Callable[[list[Path]], None],
+    tell: Tell,
+) -> Report:
+    origin = _origin(flights)
+    numbers = _numbers(flights)
+    plans = [_plan(wish, flight, origin, numbers) for flight in flights]
+    jobs = [job for number, flight in enumerate(flights) for job in _jobs(wish, flight, number, partial)]
+    total = sum(job.size for job in jobs)
+    given_up = Event()
+    with ThreadPoolExecutor(1) as hasher:
+        paths = [part.path for flight in flights for part in flight.session.parts]
+        hashes = [hasher.submit(sha256_of, path, given_up.is_set) for path in paths]
+        try:
+            results = run_jobs(
+                plans,
+                jobs,
+                workers=wish.workers,
+                scheduler=wish.scheduler,
+                progress=lambda done: tell("points", done, total),
+            )
+            logs = [{"name": path.name, "sha256": found.result()} for path, found in zip(paths, hashes, strict=True)]
+        except BaseException:  # an interrupt too: nobody waits for the hashes of large logs then
+            given_up.set()
+            raise
+    _note_troubles(flights, results)
+    files = {job.segment.strip: _files(job, result) for job, result in zip(jobs, results, strict=True)}
+    done = [path for made in files.values() for path in made if path is not None]
+    trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
+    record = run_record(flights, results, files)
+    record["verdict"] = verdict_of(wish, flights)
+    record |= {"logs": logs, "files": [path.name for path in trajectories], "options": wish.record()}
+    into_place([*done, *trajectories])
+    sidecar = wish.output / f"{name}.json"
+    write_sidecar(sidecar, record)
+    return Report(record, sidecar)
+
+
+def _files(job: Job, result: JobResult) -> tuple[Path | None, Path | None]:
+    """What a job made: points, and the list of what has no place."""
+    if result.failed:
+        return None, None
+    return job.path if result.points or result.withheld else None, job.dropped if result.listed else None
+
+
+def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
+    """Why returns have no time; UserError where no return at all could be placed."""
+    note_times(flights, results)
+    if not any(result.points or result.failed for result in results):
+        lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
+        lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]
+        became = reasons_text(fates for result in results for fates in result.fates.values())
+        refusals.refuse_nothing(flights[0].log, lines, became)
+
+
+def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
+    """As much of it as the returns needed: CSV, and SBET with smrmsg."""
+    assert flight.trajectory is not None
+    used = flight.trajectory.between(*flight.span)
+    if flight.setup.deflection_rad is not None:  # to what its own attitude referred to: it may be used again
+        xi, eta = flight.setup.deflection_rad
+        used = used.with_deflection(-xi, -eta)
+    written = write_trajectory(TrajectoryFiles.in_folder(folder, flight.session.session_id, csv=True), used, None)
+    put_in_place(written)
+    return sorted(path for _, path in written)

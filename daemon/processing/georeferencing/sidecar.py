@@ -1,0 +1,285 @@
+"""The JSON beside the products: what they were made of, with what, and what became of every return."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swath import __version__
+from swath.daemon.processing.carried_verdict import trajectory_entry
+from swath.daemon.processing.setup.models import air_of
+from swath.daemon.processing.trajectory.files import write_whole
+from swath.daemon.processing.unread import unread_lines
+from swath.georef.points import Fate
+from swath.georef.scanner.calibration import PARAMETERS
+
+if TYPE_CHECKING:
+    from swath.daemon.processing.flights.read import Flight
+    from swath.daemon.processing.points.jobs import JobResult
+    from swath.daemon.processing.setup.setup import Setup
+    from swath.georef.scanner.calibration import Calibration
+
+FORMAT = "swath.georef"
+FORMAT_VERSION = 1
+CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # of a calibration's header
+IN_FILES = Fate.GEOREFERENCED.name.lower()
+UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
+_HASH_BLOCK = 1 << 20
+
+
+def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
+    """Of a file, or of some of it where that is given up meanwhile; raises OSError."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while (block := file.read(_HASH_BLOCK)) and not given_up():
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def calibration_entry(calibration: Calibration) -> dict[str, Any]:
+    """A calibration with all its parameters, in the units of its file."""
+    parameters = {parameter.key: calibration.value(parameter.name) / parameter.factor for parameter in PARAMETERS}
+    said = {key: calibration.header[key] for key in CARRIED if key in calibration.header}
+    return {"id": calibration.id, "method": calibration.method, **said, "parameters": parameters}
+
+
+def settings_entry(setup: Setup) -> dict[str, Any]:
+    """What the configuration says that the points depend on."""
+    config = setup.config
+    return {
+        "atmosphere": config.atmosphere.model_dump(mode="json"),
+        "attitude": config.attitude.model_dump(mode="json"),
+        "mta": config.mta.model_dump(mode="json"),
+        "scanners": {name: config.scanner[name].model_dump(mode="json", exclude_none=True) for name in setup.scanners},
+        "gnss": {
+            name: {"lever_arm_m": list(gnss.lever_arm_m), "datum": gnss.datum} for name, gnss in config.gnss.items()
+        },
+    }
+
+
+def count_fates(results: Sequence[JobResult]) -> dict[str, dict[str, Any]]:
+    """By scanner: returns read, in files, and out of them by reason."""
+    total: dict[str, Counter[str]] = {}
+    for result in results:
+        for scanner, fates in result.fates.items():
+            total.setdefault(scanner, Counter()).update(fates)
+    unread = count_unread(results)
+    return {
+        scanner: counts_entry(fates) | {"messages_not_read": dict(sorted(unread.get(scanner, {}).items()))}
+        for scanner, fates in sorted(total.items())
+    }
+
+
+def count_unread(results: Sequence[JobResult]) -> dict[str, Counter[str]]:
+    """By scanner: messages that gave nothing, by reason."""
+    total: dict[str, Counter[str]] = {}
+    for result in results:
+        for scanner, counts in result.unread.items():
+            total.setdefault(scanner, Counter()).update(counts)
+    return total
+
+
+def reasons_text(fates: Iterable[Counter[str]]) -> str:
+    """What became of returns, for people."""
+    total: Counter[str] = Counter()
+    for counts in fates:
+        total.update(counts)
+    became = (f"{count:,} {reason.replace('_', ' ')}" for reason, count in sorted((+total).items()))
+    return ", ".join(became) or "none came"
+
+
+def counts_entry(fates: Counter[str]) -> dict[str, Any]:
+    """Read = written + dropped, and why."""
+    dropped = {name: count for name, count in sorted(fates.items()) if name != IN_FILES and count}
+    return {"read": fates.total(), "written": fates[IN_FILES], "dropped": dropped}
+
+
+def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> dict[str, Any]:
+    """A strip: its files, its times, what is in it."""
+    entry: dict[str, Any] = {
+        "number": result.strip,
+        "file": None if file is None else file.name,
+        "points": result.points,
+        "withheld": result.withheld,
+        "dropped_file": None if dropped is None else dropped.name,
+        "dropped_rows": result.listed,
+        "first_gps_ns": result.first_gps_ns,
+        "last_gps_ns": result.last_gps_ns,
+        "bounds": result.bounds,
+        "bytes": result.file_bytes,
+        "counts": {scanner: counts_entry(fates) for scanner, fates in sorted(result.fates.items())},
+        "clipped": {
+            "sigma_above_6.5535_m": result.clipped.sigma,
+            "sigma_unknown": result.clipped.sigma_unknown,
+            "intensity": result.clipped.intensity,
+        },
+    }
+    return entry | ({"failed": result.failed} if result.failed else {})
+
+
+def run_record(
+    flights: Sequence[Flight], results: Sequence[JobResult], files: Mapping[int, tuple[Path | None, Path | None]]
+) -> dict[str, Any]:
+    """What the sidecar says of the run, but for the user's wishes.
+
+    Args:
+        flights: of the run.
+        results: of all segments.
+        files: by strip, of its points and of what has no place.
+    """
+    warnings = [line for flight in flights for line in _warnings(flight, _of(results, flight, flights))]
+    holes = [line for flight in flights for line in _holes(flight, _of(results, flight, flights))]
+    strips = [strip_entry(result, *files[result.strip]) for result in results if result.strip]
+    mapping = flights[0].setup.mapping
+    assert mapping is not None
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "software": f"swath {__version__}",
+        "complete": not holes,
+        "holes": holes,
+        "warnings": warnings,
+        "crs": mapping.description(),
+        "counts": count_fates(results),
+        "strips": strips,
+        "flights": [_flight_entry(flight, _of(results, flight, flights)) for flight in flights],
+    }
+
+
+def _of(results: Sequence[JobResult], flight: Flight, flights: Sequence[Flight]) -> list[JobResult]:
+    number = next(number for number, one in enumerate(flights) if one is flight)
+    return [result for result in results if result.session == number]
+
+
+def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
+    setup, trajectory = flight.setup, flight.trajectory
+    assert trajectory is not None
+    return {
+        "session": flight.session.session_id,
+        "start": utc_text(flight.session.info.realtime_ns),
+        "recorder": flight.session.info.software,
+        "origin": flight.session.info.origin or "recording",
+        "returns_gps_ns": list(flight.span),
+        "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts)
+        | {
+            "epochs": len(trajectory),
+            "solutions": flight.solutions,
+            "gaps_gps_ns": trajectory.between(*flight.span).gaps().tolist(),
+        },
+        "clock": flight.clock,
+        "stamps": {
+            source: {"scale": found.scale.value, "why": found.text, "sigma_ns": round(found.sigma_ns)}
+            for source, found in sorted(flight.clocks.clocks.stamps.items())
+        },
+        "calibrations": {name: calibration_entry(value) for name, value in setup.calibrations.items()},
+        "settings": settings_entry(setup),
+        "atmosphere_at_edge": _edges(flight, results),
+        "lost_by_recorder": flight.lost,
+    }
+
+
+def _edges(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
+    """By scanner: what the atmosphere's models amount to at the swath's edge, whether they were applied or not."""
+    config, entries = flight.setup.config, {}
+    for name, (angle_rad, above_m, ground_m) in _widest(results).items():
+        effect = air_of(config, config.scanner[name]).at_edge(above_m, angle_rad, ground_m)
+        entries[name] = {
+            "angle_deg": math.degrees(angle_rad),
+            "height_above_ground_m": above_m,
+            "range_m": effect.range_m,
+            "bending_m": effect.bending_m,
+        }
+    return entries
+
+
+def _widest(results: Sequence[JobResult]) -> dict[str, tuple[float, float, float]]:
+    widest: dict[str, tuple[float, float, float]] = {}
+    for result in results:
+        for name, edge in result.edges.items():
+            widest[name] = max(widest.get(name, edge), edge)
+    return widest
+
+
+def _warnings(flight: Flight, results: Sequence[JobResult]) -> list[str]:
+    config = flight.setup.config
+    lines = [
+        line
+        for name, (angle_rad, above_m, ground_m) in _widest(results).items()
+        if (line := air_of(config, config.scanner[name]).warning(above_m, angle_rad, ground_m)) is not None
+    ]
+    lines += unit_doubts(flight)
+    lines += flight.doubts
+    lines += unread_lines(str(flight.log), count_unread(results))[1]
+    sigma, unknown, intensity = (
+        sum(getattr(result.clipped, name) for result in results) for name in ("sigma", "sigma_unknown", "intensity")
+    )
+    if sigma:
+        lines.append(f"{sigma:,} points have a sigma of 6.5535 m or more, which stands in the file as 6.5535 m")
+    if unknown:
+        lines.append(
+            f"{unknown:,} points have a sigma that is not known, as the trajectory says none; "
+            "6.5535 m stands in the file"
+        )
+    if intensity:
+        lines.append(f"{intensity:,} points have an intensity above 65535, which stands in the file as 65535")
+    return lines
+
+
+def unit_doubts(flight: Flight) -> list[str]:
+    """Where coordinates are feet and heights, of which the CRS says nothing, are metres."""
+    assert flight.setup.mapping is not None
+    frame = flight.setup.mapping.description()
+    unit, _, unit_of_height = frame["units"]["names"]
+    if unit == unit_of_height or not frame["heights"].startswith("ellipsoidal"):
+        return []
+    return [
+        f"easting and northing are in {unit}, heights in {unit_of_height} above the ellipsoid: {frame['crs']} says "
+        f"nothing of heights, and other programs may take them for {unit}; want output.crs with a vertical CRS, "
+        f"such as EPSG:6529+5703"
+    ]
+
+
+def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
+    session = flight.session
+    damages = list(dict.fromkeys([*session.damage, *flight.index.damage, *(d for r in results for d in r.damage)]))
+    lines = [
+        f"{flight.log.parent}: part {number} of {session.session_id} is missing" for number in session.missing_parts
+    ]
+    if session.growing is not None:
+        lines.append(f"{session.growing}: is still being recorded; the products are of what it held so far")
+    for part in damages:
+        damage = part.damage
+        lines.append(f"{part.path}: at byte {damage.offset}: {damage.length} bytes, {damage.what}")
+    lines += flight.holes
+    lines += unread_lines(str(flight.log), count_unread(results))[0]
+    for result in results:
+        if result.failed:
+            lines.append(f"strip {result.strip}: {result.failed}" if result.strip else f"a turn: {result.failed}")
+        elif result.strip and not result.points:
+            why = reasons_text(result.fates.values())
+            file = "" if result.withheld else "; it has no file"
+            lines.append(f"strip {result.strip}: no return of it could be georeferenced ({why}){file}")
+        elif result.strip:
+            lines += [
+                f"strip {result.strip}: {count:,} returns of {name} {UNCOVERED[reason]}"
+                for name, fates in sorted(result.fates.items())
+                for reason, count in sorted(fates.items())
+                if reason in UNCOVERED and count
+            ]
+    return lines
+
+
+def utc_text(time_ns: int) -> str:
+    """A host time for people."""
+    return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def write_sidecar(path: Path, content: dict[str, Any]) -> None:
+    """Write it whole or not at all; raises OSError."""
+    write_whole({path: (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()})

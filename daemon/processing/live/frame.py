@@ -1,0 +1,141 @@
+"""The frame ``local`` that people look at: east, north, up in metres, near the flight: for single precision."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from swath.daemon.processing.live.mcap import CLOUD_DTYPE
+from swath.georef.compiled import kept
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.vectors import rot_of
+from swath.georef.points import Points
+
+FloatArray = NDArray[np.float64]
+
+ORIGIN_STEP = 100.0  # the origin's coordinates are whole hundreds, so that people can add them in their heads
+STEP_M = 10.0  # along the body's axes, to see where they point on the map
+POLAR_STEPS = 10  # as many as a map's scale of up to ten wants
+_ENU_OF_L = [1, 0, 2]
+_ENU_SIGNS = np.array([1.0, 1.0, -1.0])
+
+
+class Maps(Protocol):
+    """`swath.georef.mapping.frame.Mapping`, as far as it is wanted here."""
+
+    @property
+    def unit_m(self) -> FloatArray:
+        """(3,) metres in a unit of easting, northing, height."""
+
+    @property
+    def wkt(self) -> str:
+        """The CRS."""
+
+    def map_from_e(self, points_e: FloatArray) -> FloatArray:
+        """(n, 3) east, north, height."""
+
+
+class LocalFrame:
+    """East, north, up in metres from an origin near the first position.
+
+    The axes are the mapping frame's; where there is none, or an earth-centred one, they are level at the origin.
+
+    Attributes:
+        origin: (3,) in the coordinates of the points: map, or e.
+        unit_m: (3,) metres in a unit of those.
+        is_level: the axes are not those of the points.
+    """
+
+    def __init__(self, position_e: FloatArray, mapping: Maps | None) -> None:
+        """``position_e``: (3,) the first position."""
+        self._mapping = mapping
+        self.is_level = mapping is None or bool(CRS.from_wkt(mapping.wkt).is_geocentric)
+        self.unit_m: FloatArray = np.ones(3) if mapping is None else mapping.unit_m
+        self.origin: FloatArray = self._mapped(position_e[np.newaxis])[0].copy()
+        if self.is_level:
+            lat, lon, _ = geodetic_from_e(self.origin)
+            rot = rot_e_from_l(np.asarray(lat), np.asarray(lon))
+            self._rot_points_from_enu = np.ascontiguousarray(rot[:, _ENU_OF_L] * _ENU_SIGNS)
+        else:
+            self.origin = np.floor(self.origin / ORIGIN_STEP) * ORIGIN_STEP
+
+    def _mapped(self, points_e: FloatArray) -> FloatArray:
+        return points_e if self._mapping is None else self._mapping.map_from_e(points_e)
+
+    def of_points(self, points: FloatArray) -> FloatArray:
+        """(n, 3) of points as the georeferencer gives them."""
+        away: FloatArray = points - self.origin
+        return away @ self._rot_points_from_enu if self.is_level else away * self.unit_m
+
+    def cloud_of(self, points: Points, keep: NDArray[np.int64]) -> NDArray[Any]:
+        """Those of the points, by number, of `CLOUD_DTYPE`."""
+        cloud = np.empty((len(keep), 4), np.float32)
+        if self.is_level:
+            cloud[:, :3] = self.of_points(points.points_map.take(keep, axis=0))
+            cloud[:, 3] = points.intensity.take(keep)
+        else:
+            _fill_cloud(points.points_map, points.intensity, keep, self.origin, self.unit_m, cloud)
+        return cloud.view(CLOUD_DTYPE).reshape(-1)
+
+    def pose_of(self, position_e: FloatArray, q_e_from_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position (3,) and quaternion (4,), scalar first and ≥ 0, of the body.
+
+        The axes are those of the frame where the body is: three steps along b, mapped, made perpendicular.
+        """
+        places, q_local_from_b = np.empty((4, 3)), np.empty(4)
+        _step_along(position_e, q_e_from_b, places)
+        mapped = self.of_points(self._mapped(places))
+        _attitude_of(mapped, q_local_from_b)
+        return mapped[0], q_local_from_b
+
+
+@kept
+def _step_along(position_e: Any, q_e_from_b: Any, places: Any) -> None:
+    """(4, 3): a position, and a step from there along each axis of b."""
+    rot = rot_of(q_e_from_b[0], q_e_from_b[1], q_e_from_b[2], q_e_from_b[3])
+    for axis in range(3):
+        places[:, axis] = position_e[axis]
+        for of_b in range(3):
+            places[1 + of_b, axis] += STEP_M * rot[axis][of_b]
+
+
+@kept
+def _attitude_of(places: Any, q: Any) -> None:
+    """Quaternion (4,), scalar first, of the steps (4, 3) made perpendicular: the rotation that is nearest to them.
+
+    Polar decomposition by Newton's iteration (Higham 1986, SIAM J. Sci. Stat. Comput. 7), then Shepperd 1978.
+    """
+    m = np.empty((3, 3))  # a column each, but for the scale
+    for axis in range(3):
+        m[:, axis] = (places[1 + axis] - places[0]) / STEP_M
+    for _ in range(POLAR_STEPS):
+        inverse = np.empty((3, 3))
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            for axis in range(3):
+                up, down = (axis + 1) % 3, (axis + 2) % 3
+                inverse[i, axis] = m[j, up] * m[k, down] - m[j, down] * m[k, up]
+        m = 0.5 * (m + inverse / (m[0] * inverse[0]).sum())
+    i = int(np.argmax(np.array([m[0, 0], m[1, 1], m[2, 2]])))
+    j, k = (i + 1) % 3, (i + 2) % 3
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    if trace > m[i, i]:
+        q[:] = (1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    else:
+        q[0], q[1 + i] = m[k, j] - m[j, k], 1.0 + m[i, i] - m[j, j] - m[k, k]
+        q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+    q /= math.copysign(math.sqrt((q * q).sum()), q[0])
+
+
+@kept
+def _fill_cloud(points: Any, intensity: Any, keep: Any, origin: Any, unit_m: Any, cloud: Any) -> None:
+    """Rows of x, y, z, intensity; the frame's axes are those of the points."""
+    for k in range(len(keep)):
+        i = keep[k]
+        for axis in range(3):
+            cloud[k, axis] = (points[i, axis] - origin[axis]) * unit_m[axis]
+        cloud[k, 3] = intensity[i]

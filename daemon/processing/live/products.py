@@ -1,0 +1,279 @@
+"""What the operator looks at during the flight: points thinned for the eye, where the aircraft is, what is covered.
+
+Counts and grids take every point; only what live.mcap shows is thinned. Nothing here has a say in the points.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import functools
+import json
+import math
+import os
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.processing.live.frame import LocalFrame, Maps
+from swath.daemon.processing.live.grid import CountGrid
+from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
+from swath.georef.compiled import kept
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.points import Points
+from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
+from swath.georef.trajectory.trajectory import Trajectory
+
+POSE_NS = 100_000_000  # between two poses
+ROOM_AGAIN = 1.05  # of the free space at which writing stopped: where it begins again
+IMAGE_CELLS = 2048
+COVERAGE, PICTURE = "coverage.json", "coverage.png"
+FIRST_STRIDE = 16  # of the thinning, until a second of points has been counted
+# Points a square metre, and the colour from there on; nothing is transparent.
+_COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
+            (32.0, 0x1F5F8B))  # fmt: skip
+
+
+class Thinning:
+    """Which points are for the eye: at most so many of a second of GPS time, spread over it.
+
+    The stride follows from the number in the second before; the rule knows points and their order, not their blocks.
+    """
+
+    def __init__(self, points_per_s: int) -> None:
+        self._limit = points_per_s
+        self._state = np.array([np.iinfo(np.int64).min, 0, 0, FIRST_STRIDE, 0], dtype=np.int64)
+
+    def keep(self, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which (k,) of points in the order in which they came."""
+        kept_ones = np.empty(len(time_ns), dtype=np.int64)
+        return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
+
+
+@kept
+def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
+    """How many are kept.
+
+    state: first nanosecond after the second, points in it, of them kept, stride, points until the next is kept.
+    """
+    count = 0
+    end, points, shown, stride, until = state[0], state[1], state[2], state[3], state[4]
+    for i in range(len(time_ns)):
+        if time_ns[i] >= end:
+            if points > 0:
+                stride = max(1, -(-points // limit))
+            end, points, shown, until = (time_ns[i] // SECOND_NS + 1) * SECOND_NS, 0, 0, 0
+        if until == 0:
+            until = stride
+            if shown < limit:
+                keep[count] = i
+                count += 1
+                shown += 1
+        until -= 1
+        points += 1
+    state[0], state[1], state[2], state[3], state[4] = end, points, shown, stride, until
+    return count
+
+
+@dataclass(slots=True)
+class Room:
+    """Whether there is room on the disk: not from twice the recorder's reserve on, and again above it."""
+
+    folder: Path
+    least_bytes: int
+    free_bytes: int = 0
+    is_enough: bool = True
+
+    def look(self) -> bool:
+        """Look again."""
+        disk = os.statvfs(self.folder)
+        self.free_bytes = disk.f_bavail * disk.f_frsize
+        wanted = self.least_bytes * (1.0 if self.is_enough else ROOM_AGAIN)
+        self.is_enough = self.free_bytes > wanted
+        return self.is_enough
+
+
+class LiveProducts:
+    """Takes points as they come, and writes what is to be looked at.
+
+    Attributes:
+        points: by scanner, all of them; ``shown``: written to live.mcap; ``unwritten``: thinned ones that were not.
+        trouble: why nothing is written, for people; empty: it is.
+    """
+
+    def __init__(self, folder: Path, live: LiveConfig, mapping: Maps | None, reserve_bytes: int, about: str) -> None:
+        """``about``: the mapping frame for people. Raises OSError: the folder cannot be written to."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.points: Counter[str] = Counter()
+        self.shown = self.unwritten = 0
+        self.trouble = ""
+        self.room = Room(folder, 2 * reserve_bytes)
+        self.frame: LocalFrame | None = None
+        self.grid = CountGrid(live.cell_m)
+        self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
+        self._thinning = Thinning(live.points_per_s)
+        self._mcap: LiveMcap | None = None
+        self._pose_ns = 0
+
+    def begin(self, trajectory: Trajectory | None) -> None:
+        """Lay the local frame at the first position that is known; later calls change nothing.
+
+        With the first of the trajectory and not of the points, which must not wait for what PROJ does when it is first
+        asked.
+        """
+        if self.frame is None and trajectory is not None and len(trajectory):
+            self.frame = LocalFrame(trajectory.position_e[-1], self._mapping)
+
+    def take(self, name: str, points: Points, trajectory: Trajectory | None, log_time_ns: int) -> None:
+        """Points of a scanner, in order; with what is known of the flight by then."""
+        self.points[name] += len(points)
+        self.begin(trajectory)
+        if self.frame is None:
+            return
+        if self.frame.is_level:
+            self.grid.add(self.frame.of_points(points.points_map))
+        else:
+            east, north, _ = self.frame.origin.tolist()
+            self.grid.add(points.points_map, east, north, float(self.frame.unit_m[0]))
+        keep = self._thinning.keep(points.time_ns)
+        count = len(keep)
+        if count:
+            cloud = self.frame.cloud_of(points, keep)
+            time_ns = unix_from_gps(int(points.time_ns[keep[0]]))
+            written = self._write(lambda mcap: mcap.add_cloud(f"/points/{name}", cloud, time_ns, log_time_ns))
+            self.shown += count * written
+            self.unwritten += count * (not written)
+
+    def take_pose(self, trajectory: Trajectory | None, log_time_ns: int) -> None:
+        """The newest pose, ten times a second of the log at most; the first one lays the frame."""
+        if trajectory is None or log_time_ns < self._pose_ns + POSE_NS:
+            return
+        self.begin(trajectory)
+        if self.frame is None:
+            return
+        self._pose_ns = log_time_ns
+        position_e = trajectory.position_e[-1]
+        position, q_local_from_b = self.frame.pose_of(position_e, trajectory.q_e_from_b[-1])
+        lat, lon, height = geodetic_from_e(position_e)
+        pose = LivePose(
+            unix_from_gps(int(trajectory.time_ns[-1])),
+            math.degrees(lat),
+            math.degrees(lon),
+            float(height),
+            position,
+            q_local_from_b,
+            trajectory.position_sigma_l[-1],
+        )
+        self._write(lambda mcap: mcap.add_pose(pose, log_time_ns))
+
+    def look_for_room(self) -> None:
+        """Once a second: may there be written?"""
+        try:
+            is_enough = self.room.look()
+        except OSError as error:
+            self.trouble = f"{self._folder}: {error.strerror or error}: nothing is written any more"
+            return
+        if is_enough:
+            if self.trouble.startswith("free space"):
+                self.trouble = ""
+            return
+        least_mb = self.room.least_bytes / 1e6
+        self.trouble = f"free space is down to {least_mb:.0f} MB, twice the recorder's reserve: nothing is written"
+
+    def _write(self, add: Any) -> bool:
+        """Into live.mcap, if there is one and room for it."""
+        if self.trouble or self.frame is None:
+            return False
+        try:
+            if self._mcap is None:
+                quota_bytes = int(self._live.live_quota_mb * 1e6)
+                metadata = {key: json.dumps(value) for key, value in self.origin().items()}
+                self._mcap = LiveMcap(self._folder, quota_bytes, metadata)
+            written = bool(add(self._mcap))
+        except OSError as error:
+            self.trouble = f"{NAME}: {error.strerror or error}: nothing is written any more"
+            return False
+        if self._mcap.is_full:
+            self.trouble = f"{NAME} has reached live_quota_mb = {self._live.live_quota_mb:g}: nothing is added to it"
+        return written
+
+    def origin(self) -> dict[str, Any]:
+        """What the coordinates of the products mean."""
+        said: dict[str, Any] = {"crs": self._about, "axes": "east, north, up, metres"}
+        if self.frame is not None:
+            said["origin"] = [round(value, 4) for value in self.frame.origin.tolist()]
+            said["origin_unit_m"] = self.frame.unit_m.tolist()
+        return said
+
+    def save_coverage(self, latest: dict[str, Any]) -> None:
+        """The grid as numbers and as a picture, each replaced at once; nothing where there is no room."""
+        if self.trouble.startswith("free space") or not self.grid.points:
+            return
+        counts, west_m, north_m, cell_m = self.grid.image(IMAGE_CELLS)
+        numbers = self.grid.numbers() | self.origin() | latest
+        numbers["picture"] = {
+            "name": PICTURE,
+            "west_m": west_m,
+            "north_m": north_m,
+            "cell_m": cell_m,
+            "rows": counts.shape[0],
+            "columns": counts.shape[1],
+            "colours_from_points_per_m2": {f"#{colour:06x}": density for density, colour in _COLOURS},
+        }
+        try:
+            replace_file(self._folder / PICTURE, picture(counts, cell_m))
+            replace_file(self._folder / COVERAGE, (json.dumps(numbers, indent=2) + "\n").encode())
+        except OSError as error:
+            self.trouble = f"{COVERAGE}: {error.strerror or error}: nothing is written any more"
+
+    def close(self) -> None:
+        """Finish live.mcap."""
+        mcap, self._mcap = self._mcap, None
+        if mcap is not None:
+            try:
+                mcap.close()
+            except OSError as error:
+                self.trouble = f"{NAME}: {error.strerror or error}: it has no index"
+
+
+def unix_from_gps(gps_ns: int) -> int:
+    """POSIX nanoseconds of a GPS time, for stamps that people see: leap seconds by the built-in table."""
+    second, rest_ns = divmod(gps_ns, SECOND_NS)
+    return _unix_of_second(second) + rest_ns
+
+
+@functools.lru_cache(maxsize=16)
+def _unix_of_second(gps_s: int) -> int:
+    gps_ns = gps_s * SECOND_NS
+    date: dt.date = utc_from_gps(gps_ns, 18)[0]
+    return max(0, unix_ns_from_gps(gps_ns, table_leap_seconds(date)[0]))
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Put data in a file's place at once: whoever reads sees the old or the new one, never half."""
+    new = path.with_name(path.name + ".new")
+    new.write_bytes(data)
+    new.replace(path)
+
+
+def picture(counts: NDArray[Any], cell_m: float) -> bytes:
+    """A PNG (ISO/IEC 15948) of points in cells (rows, columns), a pixel each, coloured by density; none is clear."""
+    index: NDArray[np.uint8] = np.zeros(counts.shape, dtype=np.uint8)
+    for density, _ in _COLOURS:
+        index += counts >= max(1, math.ceil(density * cell_m**2))
+    rows, columns = index.shape
+    lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # before each line the number of its filter: none
+    lines[:, 1:] = index
+    palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in _COLOURS)))
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
+    pieces = {b"IHDR": head, b"PLTE": palette, b"tRNS": b"\0", b"IDAT": zlib.compress(lines.tobytes(), 1), b"IEND": b""}
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in pieces.items()
+    )

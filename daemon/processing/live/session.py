@@ -1,0 +1,327 @@
+"""The live georeferencer: follows a recording, or reads finished logs by the same code, and says how it does.
+
+The messages go in the file's order into a `LogFeed`; what comes out depends on the log alone. Only what is written for
+the operator, and what is passed over when this computer is too slow, depends on the clock on the wall.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.config.tables import LiveConfig
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
+from swath.daemon.processing.live.follow import LiveFollower, Skipped
+from swath.daemon.processing.live.points import PointsFile
+from swath.daemon.processing.live.products import LiveProducts, Room
+from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
+from swath.daemon.processing.points.feed import LogFeed, Placed
+from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.recorder.run import read_boot_id
+from swath.georef.records import StructArray
+from swath.georef.trajectory.trajectory import Trajectory
+
+FOLDER = "live"  # in the log directory
+POLL_S = 0.05
+STATUS_S = 1.0
+COVERAGE_S = 10.0
+NICE = 10
+_IOPRIO_SET = {"x86_64": 251, "aarch64": 30, "armv7l": 314, "riscv64": 30}  # system call numbers
+_IOPRIO_WHO_PROCESS, _IOPRIO_IDLE = 1, 3 << 13
+
+Told = dict[str, Any]
+
+
+class _SeenPath:
+    """A stream's path, with what it last said."""
+
+    def __init__(self, path: Any) -> None:
+        self.trajectory: Trajectory | None = None
+        self._path = path
+
+    @property
+    def covered_until_ns(self) -> int | None:
+        covered: int | None = self._path.covered_until_ns
+        return covered
+
+    def add(self, rows: StructArray) -> None:
+        self._path.add(rows)
+
+    def update(self) -> Trajectory | None:
+        self.trajectory = self._path.update()
+        return self.trajectory
+
+
+class LiveSession:
+    """One recording on its way to points.
+
+    Attributes:
+        now_ns: host time as far as the log has been read; `live` reads the clock instead.
+        verdict: on the calibrations, as the status says it.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        info: SessionInfo,
+        folder: Path,
+        live: LiveConfig,
+        points: Path | None,
+        *,
+        beside_recorder: bool = False,
+        accept_verdict: bool = False,
+    ) -> None:
+        """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
+        self.info = info
+        source = "navigated" if setup.ins_source is None else "ins"
+        self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
+        self.now_ns = 0
+        self._stream = setup.live_stream(info)
+        self._path = _SeenPath(self._stream.path)
+        self._stream.path = self._path
+        self._feed = LogFeed(setup, self._stream)
+        if setup.ins_source is None and self._feed.navigator is None:
+            raise UserError(
+                f"{info.session_id}: no configured device tells its own INS solution, nor are there both an IMU and a "
+                "receiver to navigate by, and without a trajectory nothing is made while it is recorded; add them, or "
+                "georeference afterwards",
+                ExitCode.USAGE,
+            )
+        reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
+        about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
+        self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about)
+        self.status = LiveStatus(setup, self._stream, self.products)
+        self.points: PointsFile | None = None
+        if points is not None:
+            room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None
+            self.points = PointsFile(points, self._stream.scanners, room)
+        self._is_own = info.boot_id == read_boot_id()
+
+    def take(self, batch: LogBatch, *, live: bool) -> None:
+        """The next messages."""
+        self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
+        self.status.note_batch(batch, self.host_now_ns(live=live))
+        placed = self._feed.take(batch)
+        self.status.navigation = None if self._feed.navigator is None else self._feed.navigator.state
+        if placed:
+            self._give(placed, live=live)
+        self.products.take_pose(self._path.trajectory, self.now_ns)
+
+    def host_now_ns(self, *, live: bool) -> int:
+        """Host time of the session; of another computer's, whose clocks are not ours, that of what was read last."""
+        if live and self._is_own:
+            return time.monotonic_ns() + self.info.realtime_ns - self.info.monotonic_ns
+        return self.now_ns
+
+    def _give(self, placed: Placed, *, live: bool) -> None:
+        for name, points in placed:
+            if self.points is not None:
+                self.points.add(name, points)
+            self.products.take(name, points, self._path.trajectory, self.now_ns)
+            self.status.note_points(name, points.time_ns, self.host_now_ns(live=live))
+
+    def close(self, *, live: bool) -> None:
+        """The log is over: what still waits comes out, and files get their ends."""
+        self._give(self._feed.close(), live=live)
+        self.look_for_room()
+        self.products.close()
+        if self.points is not None:
+            self.points.close()
+
+    def look_for_room(self) -> None:
+        """Once a second: may there be written?"""
+        self.products.look_for_room()
+        if self.points is not None:
+            self.points.look_for_room()
+
+
+class Live:
+    """Follows what is recorded in a directory, once, until it ends.
+
+    Args:
+        directory: of the log.
+        live: what is written.
+        tell: takes the status each second, with its ``sentence``.
+        prepare: called with the recording's setup before the first of its messages is taken, to compile what it needs.
+        accept_verdict: a calibration that is not to be used is taken.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        live: LiveConfig,
+        tell: Callable[[Told], None],
+        *,
+        from_start: bool = False,
+        points: Path | None = None,
+        prepare: Callable[[Setup], None] | None = None,
+        accept_verdict: bool = False,
+    ) -> None:
+        self._accept_verdict = accept_verdict
+        self._directory, self._live, self._tell, self._points = directory, live, tell, points
+        self._prepare = prepare
+        self._follower = LiveFollower(directory, from_start=from_start)
+        self._session: LiveSession | None = None
+        self._told_s = self._covered_s = -COVERAGE_S
+        self._trouble = ""
+
+    def run(self, stopped: Callable[[], bool]) -> Told:
+        """Until the recording ends, or somebody says so; what was told last.
+
+        Raises:
+            UserError: the recording's configuration cannot be used, or nothing can be written.
+        """
+        try:
+            while not stopped() and not self._follower.ended:
+                for item in self._follower.poll():
+                    self._take(item)
+                    self._look_at_clock()
+                    if stopped():
+                        break
+                self._look_at_clock()
+                if not self._follower.ended:
+                    time.sleep(POLL_S)
+            return self._end()
+        finally:
+            self._follower.close()
+
+    def _take(self, item: LogBatch | Skipped) -> None:
+        part = self._follower.part
+        if isinstance(item, Skipped) or part is None:
+            return  # to the stream it is a hole in the log; the follower counts it
+        if self._session is None:
+            setup = Setup.of_log(part.attachments, Options(uncertainty=False))
+            if self._prepare is not None:
+                self._prepare(setup)
+            self._session = made_session(
+                setup,
+                part.info,
+                self._directory / FOLDER,
+                self._live,
+                self._points,
+                beside_recorder=True,
+                accept_verdict=self._accept_verdict,
+            )
+        self._session.take(item, live=True)
+
+    def _look_at_clock(self) -> None:
+        """The status once a second, the coverage now and then."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < STATUS_S:
+            return
+        self._told_s = now_s
+        if self._session is not None:
+            self._session.look_for_room()
+            if now_s - self._covered_s > COVERAGE_S:
+                self._covered_s = now_s
+                self._session.products.save_coverage(self._about())
+        self._say("following" if self._session is not None else "waiting for a recording to begin")
+
+    def _about(self) -> Told:
+        part = self._follower.part
+        return {} if part is None else {"session_id": part.info.session_id, "part": part.number}
+
+    def _say(self, state: str) -> Told:
+        found: Told = {"state": state, "directory": str(self._directory), **self._about()}
+        if self._session is not None:
+            now_ns = self._session.host_now_ns(live=True)
+            found |= {"time_ns": now_ns, "verdict": self._session.verdict}
+            found |= self._session.status.plain(self._follower, now_ns)
+            if self._session.points is not None and self._session.points.trouble:
+                found["points_file"] = self._session.points.trouble
+        found["sentence"] = one_line(sentence(found))
+        if self._session is not None:
+            with contextlib.suppress(OSError):  # the sentence is told all the same
+                write_status(self._directory / FOLDER, found)
+        self._tell(found)
+        return found
+
+    def _end(self) -> Told:
+        if self._session is not None:
+            self._session.close(live=True)
+            self._session.products.save_coverage(self._about())
+        return self._say(f"ended ({self._follower.ended or 'stopped'})")
+
+
+def made_session(
+    setup: Setup,
+    info: SessionInfo,
+    folder: Path,
+    live: LiveConfig,
+    points: Path | None,
+    *,
+    beside_recorder: bool = False,
+    accept_verdict: bool = False,
+) -> LiveSession:
+    """A session; UserError where its folder cannot be written to."""
+    try:
+        session = LiveSession(
+            setup, info, folder, live, points, beside_recorder=beside_recorder, accept_verdict=accept_verdict
+        )
+        session.look_for_room()
+        return session
+    except OSError as error:
+        text = f"{error.filename or folder}: {error.strerror or error}; swath live writes what it shows there"
+        raise UserError(one_line(text), ExitCode.IO) from error
+
+
+def replay(
+    session: Session,
+    setup: Setup,
+    folder: Path,
+    live: LiveConfig,
+    points: Path | None,
+    tell: Callable[[int], None] | None = None,
+    batches: Iterable[LogBatch] | None = None,
+    *,
+    accept_verdict: bool = False,
+) -> Told:
+    """The same over a finished session, as fast as it goes; the last status, which also stands in ``folder``.
+
+    Args:
+        session: of `open_logs`.
+        points: where all points go; None: nowhere.
+        tell: takes the log time reached.
+        batches: instead of the session's own, cut otherwise.
+        accept_verdict: a calibration that is not to be used is taken.
+
+    Raises:
+        UserError: nothing can be written.
+    """
+    run = made_session(setup, session.info, folder, live, points, accept_verdict=accept_verdict)
+    try:
+        for batch in session.batches() if batches is None else batches:
+            run.take(batch, live=False)
+            if tell is not None:
+                tell(run.now_ns)
+        run.close(live=False)
+        about = {"session_id": session.session_id, "part": session.parts[-1].number}
+        run.products.save_coverage(about)
+        found: Told = {"state": "replayed", **about, "time_ns": run.now_ns, "verdict": run.verdict}
+        found |= run.status.plain(None, run.now_ns)
+        found["damaged_chunks"] = len(session.damage)
+        found["sentence"] = one_line(sentence(found))
+        write_status(folder, found)
+    except OSError as error:
+        raise UserError(one_line(f"{error.filename or folder}: {error.strerror or error}"), ExitCode.IO) from error
+    return found
+
+
+def be_humble() -> None:
+    """Give way to the recorder: a low priority, and the disk only when nobody else wants it. None of it is vital."""
+    import ctypes
+    import platform
+
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+    number = _IOPRIO_SET.get(platform.machine())
+    if number is not None:
+        ctypes.CDLL(None, use_errno=True).syscall(number, _IOPRIO_WHO_PROCESS, 0, _IOPRIO_IDLE)

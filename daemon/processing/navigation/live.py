@@ -1,0 +1,274 @@
+"""The way the aircraft goes while its log grows: samples and fixes of a stream, taken at its ticks, give poses.
+
+Everything is decided by what stands in the log and where its ticks fall, so a log followed while it grows and the same
+log read afterwards give the same poses.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.daemon.errors import UserError
+from swath.daemon.processing.navigation.observations import (
+    fix_observations,
+    gps_times,
+    heading_observations,
+    heading_times,
+)
+from swath.daemon.processing.navigation.sources import NavigationSources
+from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
+from swath.georef.navigation.alignment.align import Aligner
+from swath.georef.navigation.filter.filter import NavigationFilter
+from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
+from swath.georef.navigation.samples import Sampler
+from swath.georef.records import (
+    DEVICE_CLOCK_DTYPE,
+    IMU_DTYPE,
+    INS_DTYPE,
+    GnssFix,
+    GnssHeading,
+    ImuSamples,
+    Int64Array,
+    Record,
+    StructArray,
+)
+from swath.georef.timescales import SECOND_NS, WEEK_NS
+
+if TYPE_CHECKING:
+    from swath.daemon.config.config import Config
+    from swath.georef.navigation.filter.types import Path
+    from swath.georef.stream.clocks import StreamClocks
+
+HOLD_S = 0.3  # fixes come so much later than the samples of their time, at most
+TIME_WAIT_NS = 5 * SECOND_NS  # for a clock that is not known yet
+MAX_TIME_SIGMA_NS = 1e7  # of a sample: a worse time is none
+REALIGN_NS = 30 * SECOND_NS  # of missing samples: after them attitude is found anew
+PAUSE_NS = SECOND_NS // 2  # of arrivals: after it a unit without a counter is taken to have missed samples
+KEPT_NS = 10 * SECOND_NS  # of samples before the start that was found
+EPOCH_LASTS_NS = 2 * SECOND_NS  # messages of one epoch come within it
+NEVER_NS = 1 << 62
+GOOD_STATUS = 3  # as a device's INS says that its solution is good
+
+
+class Navigator:
+    """Finds the start and runs the filter.
+
+    Args:
+        sources: which IMU and receiver.
+        clocks: of the stream; its plan has the IMU among its devices.
+
+    Attributes:
+        counts: what became of what came, by name.
+        parsers: of the IMU and of all receivers, by source; whoever feeds them gives their records to `take`.
+    """
+
+    def __init__(self, sources: NavigationSources, clocks: StreamClocks) -> None:
+        self.counts: Counter[str] = Counter()
+        self.parsers = sources.parsers()
+        self._sources, self._clocks = sources, clocks
+        self._setup = sources.setup()
+        table = sources.imu
+        self._sampler = Sampler(table.rate_hz, table.sample, table.stamp, sources.rot_b_from_imu)
+        self._aligner = Aligner(self._setup)
+        self._filter: NavigationFilter | None = None
+        self._imu: list[StructArray] = []
+        self._fixes: list[GnssFix] = []
+        self._headings: list[GnssHeading] = []
+        self._said: set[str] = set()  # names of messages
+        self._handed: set[tuple[int, int, int]] = set()  # time, kind, antenna of observations of the last seconds
+        self._latest_heading_ns = -(1 << 62)
+        self._kept: list[Inertial] = []
+        self._kept_rows: list[StructArray] = []
+        self._counter = _Counter(table.rate_hz)
+
+    @property
+    def state(self) -> str:
+        """In words: what it waits for, or how the start was found."""
+        return self._aligner.state
+
+    def take(self, source: str, record: Record) -> None:
+        """A record of the stream; those of other sources and kinds are left."""
+        if isinstance(record, ImuSamples) and source == self._sources.imu_source:
+            self._imu.append(self._counter.told(record.rows, self._clocks, source))
+        elif isinstance(record, GnssFix) and source == self._sources.gnss_source:
+            self._fixes.append(record)
+            self._said.add(record.message)
+        elif isinstance(record, GnssHeading) and source == self._sources.gnss_source:
+            self._headings.append(record)
+
+    def advance(self, tick_ns: int) -> StructArray:
+        """Poses that have become known at a tick of the log: `INS_DTYPE`, attitude of b."""
+        self._clocks.update()
+        observations, gaps = self._observations(tick_ns), len(self._sampler.gaps)
+        inertial = self._inertial(tick_ns)
+        if any(end - begin > REALIGN_NS for begin, end in self._sampler.gaps[gaps:]):
+            self._begin_anew()
+        if self._filter is None:
+            self._align(inertial, observations)
+        else:
+            self._filter.observe(observations)
+            self._filter.feed(inertial)
+        return np.empty(0, INS_DTYPE) if self._filter is None else poses(self._filter.new_path())
+
+    def close(self) -> StructArray:
+        """The log is over: what still waits."""
+        rows = self.advance(NEVER_NS)
+        if self._filter is None:
+            return rows
+        self._filter.flush()
+        return np.concatenate([rows, poses(self._filter.new_path())])
+
+    def _begin_anew(self) -> None:
+        self.counts["aligned anew"] += 1
+        self._aligner, self._filter = Aligner(self._setup), None
+        self._kept, self._kept_rows = [], []
+
+    def _align(self, inertial: Inertial, observations: StructArray) -> None:
+        self._kept.append(inertial)
+        self._kept_rows.append(observations)
+        self._aligner.feed(inertial)
+        self._aligner.observe(observations)
+        newest_ns = max((int(piece.time_ns[-1]) for piece in self._kept if len(piece)), default=0)
+        self._kept = [piece for piece in self._kept if len(piece) and piece.time_ns[-1] > newest_ns - KEPT_NS]
+        self._kept_rows = [rows[rows["time_ns"] > newest_ns - KEPT_NS] for rows in self._kept_rows if len(rows)]
+        if self._aligner.start is None:
+            return
+        self._filter = NavigationFilter(self._setup, self._aligner.start, hold_s=HOLD_S, smoothed=False)
+        for rows in self._kept_rows:
+            self._filter.observe(rows[rows["time_ns"] > self._aligner.start.time_ns])
+        for piece in self._kept:
+            self._filter.feed(piece)
+        self._kept, self._kept_rows = [], []
+
+    # ------------------------------------------------------------------ times
+
+    def _inertial(self, tick_ns: int) -> Inertial:
+        """Samples whose times are known by now."""
+        rows = np.concatenate([np.empty(0, IMU_DTYPE), *self._imu])
+        time_ns, known = self._times(rows)
+        if not known.all():  # those behind one that waits wait too, so that they stay in order
+            first = int(np.argmin(known))
+            late = ~known & (tick_ns - rows["host_time_ns"] > TIME_WAIT_NS)
+            self.counts["samples without time"] += int(late.sum())
+            waits = np.zeros(len(rows), np.bool_)
+            waits[first:] = True
+            waits &= tick_ns - rows["host_time_ns"] <= TIME_WAIT_NS
+            self._imu = [rows[waits]]
+            rows, time_ns = rows[known & ~waits], time_ns[known & ~waits]
+        else:
+            self._imu = []
+        return self._sampler.feed(rows, time_ns)
+
+    def _times(self, rows: StructArray) -> tuple[Int64Array, NDArray[np.bool_]]:
+        """GPS ns (n,) of samples, and whether they are known."""
+        source = self._sources.imu_source
+        own = rows["gps_week"] >= 0
+        if own.any():
+            return rows["gps_week"].astype(np.int64) * WEEK_NS + rows["device_time_ns"], own
+        if self._sources.clock is None or not len(rows):
+            return np.zeros(len(rows), np.int64), np.zeros(len(rows), np.bool_)
+        gps_ns, sigma_ns = self._clocks.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])
+        return gps_ns, sigma_ns <= MAX_TIME_SIGMA_NS
+
+    def _observations(self, tick_ns: int) -> StructArray:
+        """Of fixes and headings that came before the tick; those whose time is not known yet wait."""
+        host, source = self._clocks.host, self._sources.gnss_source
+        fixes, headings = self._fixes, self._headings
+        fix_ns = gps_times(host, source, [fix.host_time_ns for fix in fixes], [fix.time for fix in fixes])
+        told_ns = gps_times(host, source, [one.host_time_ns for one in headings], [one.time for one in headings])
+        heading_ns = heading_times(headings, told_ns, fixes, fix_ns)
+        self._fixes = [
+            fix
+            for fix, at in zip(fixes, fix_ns, strict=True)
+            if at is None and tick_ns - fix.host_time_ns <= TIME_WAIT_NS
+        ]
+        self._headings = []
+        waiting = set(map(id, self._fixes))
+        taken = [(fix, at) for fix, at in zip(fixes, fix_ns, strict=True) if id(fix) not in waiting]
+        found = fix_observations(
+            [fix for fix, _ in taken], [at for _, at in taken], len(self._setup.lever_arms_b), self._said
+        )
+        self.counts.update({f"fix {why.replace('_', ' ')}": count for why, count in found.refused.items()})
+        return sort_observations(np.concatenate([self._fresh(found.rows), self._directions(headings, heading_ns)]))
+
+    def _fresh(self, rows: StructArray) -> StructArray:
+        """Without what an earlier tick had of the same epoch: a receiver says it in several messages."""
+        keys = list(zip(rows["time_ns"].tolist(), rows["kind"].tolist(), rows["antenna"].tolist(), strict=True))
+        fresh = np.array([key not in self._handed for key in keys], dtype=np.bool_)
+        self.counts["fix repeated in epoch"] += int((~fresh).sum())
+        newest_ns = max((at_ns for at_ns, _, _ in keys), default=-NEVER_NS)
+        self._handed = {key for key in self._handed if key[0] > newest_ns - EPOCH_LASTS_NS} | set(keys)
+        return rows[fresh]
+
+    def _directions(self, headings: list[GnssHeading], time_ns: list[int | None]) -> StructArray:
+        """Return headings of the baseline that are later than those handed on before."""
+        if self._setup.baseline_b is None:
+            return np.empty(0, OBSERVATION_DTYPE)
+        found = heading_observations(headings, time_ns, float(np.linalg.norm(self._setup.baseline_b))).rows
+        rows = found[found["time_ns"] > self._latest_heading_ns]
+        if len(rows):
+            self._latest_heading_ns = int(rows["time_ns"][-1])
+        return rows
+
+
+def navigator_of(config: Config, attachments: Mapping[str, bytes], clocks: StreamClocks) -> Navigator | None:
+    """By a configuration; None where it has not an IMU and a receiver that can be navigated with."""
+    if not config.imu or not config.gnss:
+        return None
+    try:
+        return Navigator(NavigationSources(config, attachments), clocks)
+    except (UserError, NavigationError):
+        return None
+
+
+class _Counter:
+    """Tells the clock what the samples' counter said beside the host's time.
+
+    Samples that have none are given one: one nominal interval each, and the host's time over pauses.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._interval_ns = SECOND_NS / rate_hz
+        self._count_ns = 0.0
+        self._host_ns: int | None = None
+
+    def told(self, rows: StructArray, clocks: StreamClocks, source: str) -> StructArray:
+        """Rows with a device time; those that say GPS time themselves need no clock."""
+        if (rows["gps_week"] >= 0).any() or source not in clocks.host.plan.devices:
+            return rows
+        bare = np.flatnonzero(rows["device_time_ns"] < 0).tolist()
+        if bare:
+            rows = rows.copy()
+        for place in bare:
+            host_ns = int(rows["host_time_ns"][place])
+            step = 0 if self._host_ns is None else host_ns - self._host_ns
+            self._count_ns += step if step > PAUSE_NS else self._interval_ns
+            self._host_ns = host_ns
+            rows["device_time_ns"][place] = round(self._count_ns)
+        said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
+        for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
+            said[name] = rows[name]
+        said["pps_count"] = said["locked"] = -1
+        clocks.add_samples(source, said)
+        return rows
+
+
+def poses(path: Path) -> StructArray:
+    """States of a filter (n, …) as `INS_DTYPE` rows."""
+    rows = np.zeros(len(path.time_ns), INS_DTYPE)
+    lat, lon, height = geodetic_from_e(path.states[:, :3])
+    rot_l_from_e = rot_e_from_l(lat, lon).swapaxes(-1, -2)
+    attitude = attitude_of(rot_l_from_e @ rot_from_quaternion(path.states[:, 6:10]))
+    rows["host_time_ns"], rows["gps_ns"], rows["status"] = -1, path.time_ns, GOOD_STATUS
+    rows["lat_rad"], rows["lon_rad"], rows["height_m"] = lat, lon, height
+    rows["velocity_l"] = np.einsum("nij,nj->ni", rot_l_from_e, path.states[:, 3:6])
+    rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"] = attitude
+    rows["position_sigma_l"], rows["velocity_sigma_l"] = path.sigma[:, :3], path.sigma[:, 3:6]
+    rows["attitude_sigma_rad"] = path.sigma[:, 6:9]
+    return rows

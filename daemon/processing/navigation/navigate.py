@@ -1,0 +1,289 @@
+"""Navigates logs: start, filter, smoother, diagnosis, leg by leg; one trajectory of each session."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.ins_point import point_doubts
+from swath.daemon.processing.mapped_storage import MappedStorage
+from swath.daemon.processing.navigation.inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from swath.daemon.processing.navigation.sources import noise_of
+from swath.daemon.processing.navigation.times import Stretch
+from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
+from swath.georef.navigation.inputs import (
+    GRADES,
+    OBSERVATION_DTYPE,
+    Kind,
+    NavigationError,
+    Solution,
+    sort_observations,
+)
+from swath.georef.records import FixType, StructArray
+from swath.georef.trajectory.buffer import TrajectoryBuffer
+from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
+
+if TYPE_CHECKING:
+    from swath.georef.navigation.diagnosis.diagnose import Finding
+    from swath.georef.navigation.inputs import Setup, Start
+    from swath.georef.navigation.solve import Solved
+
+FloatArray = NDArray[np.float64]
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is that of a receiver's rate
+NAVIGATED = "navigation of the log's IMU and GNSS"
+GIVEN_SIGMA_RAD = tuple(map(math.radians, (1.0, 1.0, 3.0)))  # of an attitude that somebody says by hand
+COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class NavigateWish:
+    """What the command line says of the run.
+
+    Attributes:
+        inputs: of what is read.
+        smooth: the smoother runs too; False: as it was in real time.
+        attitude_rad: roll, pitch, heading at the start; None: they are found.
+        compare_noise: find out whether the flight asks for another noise of the unit; takes some runs of ten minutes.
+    """
+
+    inputs: InputWish = field(default_factory=InputWish)
+    smooth: bool = True
+    attitude_rad: tuple[float, float, float] | None = None
+    compare_noise: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class NavigatedLeg:
+    """A leg and what came of it."""
+
+    leg: Leg
+    start: Start
+    setup: Setup
+    solved: Solved
+    findings: list[Finding]
+
+    def solution(self, *, smooth: bool) -> Solution:
+        """The one asked for."""
+        return self.solved.smoothed if smooth else self.solved.forward
+
+    def noise_found(self) -> dict[str, float]:
+        """Return factors on sigmas, the receiver's own or those assumed of it, with which it was navigated."""
+        rows, setup = self.solved.forward.innovations, self.setup
+        found: dict[str, float] = {}
+        for kind, words, scales, of_vertical in (
+            (Kind.POSITION, "positions", setup.gnss_sigma_scale, setup.gnss_vertical_scale),
+            (Kind.VELOCITY, "velocities", setup.gnss_velocity_scale, setup.gnss_velocity_vertical_scale),
+        ):
+            for fix in sorted(set(rows["fix_type"][rows["kind"] == kind].tolist())):
+                name = f"{words}, {FixType(fix).name.lower().replace('_', ' ')}"
+                if fix in scales:
+                    found[name] = scales[fix]
+                if fix in of_vertical:
+                    found[f"{name}, vertical"] = scales.get(fix, 1.0) * of_vertical[fix]
+        if setup.gnss_heading_scale != 1.0:
+            found["headings"] = setup.gnss_heading_scale
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Navigated:
+    """A session's trajectory and how it came about.
+
+    Attributes:
+        legs: those that could be navigated.
+        holes: what is missing, a line each, those of the inputs included.
+        doubts: lines for the user.
+        missing: stretches of the samples without a trajectory, by time; a line of holes each.
+    """
+
+    inputs: NavigationInputs
+    smooth: bool
+    legs: list[NavigatedLeg]
+    holes: list[str]
+    doubts: list[str]
+    missing: list[Stretch] = field(default_factory=list)
+
+    @property
+    def missing_s(self) -> float:
+        """Return how long in all samples have no trajectory."""
+        return sum(part.seconds for part in self.missing)
+
+    @property
+    def session_id(self) -> str:
+        """The session's."""
+        return self.inputs.session.session_id
+
+    def solutions(self) -> list[Solution]:
+        """Of the legs, in order of time."""
+        return [leg.solution(smooth=self.smooth) for leg in self.legs]
+
+    def trajectory(self, name: str = NAVIGATED) -> Trajectory:
+        """Of all legs; between them are gaps."""
+        return joined_trajectory([solution.trajectory() for solution in self.solutions()], name)
+
+    def velocity_sigma_l(self) -> FloatArray:
+        """(n, 3) m/s of the trajectory's epochs."""
+        return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
+
+
+def navigate_session(session: Session, wish: NavigateWish, tell: Tell = lambda what, done, total: None) -> Navigated:
+    """Read a session and navigate it.
+
+    Raises:
+        UserError: it cannot be navigated, a line each.
+        LogError, OSError: the log cannot be read.
+    """
+    tell("clocks, IMU and GNSS", 0, 1)
+    storage = MappedStorage()
+    inputs = read_inputs(session, wish.inputs, storage)
+    storage.rest()
+    return navigate_inputs(inputs, wish, tell, storage)
+
+
+def navigate_inputs(
+    inputs: NavigationInputs,
+    wish: NavigateWish,
+    tell: Tell = lambda what, done, total: None,
+    storage: Storage = IN_MEMORY,
+) -> Navigated:
+    """Navigate what was read; runs and solutions are kept in the storage.
+
+    Raises:
+        UserError: no leg of it can be navigated, a line each.
+    """
+    legs: list[NavigatedLeg] = []
+    holes, missing = list(inputs.holes), list(inputs.missing)
+    for number, leg in enumerate(inputs.legs):
+        tell("filter and smoother" if wish.smooth else "filter", number, len(inputs.legs))
+        try:
+            legs.append(_navigated(inputs, leg, wish, storage))
+            storage.rest()
+        except NavigationError as error:
+            missing.append(Stretch(*leg.span, str(error)))
+            holes.append(f"{inputs.log}: {missing[-1].text}")
+            holes += _why_not(inputs, leg)
+    if not legs:
+        why = holes[len(inputs.holes) :] or [
+            f"{inputs.log}: {inputs.sources.imu_source}: no run of samples without a gap is long enough to be navigated"
+        ]
+        raise UserError("\n".join(why))
+    doubts = list(inputs.doubts)
+    for part, has_fixes in _unreached(legs, smooth=wish.smooth):
+        if wish.smooth and has_fixes:
+            missing.append(part)
+        (holes if wish.smooth and has_fixes else doubts).append(f"{inputs.log}: {part.text}")
+    navigated = Navigated(inputs, wish.smooth, legs, holes, doubts, sorted(missing, key=lambda part: part.begin_ns))
+    navigated.doubts.extend(_ins_doubts(inputs, navigated.trajectory()))
+    return navigated
+
+
+def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: Storage) -> NavigatedLeg:
+    from swath.georef.navigation.alignment.align import align
+    from swath.georef.navigation.alignment.earlier_start import earlier_start
+    from swath.georef.navigation.diagnosis.diagnose import diagnose
+    from swath.georef.navigation.solve import solve, stretch_of
+    from swath.georef.navigation.stillness import with_still_seconds
+    from swath.georef.navigation.unit_noise import noise_findings
+
+    rows = leg.observations if wish.attitude_rad is None else _with_attitude(leg, wish.attitude_rad)
+    start = align(leg.inertial, rows, inputs.setup)
+    if wish.smooth:
+        start = earlier_start(leg.inertial, leg.observations, inputs.setup, start)
+    setup, rows = inputs.setup, with_still_seconds(leg.inertial, leg.observations)
+    solved = solve(leg.inertial, rows, setup, start, storage=storage)
+    setup = solved.report.setup
+    findings = diagnose(leg.inertial, leg.observations, setup, solved) + inputs.findings
+    if wish.compare_noise and not any(finding.severity == "error" for finding in findings):
+        table, name = inputs.sources.imu.noise, inputs.sources.imu_name
+        grades = {grade: noise_of(table.model_copy(update={"grade": grade})) for grade in GRADES}
+        run = stretch_of(leg.inertial, rows, start)
+        findings += noise_findings(run, setup, table.grade, grades, f"imu.{name}.noise")
+    return NavigatedLeg(leg, start, setup, solved, findings)
+
+
+def _why_not(inputs: NavigationInputs, leg: Leg) -> list[str]:
+    """What is wrong with a leg's data that gave no start."""
+    from swath.georef.navigation.diagnosis.diagnose import diagnose
+
+    found = diagnose(leg.inertial, leg.observations, inputs.setup, None)
+    return [f"{inputs.log}: {finding.text}" for finding in found]
+
+
+def _with_attitude(leg: Leg, attitude_rad: tuple[float, float, float]) -> StructArray:
+    """The observations, and an attitude that is known at the leg's beginning."""
+    row = np.zeros(1, OBSERVATION_DTYPE)
+    row["time_ns"], row["kind"] = leg.inertial.time_ns[0], Kind.ATTITUDE
+    row["value"], row["sigma"] = attitude_rad, GIVEN_SIGMA_RAD
+    return sort_observations(np.concatenate([leg.observations, row]))
+
+
+def _unreached(legs: Sequence[NavigatedLeg], *, smooth: bool) -> list[tuple[Stretch, bool]]:
+    """Return the stretches before the starts that were found, and for each whether it has positions to begin from."""
+    found: list[tuple[Stretch, bool]] = []
+    for leg in legs:
+        first, rows = int(leg.solution(smooth=smooth).time_ns[0]), leg.leg.observations
+        fixes_ns = rows["time_ns"][(rows["kind"] == Kind.POSITION) & (rows["time_ns"] >= leg.leg.span[0])]
+        fix_ns = int(fixes_ns[0]) if len(fixes_ns) else first
+        if fix_ns - leg.leg.span[0] > UNTIL_A_FIX_NS:
+            part = Stretch(leg.leg.span[0], min(fix_ns, first), "no trajectory before the first position")
+            found.append((part, False))
+        if first - fix_ns > UNTIL_A_FIX_NS:
+            found.append((Stretch(fix_ns, first, "no trajectory: no start was found earlier"), True))
+    return found
+
+
+def _ins_doubts(inputs: NavigationInputs, navigated: Trajectory) -> list[str]:
+    """Of the device's own INS, against what was navigated."""
+    source = inputs.sources.ins_source
+    if source is None or len(inputs.ins) < 2:
+        return []
+    buffer = TrajectoryBuffer(protocol_of(inputs.sources, source), name=source)
+    buffer.append(inputs.ins)
+    lines = point_doubts(buffer.snapshot(), navigated, list(inputs.setup.lever_arms_b), source)
+    return [f"{inputs.log}: {line}" for line in lines]
+
+
+def joined_trajectory(parts: Sequence[Trajectory], name: str, max_gap_ns: int = DEFAULT_MAX_GAP_NS) -> Trajectory:
+    """One trajectory of several that follow each other."""
+    if len(parts) == 1:
+        return replace(parts[0], name=name, max_gap_ns=max_gap_ns)
+    columns = {column: np.concatenate([getattr(part, column) for part in parts]) for column in COLUMNS}
+    return Trajectory(**columns, max_gap_ns=max_gap_ns, name=name)
+
+
+def arm_of_text(text: str) -> tuple[float, float, float]:
+    """Return a lever arm, m in b, of ``x,y,z`` in metres.
+
+    Raises:
+        UserError: the text says none.
+    """
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not max(abs(x), abs(y), abs(z)) < 1000.0:
+        raise UserError(f'--lever-arm: got "{text}", want x,y,z in metres, as 0.35,-0.12,-1.1', ExitCode.USAGE)
+    return x, y, z
+
+
+def attitude_of_text(text: str) -> tuple[float, float, float]:
+    """``roll,pitch,heading`` in degrees; rad.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        roll, pitch, heading = (float(part) for part in text.split(","))
+    except ValueError:
+        roll = pitch = heading = math.nan
+    if not (abs(roll) <= 180.0 and abs(pitch) <= 90.0 and abs(heading) <= 360.0):
+        raise UserError(f'--start: got "{text}", want roll,pitch,heading in degrees, as 0.5,-1.2,273', ExitCode.USAGE)
+    return math.radians(roll), math.radians(pitch), math.radians(heading)

@@ -1,0 +1,339 @@
+"""A segment of a log as a job that stands alone: it reads its chunks, decodes, georeferences, writes its own file.
+
+What a job gives depends on its input only, so it does not matter which process or computer does it, or when.
+"""
+
+from __future__ import annotations
+
+import errno
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import lazrs
+import numpy as np
+
+from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.reader import PartDamage
+from swath.daemon.processing.points.dropped import Dropped
+from swath.daemon.processing.points.feed import LogFeed
+from swath.daemon.processing.setup.setup import Setup
+from swath.daemon.processing.unread import Unread
+from swath.daemon.replay.units import source_of_topic
+from swath.georef.formats.copc import CopcWriter
+from swath.georef.formats.las import Clipped, LasError, LasSettings, LasWriter
+from swath.georef.geodesy.earth import geodetic_from_e
+from swath.georef.mapping.frame import MappingError
+from swath.georef.points import Fate, Points
+from swath.georef.records import ChunkBatch, ScannerReturns
+from swath.georef.stream.clocks import FrozenClocks
+from swath.georef.strips import Segment
+from swath.georef.trajectory.trajectory import Trajectory
+
+MARGIN_NS = 5_000_000_000  # of log time read on either side: edges a device latched, revolutions, pulses in air
+BETWEEN_STRIPS = "between_strips"
+EDGE_SAMPLES = 50  # of the points of a tick
+MAX_EDGE_RAD = 1.31  # 75°; beams of spinning heads go to the horizon
+Tell = Callable[[int], None]  # bytes of the log that were read
+
+
+class JobError(Exception):
+    """A strip that cannot be written at all; one line."""
+
+
+@dataclass(frozen=True)
+class JobPlan:
+    """What all jobs of a session share, whatever they do; pickles.
+
+    Attributes:
+        index: where the chunks stand.
+        setup: what makes points.
+        clocks: the host's, complete.
+    """
+
+    index: LogIndex
+    setup: Setup
+    clocks: FrozenClocks
+
+
+@dataclass(frozen=True)
+class SessionPlan(JobPlan):
+    """Of jobs that write files of points.
+
+    Attributes:
+        las: of the files.
+        intensity_factors: by scanner.
+        numbers: of scanners, as the files say them.
+        copc: the files are cloud optimised.
+    """
+
+    las: LasSettings
+    intensity_factors: dict[str, float]
+    numbers: dict[str, int]
+    copc: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """A segment to be done; pickles.
+
+    Attributes:
+        session: index of its plan.
+        segment: in log time.
+        places: its chunks, and those of the margin.
+        trajectory: as much as it needs; None between strips, where returns are only counted.
+        path: file to be written; None: none.
+        dropped: list of the returns that get no place, which go into no file otherwise; None: they are only counted.
+    """
+
+    session: int
+    segment: Segment
+    places: list[ChunkPlace]
+    trajectory: Trajectory | None = None
+    path: Path | None = None
+    dropped: Path | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the log."""
+        return sum(place.length for place in self.places)
+
+
+@dataclass
+class JobResult:
+    """What became of a segment; plain values.
+
+    Attributes:
+        fates: by scanner, returns by what became of them.
+        time_refused: by scanner, stamps that its clock did not believe, by reason.
+        unread: by scanner, messages that its parser refused, by reason, and those missing from its own sequence.
+        first_gps_ns, last_gps_ns: of the points; None: there are none.
+        bounds: least and largest coordinates.
+        edges: by scanner, of the points seen farthest from nadir among some: the angle, rad, the height of the scanner
+            above the point, m, and the point's ellipsoidal height, m.
+        file_bytes: of the file written.
+        withheld, listed: returns left out that are withheld points of the file, and that are rows of the list.
+        failed: why it could not be done; empty: it was.
+        seconds: CPU time.
+    """
+
+    session: int
+    strip: int
+    start_ns: int
+    end_ns: int
+    fates: dict[str, Counter[str]] = field(default_factory=dict)
+    time_refused: dict[str, dict[str, int]] = field(default_factory=dict)
+    unread: dict[str, Counter[str]] = field(default_factory=dict)
+    clipped: Clipped = field(default_factory=Clipped)
+    points: int = 0
+    withheld: int = 0
+    listed: int = 0
+    first_gps_ns: int | None = None
+    last_gps_ns: int | None = None
+    bounds: list[list[float]] = field(default_factory=list)
+    edges: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    file_bytes: int = 0
+    damage: list[PartDamage] = field(default_factory=list)
+    failed: str = ""
+    seconds: float = 0.0
+
+
+class PointSink(Protocol):
+    """What takes a strip's points: a LAZ or a COPC file."""
+
+    @property
+    def clipped(self) -> Clipped:
+        """What did not fit."""
+
+    def write(self, points: Points, *, scanner: int = 0, intensity_factor: float = 1.0, withheld: bool = False) -> None:
+        """Append points."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+def run_job(plan: SessionPlan, job: Job, tell: Tell = lambda size: None) -> JobResult:
+    """Do a job.
+
+    Raises:
+        JobError: its points cannot stand in a file.
+        OSError: the log cannot be read or the file not be written.
+    """
+    began = time.process_time()
+    result = JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns)
+    if job.trajectory is None or job.path is None:
+        _count(plan, job, result, tell)
+    else:
+        try:
+            with ExitStack() as opened:
+                stream = opened.enter_context(job.path.open("x+b"))
+                sink = _sink(plan, job, stream, opened)
+                _write(plan, job, job.trajectory, result, sink, opened, tell)
+                result.file_bytes = stream.tell()
+        except (LasError, MappingError) as error:
+            raise JobError(f"{job.path.name}: {error}") from error
+        except lazrs.LazrsError as error:  # which does not say what the file system said
+            raise OSError(errno.EIO, "cannot be written; is the disk full?", str(job.path)) from error
+        finally:
+            if not result.points and not result.withheld:
+                job.path.unlink(missing_ok=True)
+    result.seconds = time.process_time() - began
+    return result
+
+
+def _write(
+    plan: SessionPlan,
+    job: Job,
+    trajectory: Trajectory,
+    result: JobResult,
+    sink: PointSink,
+    opened: ExitStack,
+    tell: Tell,
+) -> None:
+    setup = plan.setup
+    georeferenced = setup.office_stream(plan.clocks, trajectory)
+    feed = LogFeed(setup, georeferenced)
+
+    def put(name: str, points: Points, *, withheld: bool = False) -> None:
+        factor = plan.intensity_factors.get(name, 1.0)
+        sink.write(points, scanner=plan.numbers[name], intensity_factor=factor, withheld=withheld)
+
+    def write(placed: list[tuple[str, Points]]) -> None:
+        for name, points in placed:
+            put(name, points)
+            _note_span(result, points)
+            _note_edge(result, name, points, setup, trajectory)
+
+    dropped = None
+    if job.dropped is not None:
+        dropped = Dropped(job.dropped, georeferenced, partial(put, withheld=True))
+        opened.callback(dropped.close)
+    feed_job(plan, job, result, feed, write, tell)
+    sink.close()
+    result.clipped = sink.clipped
+    if dropped is not None:
+        result.withheld, result.listed = dropped.withheld, dropped.rows
+
+
+def feed_job(
+    plan: JobPlan,
+    job: Job,
+    result: JobResult,
+    feed: LogFeed,
+    write: Callable[[list[tuple[str, Points]]], None],
+    tell: Tell,
+) -> None:
+    """A job's messages through a feed of its own, which is closed; counts what became of them."""
+    stream = feed.stream
+    unread = Unread({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
+    was_own = False
+    for batch, own in _messages(plan, job, result, tell):
+        if own is not was_own:
+            feed.flush()  # what is held is decoded, and so counted, as what it was when it came
+            unread.note(own=was_own)
+            was_own = own
+        write(feed.take(batch, context=not own))
+    write(feed.close())
+    unread.note(own=was_own)
+    result.unread = unread.counts
+    for name in stream.scanners:
+        fates = stream.fates(name)
+        result.fates[name] = Counter({fate.name.lower(): count for fate, count in fates.items()})
+        result.points += fates.get(Fate.GEOREFERENCED, 0)
+        result.time_refused[name] = stream.clocks.refused(f"scanner/{name}")
+
+
+def _sink(plan: SessionPlan, job: Job, stream: BinaryIO, opened: ExitStack) -> PointSink:
+    if not plan.copc:
+        return LasWriter(stream, plan.las, job.segment.strip)
+    assert job.path is not None
+    folder = job.path.parent
+    spools = (
+        opened.enter_context(tempfile.TemporaryFile(dir=folder)),
+        opened.enter_context(tempfile.TemporaryFile(dir=folder)),
+    )
+    return CopcWriter(stream, spools, plan.las, job.segment.strip)
+
+
+def _note_span(result: JobResult, points: Points) -> None:
+    columns = points.points_map.T  # one by one: all at once they take ten times as long
+    least, largest = np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
+    first, last = int(points.time_ns.min()), int(points.time_ns.max())
+    if result.first_gps_ns is not None and result.last_gps_ns is not None:
+        least, largest = np.minimum(least, result.bounds[0]), np.maximum(largest, result.bounds[1])
+        first, last = min(first, result.first_gps_ns), max(last, result.last_gps_ns)
+    result.first_gps_ns, result.last_gps_ns = first, last
+    result.bounds = [least.tolist(), largest.tolist()]
+
+
+def _note_edge(result: JobResult, name: str, points: Points, setup: Setup, trajectory: Trajectory) -> None:
+    """Look at some of the points from where the body was."""
+    assert setup.mapping is not None
+    some = points.take(slice(None, None, max(1, len(points) // EDGE_SAMPLES)))
+    some = some.take(trajectory.fates(some.time_ns) == Fate.GEOREFERENCED)
+    if not len(some):
+        return
+    ground_e = setup.mapping.e_from_map(some.points_map)
+    beam_e = ground_e - trajectory.poses(some.time_ns).position_e
+    lat, lon, height_m = geodetic_from_e(ground_e)
+    down_e = -np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    above_m = (beam_e * down_e).sum(axis=1)
+    angle = np.arccos(above_m / np.linalg.norm(beam_e, axis=1))
+    angle[angle > MAX_EDGE_RAD] = 0.0
+    at = int(np.argmax(angle))
+    if angle[at] > result.edges.get(name, (0.0,))[0]:
+        result.edges[name] = (float(angle[at]), float(above_m[at]), float(height_m[at]))
+
+
+def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
+    """Returns between strips: decoded and counted, no more."""
+    parsers = plan.setup.parsers(("scanner",))
+    counts = dict.fromkeys(parsers, 0)
+    start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
+
+    def count(source: str, records: Sequence[object]) -> None:
+        for record in records:
+            if isinstance(record, ScannerReturns):
+                host_ns = record.rows["host_time_ns"]
+                counts[source] += int(np.count_nonzero((host_ns >= start_ns) & (host_ns < end_ns)))
+
+    unread = Unread({source.removeprefix("scanner/"): parser for source, parser in parsers.items()})
+    for batch, own in _messages(plan, job, result, tell):
+        wire = source_of_topic(batch.channel.topic) or ""
+        source = wire.removesuffix("/aux")
+        if source in parsers:
+            count(source, parsers[source].feed_batch(ChunkBatch(wire, batch.log_time_ns, batch.units)))
+        unread.note(own=own)
+    result.unread = unread.counts
+    for source, parser in parsers.items():
+        count(source, parser.close())
+        result.fates[source.removeprefix("scanner/")] = Counter({BETWEEN_STRIPS: counts[source]})
+
+
+def _messages(plan: JobPlan, job: Job, result: JobResult, tell: Tell) -> Iterator[tuple[LogBatch, bool]]:
+    """Messages of the job's chunks, in the order of the file, and whether they are its own or of the margin."""
+    start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
+    own_damage: list[PartDamage] = []
+    for place in job.places:
+        mine = place.start_ns < end_ns and place.end_ns >= start_ns
+        damage = own_damage if mine else []
+        for batch in read_chunks(plan.index, [place], lambda topic: topic.startswith(SCANNER), damage):
+            yield from _runs(batch, start_ns, end_ns)
+        tell(place.length)
+    result.damage = own_damage
+
+
+def _runs(batch: LogBatch, start_ns: int, end_ns: int) -> Iterator[tuple[LogBatch, bool]]:
+    """A batch split where messages of the span and others alternate."""
+    own = (batch.log_time_ns >= start_ns) & (batch.log_time_ns < end_ns)
+    changes = np.flatnonzero(np.diff(own)) + 1
+    for first, last in pairwise([0, *changes.tolist(), len(own)]):
+        yield batch.between(first, last), bool(own[first])

@@ -1,0 +1,392 @@
+"""Maps of a quick look as pictures: height, intensity, density, sigma of height, differences of strips."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LightSource, ListedColormap, Normalize, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from swath.daemon.processing.quicklook.grids import COUNT, HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame, filled, round_up
+from swath.daemon.processing.quicklook.profile import axis_of
+from swath.daemon.processing.quicklook.run import Look
+from swath.daemon.processing.quicklook.strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+DPI = 140
+INK, MUTED, EMPTY = "#1d242b", "#5d6770", "#f3f4f2"
+LARGEST_MAP_IN, SMALLEST_MAP_IN = (10.0, 7.6), (3.0, 1.3)
+NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.75
+LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
+HALO = [withStroke(linewidth=2.4, foreground="white")]
+STRIP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7a5c00", "#56b4e9", "#8b1a1a", "#5b4fc4", "#444444")
+MOST_OUTLINES = 60
+# Leica HxMap's defaults of strip quality control: green to 3 cm, yellow to 5, red to 10
+DZ_LIMITS_M = (0.03, 0.05, 0.10)
+DZ_COLOURS = ("#2f9e4c", "#f4cc2a", "#e4572e", "#7d1d5a")
+DZ_WORDS = ("≤ 3 cm", "3–5 cm", "5–10 cm", "> 10 cm")
+
+
+def strip_colour(number: int) -> str:
+    """The same one for a strip in every picture."""
+    return STRIP_COLOURS[number % len(STRIP_COLOURS)]
+
+
+def thousands(value: float, digits: int = 0) -> str:
+    """A number whose thousands stand apart, with a real minus."""
+    return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
+
+
+class MapPage:
+    """A map with its title, axes in the files' coordinates, a scale bar, and a column for legends at the right.
+
+    Attributes:
+        figure: the page.
+        axes: the map's, in metres times the unit's inverse: the files' own coordinates.
+    """
+
+    def __init__(self, look: Look, title: str, under: str, side_in: float = NARROW_SIDE_IN) -> None:
+        self.look = look
+        low, high = look.surface.low_m[:2], look.surface.high_m[:2]
+        border = np.maximum(0.03 * (high - low).max(), look.surface.frame.cell_m)
+        self.low_m, self.high_m = low - border, high + border
+        size_m = self.high_m - self.low_m
+        map_in = np.maximum(size_m * float((np.array(LARGEST_MAP_IN) / size_m).min()), SMALLEST_MAP_IN)
+        self.page_in = np.array([LEFT_IN + map_in[0] + side_in, max(TOP_IN + map_in[1] + BOTTOM_IN, LOWEST_PAGE_IN)])
+        self.page_in[0] = max(self.page_in[0], 8.2)
+        self.figure = Figure(figsize=(float(self.page_in[0]), float(self.page_in[1])), facecolor="white")
+        bottom = self.page_in[1] - TOP_IN - map_in[1]
+        self.axes = self._panel(LEFT_IN, bottom, self.page_in[0] - LEFT_IN - side_in, map_in[1])
+        self.side_in = self.page_in[0] - side_in + 0.3
+        self._dress()
+        place = (LEFT_IN - 0.75) / self.page_in[0], 1.0 - 0.3 / self.page_in[1]
+        self.figure.text(*place, title, fontsize=15, weight="bold", color=INK, va="center")
+        self.figure.text(
+            place[0], 1.0 - 0.57 / self.page_in[1], under, fontsize=9, color=MUTED, va="center", wrap=False
+        )
+
+    def _panel(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        across, up = self.page_in
+        axes = self.figure.add_axes((left / across, bottom / up, width / across, height / up))
+        axes.tick_params(labelsize=8, colors=MUTED, length=3)
+        axes.spines[:].set_color("#b9bdb8")
+        return axes
+
+    def side(self, top: float, width: float, height: float) -> Axes:
+        """A panel in the right column, ``top`` inches below the map's upper edge."""
+        return self._panel(self.side_in, self.page_in[1] - TOP_IN - top - height, width, height)
+
+    def say(self, top: float, text: str, **style: Any) -> None:
+        """Words in the right column."""
+        look: dict[str, Any] = {"fontsize": 8.5, "color": INK, "va": "top", "linespacing": 1.5} | style
+        x, y = self.side_in / self.page_in[0], (self.page_in[1] - TOP_IN - top) / self.page_in[1]
+        self.figure.text(x, y, text, **look)
+
+    def box(self, frame: Frame) -> tuple[float, float, float, float]:
+        """A frame's west, east, south and north in the files' coordinates."""
+        west_m, east_m, south_m, north_m = frame.extent_m
+        units = self.look.units
+        return west_m / units.east_m, east_m / units.east_m, south_m / units.north_m, north_m / units.north_m
+
+    def image(self, values: NDArray[Any], frame: Frame, **style: Any) -> Any:
+        """Cells (rows, columns[, colour]) on the map."""
+        return self.axes.imshow(
+            values, origin="lower", extent=self.box(frame), aspect=self.axes.get_aspect(), **({"zorder": 1} | style)
+        )
+
+    def _dress(self) -> None:
+        units, axes = self.look.units, self.axes
+        axes.set_facecolor(EMPTY)
+        axes.set_aspect(units.north_m / units.east_m, adjustable="box", anchor="NW")
+        axes.set_xlim(self.low_m[0] / units.east_m, self.high_m[0] / units.east_m)
+        axes.set_ylim(self.low_m[1] / units.north_m, self.high_m[1] / units.north_m)
+        metric = units.name != "°"
+        words = ("Easting", "Northing") if metric else ("Longitude", "Latitude")
+        for axis, word, limits in (
+            (axes.xaxis, words[0], axes.get_xlim()),
+            (axes.yaxis, words[1], axes.get_ylim()),
+        ):
+            step = (limits[1] - limits[0]) / 5
+            digits = max(0, -math.floor(math.log10(step))) if step < 1.0 else 0
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(FuncFormatter(lambda value, _, digits=digits: thousands(value, digits)))
+            axis.set_label_text(f"{word} ({units.name})", fontsize=8.5, color=MUTED)
+        for label in axes.get_yticklabels():
+            label.set(rotation=90, va="center")
+
+    def finish(self, path: Path) -> None:
+        """Grid lines, strips, scale bar; then the file."""
+        self.axes.grid(color="#7c858c", lw=0.4, alpha=0.35, zorder=2)
+        self._scale_bar()
+        self.figure.savefig(path, dpi=DPI)
+
+    def _scale_bar(self) -> None:
+        size_m = self.high_m - self.low_m
+        length_m = round_down(0.2 * float(size_m[0]))
+        part = length_m / float(size_m[0])
+        place = self.axes.transAxes
+        x, y = 0.025, 0.035
+        self.axes.add_patch(
+            Rectangle((x, y), part, 0.008, transform=place, fc=INK, ec="white", lw=1.6, zorder=9, clip_on=False)
+        )
+        text = f"{thousands(length_m / 1000, 1).rstrip('0').rstrip('.')} km" if length_m >= 1000 else f"{length_m:g} m"
+        style: dict[str, Any] = {"fontsize": 8.5, "color": INK, "path_effects": HALO, "zorder": 10}
+        self.axes.text(x + part / 2, y + 0.016, text, transform=place, ha="center", va="bottom", **style)
+
+    def outlines(self, *, light: bool = False) -> None:
+        """Edges of the strips, with their names."""
+        look, units = self.look, self.look.units
+        for number in range(min(len(look.strips), MOST_OUTLINES)):
+            coverage = look.cells.coverage(number)
+            there = ndimage.binary_closing(np.pad(coverage.there, 3), iterations=2, structure=np.ones((3, 3)))
+            there = ndimage.binary_fill_holes(there)
+            if not there.any():
+                continue
+            frame = coverage.frame
+            east_m = frame.west_m + (np.arange(there.shape[1]) - 2.5) * frame.cell_m
+            north_m = frame.south_m + (np.arange(there.shape[0]) - 2.5) * frame.cell_m
+            colour = "white" if light else strip_colour(number)
+            shape = ndimage.gaussian_filter(there.astype(float), 0.7)
+            self.axes.contour(
+                east_m / units.east_m, north_m / units.north_m, shape, [0.4], colors=[colour], linewidths=0.9, zorder=3
+            )
+        self._names()
+
+    def _names(self) -> None:
+        look = self.look
+        if not 1 < len(look.strips) <= MOST_OUTLINES:
+            return
+        for number, strip in enumerate(look.strips):
+            places_m = look.cells.coverage(number).centres()
+            if not len(places_m):
+                continue
+            middle, axis = axis_of(places_m)
+            along = (places_m - middle) @ axis
+            share = (0.5 + 0.13 * (number % 5 - 2)) * np.ptp(along) + along.min()  # neighbours' names not side by side
+            place = middle + axis * share
+            self.axes.text(
+                place[0] / look.units.east_m,
+                place[1] / look.units.north_m,
+                shortened(strip.name, 24),
+                color=strip_colour(number),
+                fontsize=8.5,
+                weight="bold",
+                ha="center",
+                va="center",
+                path_effects=HALO,
+                zorder=8,
+                clip_on=True,
+            )
+
+    def bar(self, image: Any, label: str, **style: Any) -> None:
+        """A colour bar in the right column."""
+        height = float(np.clip(self.page_in[1] - TOP_IN - BOTTOM_IN - 0.4, 1.5, 4.2))
+        axes = self.side(0.35, 0.2, height)
+        made = self.figure.colorbar(image, cax=axes, **style)
+        made.ax.tick_params(labelsize=8, colors=MUTED, length=3)
+        made.outline.set_edgecolor("#b9bdb8")
+        self.say(0.0, label, fontsize=8.5)
+
+
+def round_down(size: float) -> float:
+    """The largest of 1, 2, 5 × 10ⁿ not above a size."""
+    power = 10.0 ** math.floor(math.log10(size))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= size * (1 + 1e-9))
+
+
+def _range_of(values: FloatArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
+    """Percentiles that a colour scale spans; never nothing."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0.0, 1.0
+    first, last = (float(value) for value in np.percentile(known, (low, high)))
+    least = max(1e-3 * abs(last), 1e-6)
+    return (first, last) if last - first > least else (first - least, last + least)
+
+
+def shade_of(heights: FloatArray, cell_m: float) -> FloatArray:
+    """(rows, columns) 0 … 1 light on the ground from the north-west; gaps get the nearest height."""
+    missing = ~np.isfinite(heights)
+    if missing.any():
+        nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+        heights = heights[tuple(nearest)]
+    if min(heights.shape) < 2:
+        return np.full(heights.shape, 0.7)
+    slope = np.hypot(*np.gradient(heights, cell_m))[~missing]
+    typical = float(np.percentile(slope, 75)) if len(slope) else 1.0
+    exaggeration = float(np.clip(0.35 / max(typical, 1e-6), 0.3, 8.0))
+    lit = LightSource(315.0, 45.0).hillshade(heights, exaggeration, dx=cell_m, dy=-cell_m)
+    return np.asarray(lit, np.float64)
+
+
+def _cells_words(look: Look) -> str:
+    return f"cells {look.surface.frame.cell_m:g} m"
+
+
+def draw_height(look: Look, path: Path) -> None:
+    """Mean height of all returns, shaded; the profile's line."""
+    frame = look.surface.frame
+    heights = filled(look.surface.mean(HEIGHT))
+    low, high = _range_of(heights, 1.0, 99.0)
+    norm, colours = Normalize(low, high), colormaps["gist_earth"].resampled(256)
+    land = ListedColormap(colours(np.linspace(0.36, 0.95, 256)))
+    light = shade_of(heights, frame.cell_m)
+    image = land(norm(np.nan_to_num(heights, nan=low)))
+    image[:, :, :3] = np.clip(image[:, :, :3] * (0.45 + 0.75 * light[:, :, np.newaxis]), 0.0, 1.0)
+    image[:, :, 3] = np.isfinite(heights)
+    spread = f"{thousands(look.surface.low_m[2], 2)} to {thousands(look.surface.high_m[2], 2)} m"
+    page = MapPage(look, "Height", f"mean of all returns, shaded from the north-west, {_cells_words(look)}; {spread}")
+    page.image(image, frame, interpolation="antialiased")
+    page.bar(ScalarMappable(norm, land), "Height (m)", extend="both")
+    page.outlines()
+    _mark_profile(page)
+    page.finish(path)
+
+
+def _mark_profile(page: MapPage) -> None:
+    if page.look.profile is None:
+        return
+    line, units = page.look.profile.line, page.look.units
+    ends = np.stack([line.start_m, line.end_m]) / [units.east_m, units.north_m]
+    page.axes.plot(*ends.T, color="white", lw=3.2, zorder=6, solid_capstyle="butt")
+    page.axes.plot(*ends.T, color="#c1121f", lw=1.6, zorder=7, solid_capstyle="butt")
+    for letter, place in zip("AB", ends, strict=True):
+        style: dict[str, Any] = {"fontsize": 9.5, "weight": "bold", "color": "#c1121f", "path_effects": HALO}
+        page.axes.text(place[0], place[1], letter, ha="center", va="center", zorder=9, **style)
+
+
+def draw_intensity(look: Look, path: Path) -> None:
+    """Mean intensity of first returns."""
+    values = filled(look.surface.mean(INTENSITY))
+    norm = PowerNorm(0.6, *_range_of(values, 1.0, 99.5))  # few bright roofs and signs do not leave the rest black
+    page = MapPage(look, "Intensity", f"mean of first returns, as recorded, {_cells_words(look)}")
+    image = page.image(values, look.surface.frame, cmap="gray", norm=norm, interpolation="antialiased")
+    page.bar(image, "Intensity (no unit)", extend="both")
+    page.finish(path)
+
+
+def draw_density(look: Look, path: Path) -> None:
+    """Pulses a square metre."""
+    values, cell_m = look.surface.density()
+    frame = look.surface.frame
+    cells = Frame(frame.west_m, frame.south_m, cell_m, *values.shape)
+    top = _range_of(values)[1]
+    known = values[np.isfinite(values)]
+    few = f", 5 % of cells below {np.percentile(known, 5):.3g}" if len(known) else ""
+    step = round_up(max(top, 1e-9) / 8)
+    levels = step * np.arange(math.ceil(top / step) + 1)
+    colours = colormaps["YlGnBu"].resampled(len(levels))(np.linspace(0.06, 1.0, len(levels)))
+    norm = BoundaryNorm(levels, len(levels), extend="max")
+    under = f"first returns per m², all strips together, cells {cell_m:g} m; mean {look.density:.3g}{few}"
+    page = MapPage(look, "Density", under)
+    image = page.image(values, cells, cmap=ListedColormap(colours), norm=norm, interpolation="nearest")
+    page.bar(image, "Pulses per m²", extend="max", ticks=levels, format=FuncFormatter(lambda value, _: f"{value:.4g}"))
+    page.outlines()
+    page.finish(path)
+
+
+def draw_sigma(look: Look, path: Path) -> None:
+    """Sigma of height as the files' points carry it."""
+    values = 100.0 * filled(look.surface.mean(SIGMA_HEIGHT))
+    low, high = _range_of(values)
+    under = f"one standard deviation, as the files say it, mean of all returns, {_cells_words(look)}"
+    page = MapPage(look, "Sigma of height", under)
+    image = page.image(values, look.surface.frame, cmap="viridis", vmin=low, vmax=high, interpolation="antialiased")
+    page.bar(image, "σ of height (cm)", extend="both")
+    page.outlines(light=True)
+    page.finish(path)
+
+
+def draw_differences(look: Look, path: Path) -> None:
+    """Differences of overlapping strips in smooth cells, by size, over the shaded ground."""
+    frame, overlap = look.cells.frame, look.overlap
+    numbers = overlap.numbers()
+    assert numbers is not None
+    under = (
+        f"smooth cells of {frame.cell_m:g} m; where more than two strips meet, the largest; "
+        f"{thousands(numbers['cells'])} comparisons"
+    )
+    page = MapPage(look, "Height difference of overlapping strips", under, WIDE_SIDE_IN)
+    _pale_ground(page)
+    size = np.abs(overlap.worst_m).astype(float)
+    limits = np.array([0.0, *DZ_LIMITS_M, np.inf])
+    norm = BoundaryNorm(np.minimum(limits, 1e6), len(DZ_COLOURS))
+    cells = Frame(frame.west_m, frame.south_m, frame.cell_m, *size.shape)
+    image = page.image(size, cells, cmap=ListedColormap(list(DZ_COLOURS)), norm=norm, interpolation="nearest")
+    image.set_zorder(2.5)
+    page.outlines()
+    handles = [Patch(fc=colour, ec="none", label=word) for colour, word in zip(DZ_COLOURS, DZ_WORDS, strict=True)]
+    legend = page.side(0.0, 2.3, 1.25)
+    legend.set_axis_off()
+    made = legend.legend(
+        handles=handles, loc="upper left", frameon=False, fontsize=8.5, borderaxespad=0, title="|dZ|", labelcolor=INK
+    )
+    made.get_title().set(fontsize=8.5, color=INK)
+    made.set_alignment("left")
+    told = (
+        f"RMSDz {100 * numbers['rms_m']:.1f} cm (all pairs)\n95 % ≤ {100 * numbers['p95_m']:.1f} cm\n"
+        f"largest {100 * numbers['max_m']:.1f} cm"
+    )
+    page.say(1.2, told)
+    page.say(1.95, _worst_pairs(look), color=MUTED, fontsize=8)
+    _dz_histogram(page)
+    page.finish(path)
+
+
+def _worst_pairs(look: Look) -> str:
+    """The pairs whose medians are farthest from zero."""
+    rows = sorted(look.overlap.rows, key=lambda row: -abs(row["median_m"]))[:4]
+    names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
+    told = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
+    return "\n".join(["medians" if len(rows) == len(look.overlap.rows) else "largest medians", *told])
+
+
+def shortened(name: str, most: int) -> str:
+    """A name of so many letters at most."""
+    return name if len(name) <= most else f"{name[: most - 1]}…"
+
+
+def _pale_ground(page: MapPage) -> None:
+    surface = page.look.surface
+    heights = filled(surface.mean(HEIGHT))
+    light = 0.62 + 0.36 * shade_of(heights, surface.frame.cell_m)
+    image = np.repeat(light[:, :, np.newaxis], 4, axis=2)
+    image[:, :, 3] = filled(np.where(surface.sums[:, :, COUNT] > 0, 1.0, np.nan)) > 0
+    page.image(np.clip(image, 0.0, 1.0), surface.frame, interpolation="antialiased")
+
+
+def _dz_histogram(page: MapPage) -> None:
+    """Signed differences, coloured like the map."""
+    room = page.page_in[1] - TOP_IN - 3.0 - 0.5
+    if room < 0.6:
+        return
+    axes = page.side(3.0, 2.2, float(min(room, 2.0)))
+    counts = page.look.overlap.signed
+    share = np.cumsum(np.bincount(np.abs(np.arange(len(counts)) - HISTOGRAM_HALF), counts)) / counts.sum()
+    half_m = max(0.06, 1.1 * HISTOGRAM_STEP_M * float(np.searchsorted(share, 0.995)))
+    step = max(1, round(half_m / 0.025)) | 1  # odd, so that a bar stands in the middle
+    width_m = step * HISTOGRAM_STEP_M
+    bins = (np.arange(len(counts)) - HISTOGRAM_HALF + step // 2) // step
+    totals = np.bincount(bins - bins.min(), counts)
+    middles_m = (np.arange(len(totals)) + bins.min()) * width_m
+    which = np.searchsorted(DZ_LIMITS_M, np.abs(middles_m))
+    inside = np.abs(middles_m) <= half_m
+    colours = [DZ_COLOURS[number] for number in which[inside]]
+    axes.bar(100 * middles_m[inside], totals[inside], width=100 * width_m, color=colours)
+    axes.axvline(0.0, color=INK, lw=0.7)
+    axes.set_xlim(-100 * half_m, 100 * half_m)
+    axes.set_yticks([])
+    axes.spines[["left", "right", "top"]].set_visible(False)
+    axes.set_xlabel("dZ (cm), first strip − second", fontsize=8, color=MUTED)

@@ -1,0 +1,504 @@
+"""Strips against each other: a plane through each strip's returns in each cell, and the planes' heights compared.
+
+Means of heights would compare slopes: where two strips sample a cell differently, their means differ by the slope times
+the distance of their centroids. Planes do not, where the surface is smooth.
+
+Cells begin fine and are put together, two by two, until they hold returns enough of the thinnest strip: so that their
+size goes by the points themselves and by no order of them, and their places by no extent of a file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.calib.strips.differences import single_return_sigma_m
+from swath.daemon.processing.quicklook.grids import Frame, inner
+from swath.daemon.processing.quicklook.read import Block
+from swath.georef.compiled import kept
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+TILE = 16  # cells along a side; memory is taken by tiles
+TILE_CELLS = TILE * TILE
+MOMENTS = 11  # first returns; then of single returns n, x, y, z, xx, xy, yy, xz, yz, zz
+MOST_TILES = 12_000  # of all strips: 3 M cells, 270 MB; then cells become twice as large
+MOST_STRIPS = 2000
+MOST_FRAME_CELLS = 16_000_000  # within the extent, points or not
+MOST_TILE_PLACES = 8_000_000  # of all strips, tiles or not
+FINEST_CELL_M = 0.5
+LEVELS = 5  # doublings from the finest cell to the coarsest, 16 m
+RETURNS_A_CELL = 16.0  # single returns on open ground of the thinnest strip, within a factor of two
+RETURNS_TO_MEASURE = 64.0  # of a strip in a block of cells by which its density is measured
+OPEN = 0.7  # of a block's pulses have one return only: open ground
+LEAST_SHARE = 0.05  # of the largest strip's overlap; strips with less do not say how large cells are
+PULSES_FOR_DENSITY = 25.0  # in a cell of which density is told: its count is then good to 20 %
+FEWEST_CELLS, FEWEST_PLACES, FEWEST_IN_PLACE = 100, 3, 3  # of a verdict
+PLACE = TILE // 2  # cells along a side of a place
+FEWEST_RETURNS = 6
+STEEPEST_DEG = 10.0  # USGS Lidar Base Specification: overlap is judged where slopes are below 10 degrees
+ROUGHEST_M = 0.10
+SMALLEST_CELL_M = 0.01
+COARSEST_CELL_M = 20.0
+PULSES_TO_COVER = 6.0
+NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a strip's returns in it, in every direction
+HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
+
+
+@kept
+def _sum_moments(
+    begin: int,
+    x_m: FloatArray,
+    y_m: FloatArray,
+    z_m: FloatArray,
+    strip: Any,
+    first: Any,
+    single: Any,
+    frame: tuple[float, float, float, float],
+    tiles: Any,
+    used: int,
+    moments: FloatArray,
+) -> tuple[int, int, int]:
+    """Add points from ``begin`` on; gives where it stopped, for want of a tile, the tiles in use, and points outside.
+
+    ``frame``: west, south, cell, reference height. ``tiles``: (strips, rows, columns) of tiles, −1 where there is none.
+    """
+    west_m, south_m, cell_m, reference_m = frame
+    outside = 0
+    for i in range(begin, len(x_m)):
+        across, up = math.floor((x_m[i] - west_m) / cell_m), math.floor((y_m[i] - south_m) / cell_m)
+        if not (0 <= across < tiles.shape[2] * 16 and 0 <= up < tiles.shape[1] * 16 and strip[i] < tiles.shape[0]):
+            outside += 1
+            continue
+        tile = tiles[strip[i], up >> 4, across >> 4]
+        if tile < 0:
+            if used == len(moments):
+                return i, used, outside
+            tile = used
+            tiles[strip[i], up >> 4, across >> 4] = tile
+            used += 1
+        cell = moments[tile, ((up & 15) << 4) + (across & 15)]
+        if first[i]:
+            cell[0] += 1.0
+        if single[i]:
+            x, y = x_m[i] - west_m - (across + 0.5) * cell_m, y_m[i] - south_m - (up + 0.5) * cell_m
+            z = z_m[i] - reference_m
+            cell[1] += 1.0
+            cell[2] += x
+            cell[3] += y
+            cell[4] += z
+            cell[5] += x * x
+            cell[6] += x * y
+            cell[7] += y * y
+            cell[8] += x * z
+            cell[9] += y * z
+            cell[10] += z * z
+    return len(x_m), used, outside
+
+
+@dataclass(slots=True)
+class Pair:
+    """Height differences of two strips in their common smooth cells, the first strip minus the second.
+
+    Attributes:
+        first, second: numbers of the strips.
+        dz_m: (n,) differences.
+        row, column: (n,) cells.
+        compared: cells where both strips have single returns enough, smooth or not.
+        scatter: of each strip the variances (m,) of its single returns about their planes, m², and their numbers (m,),
+            in level cells, smooth or not.
+    """
+
+    first: int
+    second: int
+    dz_m: FloatArray
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    compared: int
+    scatter: tuple[tuple[FloatArray, FloatArray], ...] = ()
+
+    def numbers(self) -> dict[str, Any]:
+        """Median, mean, root mean square, 95 % of the absolute and largest difference, metres."""
+        size = np.abs(self.dz_m)
+        return {
+            "cells": len(size),
+            "compared_cells": self.compared,
+            "median_m": float(np.median(self.dz_m)),
+            "mean_m": float(self.dz_m.mean()),
+            "rms_m": float(np.sqrt(np.mean(self.dz_m**2))),
+            "p95_m": float(np.percentile(size, 95.0)),
+            "max_m": float(size.max()),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Cells around a strip, and how many of its first returns lie in each."""
+
+    frame: Frame
+    pulses: FloatArray
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """Cells with a pulse."""
+        return np.asarray(self.pulses > 0)
+
+    def centres(self) -> FloatArray:
+        """(n, 2) east and north of the cells with a pulse."""
+        return self.frame.centres(*np.nonzero(self.there))
+
+
+@dataclass(slots=True)
+class StripCells:
+    """Moments of every strip's single returns in cells, tile by tile where there are any.
+
+    Attributes:
+        frame: of the cells; they grow where there are too many tiles.
+        reference_m: height that moments refer to.
+        left_out: points outside the frame or of strips beyond the most.
+        fixed: the cells' size is the user's word: `settle` leaves it.
+    """
+
+    frame: Frame
+    reference_m: float
+    left_out: int = 0
+    fixed: bool = False
+    tiles: NDArray[np.int32] = field(init=False)
+    moments: FloatArray = field(init=False)
+    used: int = 0
+
+    def __post_init__(self) -> None:
+        self.tiles = self._no_tiles(1)
+        self.moments = np.zeros((min(64, MOST_TILES), TILE_CELLS, MOMENTS))
+
+    def _no_tiles(self, strips: int) -> NDArray[np.int32]:
+        return np.full((strips, -(-self.frame.rows // TILE), -(-self.frame.columns // TILE)), -1, np.int32)
+
+    def add(self, block: Block) -> None:
+        """Sum a block's points up."""
+        if not len(block):
+            return
+        strips = min(int(block.strip.max()) + 1, MOST_STRIPS)
+        while strips * self.tiles[0].size > MOST_TILE_PLACES and self.tiles[0].size > 1:
+            self._coarsen()
+        if strips > len(self.tiles):
+            self.tiles = np.concatenate([self.tiles, self._no_tiles(strips - len(self.tiles))])
+        columns = (block.x_m, block.y_m, block.z_m, block.strip, block.first, block.single)
+        begin = 0
+        while True:
+            frame = (self.frame.west_m, self.frame.south_m, self.frame.cell_m, self.reference_m)
+            begin, self.used, left = _sum_moments(begin, *columns, frame, self.tiles, self.used, self.moments)
+            self.left_out += left
+            if begin == len(block):
+                return
+            if self.used < MOST_TILES:
+                more = min(self.used, MOST_TILES - self.used)
+                self.moments = np.concatenate([self.moments, np.zeros((more, TILE_CELLS, MOMENTS))])
+            else:
+                self._coarsen()
+
+    def _coarsen(self) -> None:
+        """Twice the cell: four cells' moments, brought to their common centre, in one."""
+        old, old_tiles, old_moments, used = self.frame, self.tiles, self.moments, self.used
+        cell_m = 2 * old.cell_m
+        self.frame = Frame(old.west_m, old.south_m, cell_m, -(-old.rows // 2), -(-old.columns // 2))
+        self.tiles = self._no_tiles(len(old_tiles))
+        self.moments = np.zeros((max(used // 2, 1), TILE_CELLS, MOMENTS))
+        self.used = 0
+        for strip, up, across in np.argwhere(old_tiles >= 0):
+            if self.tiles[strip, up // 2, across // 2] < 0:
+                if self.used == len(self.moments):
+                    self.moments = np.concatenate([self.moments, np.zeros_like(self.moments)])
+                self.tiles[strip, up // 2, across // 2] = self.used
+                self.used += 1
+            into = self.moments[self.tiles[strip, up // 2, across // 2]].reshape(TILE, TILE, MOMENTS)
+            part = _halved(old_moments[old_tiles[strip, up, across]], old.cell_m)
+            half = TILE // 2
+            into[up % 2 * half : up % 2 * half + half, across % 2 * half : across % 2 * half + half] = part
+
+    def settle(self) -> None:
+        """Make cells as large as the thinnest strip wants, after all points are in."""
+        if self.fixed:
+            return
+        known = [density for density in self.single_densities() if density > 0.0]
+        wanted_m = math.sqrt(RETURNS_A_CELL / min(known)) if known else 0.0
+        coarsest_m = self.frame.cell_m * 2**LEVELS
+        while self.frame.cell_m * math.sqrt(2.0) < wanted_m and self.frame.cell_m < min(coarsest_m, COARSEST_CELL_M):
+            self._coarsen()
+
+    def single_densities(self) -> list[float]:
+        """Return by strip its single returns a square metre, on open ground where it overlaps others.
+
+        It is the median over blocks of cells. 0: the strip has no points, or hardly overlaps.
+        """
+        there = (self.tiles >= 0).reshape(len(self.tiles), -1)
+        shared = there & (there.sum(axis=0) > 1)
+        sizes = shared.sum(axis=1)
+        if not sizes.any():  # nothing overlaps: all there is
+            shared, sizes = there, there.sum(axis=1)
+        densities = []
+        for strip in range(len(self.tiles)):
+            if sizes[strip] < LEAST_SHARE * sizes.max() or not sizes[strip]:
+                densities.append(0.0)
+                continue
+            moments = self.moments[self.tiles[strip].ravel()[shared[strip]], :, :2]
+            densities.append(_open_density(moments, self.frame.cell_m))
+        return densities
+
+    def pulse_density(self) -> tuple[float, float]:
+        """Return mean pulses a square metre of all strips together where cells are covered wholly, and the area."""
+        ups, acrosses = np.nonzero((self.tiles >= 0).any(axis=0))
+        if not len(ups):
+            return math.nan, 0.0
+        up, across = int(ups.min()), int(acrosses.min())
+        pulses = np.zeros((int(ups.max()) - up + 1, TILE, int(acrosses.max()) - across + 1, TILE), np.float32)
+        for tiles in self.tiles:
+            row, column = np.nonzero(tiles >= 0)
+            pulses[row - up, :, column - across] += self.moments[tiles[row, column], :, 0].reshape(-1, TILE, TILE)
+        counts: NDArray[Any] = pulses.reshape(pulses.shape[0] * TILE, -1)
+        cell_m = self.frame.cell_m
+        while (counts > 0).any() and counts[counts > 0].mean() < PULSES_FOR_DENSITY and max(counts.shape) > 1:
+            counts, cell_m = _pooled(counts), 2.0 * cell_m
+        there = counts > 0
+        density = float(counts[inner(there)].mean()) / cell_m**2 if there.any() else math.nan
+        return density, float(there.sum()) * cell_m**2
+
+    def coverage(self, strip: int) -> Coverage:
+        """Where a strip is, in cells that hold enough of its pulses to tell a gap from chance."""
+        ups, acrosses = np.nonzero(self.tiles[strip] >= 0) if strip < len(self.tiles) else (np.array([], int),) * 2
+        if not len(ups):
+            return Coverage(Frame(self.frame.west_m, self.frame.south_m, self.frame.cell_m, 1, 1), np.zeros((1, 1)))
+        up, across = int(ups.min()), int(acrosses.min())
+        made = np.zeros((int(ups.max()) - up + 1, TILE, int(acrosses.max()) - across + 1, TILE))
+        tiles = self.moments[self.tiles[strip, ups, acrosses], :, 0]
+        made[ups - up, :, acrosses - across] = tiles.reshape(-1, TILE, TILE)
+        pulses = made.reshape(made.shape[0] * TILE, made.shape[2] * TILE)
+        side_m = TILE * self.frame.cell_m
+        west_m, south_m, cell_m = (
+            self.frame.west_m + across * side_m,
+            self.frame.south_m + up * side_m,
+            self.frame.cell_m,
+        )
+        while (pulses > 0).any() and pulses[pulses > 0].mean() < PULSES_TO_COVER and max(pulses.shape) > 1:
+            pulses, cell_m = _pooled(pulses), 2 * cell_m
+        return Coverage(Frame(west_m, south_m, cell_m, *pulses.shape), pulses)
+
+    def pairs(self) -> Iterator[Pair]:
+        """Every two strips that share a smooth cell."""
+        there = (self.tiles >= 0).reshape(len(self.tiles), -1).astype(np.float32)
+        for first, second in np.argwhere(np.triu(there @ there.T, 1) > 0):
+            found = self._pair(int(first), int(second))
+            if found is not None:
+                yield found
+
+    def _pair(self, first: int, second: int) -> Pair | None:
+        ups, acrosses = np.nonzero((self.tiles[first] >= 0) & (self.tiles[second] >= 0))
+        a, b = (self.moments[self.tiles[strip, ups, acrosses]] for strip in (first, second))
+        tile, inside = np.nonzero((a[:, :, 1] >= FEWEST_RETURNS) & (b[:, :, 1] >= FEWEST_RETURNS))
+        plane_a, plane_b = (_planes(one[tile, inside], self.frame.cell_m) for one in (a, b))
+        keep = plane_a.smooth & plane_b.smooth
+        if not keep.any():
+            return None
+        x_m, y_m = (plane_a.x_m + plane_b.x_m) / 2, (plane_a.y_m + plane_b.y_m) / 2
+        dz_m = plane_a.height(x_m, y_m) - plane_b.height(x_m, y_m)
+        row, column = ups[tile] * TILE + inside // TILE, acrosses[tile] * TILE + inside % TILE
+        scatter = tuple((one.variance_m2[one.level], one.count[one.level]) for one in (plane_a, plane_b))
+        return Pair(first, second, dz_m[keep], row[keep], column[keep], len(tile), scatter)
+
+
+@dataclass(frozen=True, slots=True)
+class _Planes:
+    """Planes (n,) through cells' returns: centroid, gradient, and whether the surface is smooth there.
+
+    ``level``: gentle, and the returns spread over the cell; ``smooth``: their scatter ``variance_m2`` is small, too.
+    """
+
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+    east: FloatArray
+    north: FloatArray
+    level: NDArray[np.bool_]
+    smooth: NDArray[np.bool_]
+    variance_m2: FloatArray
+    count: FloatArray
+
+    def height(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+        return self.z_m + self.east * (x_m - self.x_m) + self.north * (y_m - self.y_m)
+
+
+def _planes(moments: FloatArray, cell_m: float) -> _Planes:
+    """Least squares planes of cells (n, MOMENTS)."""
+    n = moments[:, 1]
+    x, y, z, xx, xy, yy, xz, yz, zz = (moments[:, 2:] / n[:, np.newaxis]).T
+    xx, xy, yy, xz, yz, zz = xx - x * x, xy - x * y, yy - y * y, xz - x * z, yz - y * z, zz - z * z
+    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    spread = least >= (NARROWEST * cell_m) ** 2
+    determinant = np.where(spread, xx * yy - xy * xy, 1.0)
+    east, north = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
+    variance = np.maximum(zz - east * xz - north * yz, 0.0) * n / (n - 3.0)
+    gentle = np.hypot(east, north) <= math.tan(math.radians(STEEPEST_DEG))
+    smooth = spread & gentle & (variance <= ROUGHEST_M**2)
+    return _Planes(x, y, z, east, north, spread & gentle, smooth, variance, n)
+
+
+def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
+    """Return sums of two by two cells (rows, columns)."""
+    rows, columns = (-(-size // 2) for size in counts.shape)
+    even = np.zeros((2 * rows, 2 * columns), counts.dtype)
+    even[: counts.shape[0], : counts.shape[1]] = counts
+    return np.asarray(even.reshape(rows, 2, columns, 2).sum(axis=(1, 3)))
+
+
+def _open_density(moments: FloatArray, cell_m: float) -> float:
+    """Return single returns a square metre of tiles (n, 256, 2): pulses and single returns, on open ground."""
+    block = 1
+    while True:
+        sums = moments.reshape(-1, TILE // block, block, TILE // block, block, 2).sum(axis=(2, 4)).reshape(-1, 2)
+        covered = sums[sums[:, 0] > 0]
+        if not len(covered):
+            return 0.0
+        if block == TILE or np.median(covered[:, 0]) >= RETURNS_TO_MEASURE:
+            break
+        block *= 2
+    open_ground = covered[covered[:, 1] >= OPEN * covered[:, 0]]
+    used = open_ground if len(open_ground) else covered
+    return float(np.median(used[:, 1])) / (block * cell_m) ** 2
+
+
+def strip_frame(low_m: FloatArray, high_m: FloatArray, cell_m: float | None = None) -> Frame:
+    """Return the fine cells that strips are summed into, of the given side or the finest.
+
+    They begin at whole multiples of the coarsest cells' tiles, so that cells put together are the same ones wherever
+    a file begins.
+    """
+    side_m = FINEST_CELL_M if cell_m is None else max(cell_m, SMALLEST_CELL_M)
+    step_m = TILE * side_m * 2**LEVELS
+    west_m, south_m = (np.floor(low_m[:2] / step_m) * step_m).tolist()
+    while True:
+        columns, rows = (np.floor((high_m[:2] - (west_m, south_m)) / side_m) + 1.0).tolist()
+        if rows * columns <= MOST_FRAME_CELLS:
+            return Frame(west_m, south_m, side_m, int(rows), int(columns))
+        side_m *= 2.0
+
+
+def _halved(moments: FloatArray, cell_m: float) -> FloatArray:
+    """A tile (256, MOMENTS) as a quarter (8, 8, MOMENTS) of one with twice the cell."""
+    cells = moments.reshape(TILE, TILE, MOMENTS)
+    made = np.zeros((TILE // 2, TILE // 2, MOMENTS))
+    for up in range(2):
+        for across in range(2):
+            part = cells[up::2, across::2]
+            east, north = (across - 0.5) * cell_m, (up - 0.5) * cell_m
+            first, n, x, y, z, xx, xy, yy, xz, yz, zz = np.moveaxis(part, 2, 0)
+            moved = (
+                first,
+                n,
+                x + n * east,
+                y + n * north,
+                z,
+                xx + 2 * east * x + n * east**2,
+                xy + east * y + north * x + n * east * north,
+                yy + 2 * north * y + n * north**2,
+                xz + east * z,
+                yz + north * z,
+                zz,
+            )
+            made += np.stack(moved, axis=2)
+    return made
+
+
+@dataclass(slots=True)
+class Overlap:
+    """All pairs together.
+
+    Attributes:
+        worst_m: (rows, columns) f4 the difference of largest size in each cell, nan where none was compared.
+        counts: histogram of |dZ| in millimetres, the last bin is open.
+    """
+
+    worst_m: NDArray[np.float32]
+    signed: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2 * HISTOGRAM_HALF + 1, np.int64))
+    cells: int = 0
+    squares: float = 0.0
+    largest_m: float = 0.0
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    best: Pair | None = None
+    scatter: dict[int, list[tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
+
+    def add(self, pair: Pair) -> None:
+        """Take a pair in; the one with most cells is kept as the best."""
+        before = self.worst_m[pair.row, pair.column]
+        larger = ~(np.abs(before) >= np.abs(pair.dz_m))  # also where there was none
+        self.worst_m[pair.row[larger], pair.column[larger]] = pair.dz_m[larger]
+        steps = np.clip(np.rint(pair.dz_m / HISTOGRAM_STEP_M), -HISTOGRAM_HALF, HISTOGRAM_HALF).astype(int)
+        self.signed += np.bincount(steps + HISTOGRAM_HALF, minlength=len(self.signed))
+        self.cells += len(pair.dz_m)
+        self.squares += float((pair.dz_m**2).sum())
+        self.largest_m = max(self.largest_m, float(np.abs(pair.dz_m).max()))
+        self.rows.append({"first": pair.first, "second": pair.second} | pair.numbers())
+        if self.best is None or len(pair.dz_m) > len(self.best.dz_m):
+            self.best = pair
+        for strip, scatter in zip((pair.first, pair.second), pair.scatter, strict=False):
+            self.scatter.setdefault(strip, []).append(scatter)
+
+    @property
+    def compared_cells(self) -> int:
+        """Return the number of cells in which any two strips were compared."""
+        return int(np.isfinite(self.worst_m).sum())
+
+    @property
+    def places(self) -> int:
+        """Return the number of places apart from each other: blocks with compared cells, of neighbouring blocks one."""
+        rows, columns = (size // PLACE for size in self.worst_m.shape)
+        cells = np.isfinite(self.worst_m).reshape(rows, PLACE, columns, PLACE).sum(axis=(1, 3))
+        found = 0
+        while cells.max(initial=0) >= FEWEST_IN_PLACE:
+            row, column = np.unravel_index(int(cells.argmax()), cells.shape)
+            cells[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = 0
+            found += 1
+        return found
+
+    def repeatability_m(self) -> dict[int, float]:
+        """Return by strip the sigma of its single returns on the smoothest quarter of gentle ground in the overlap."""
+        return {
+            strip: single_return_sigma_m(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            for strip, parts in sorted(self.scatter.items())
+            if sum(len(one) for one, _ in parts)
+        }
+
+    def numbers(self) -> dict[str, Any] | None:
+        """Of all pairs' cells; 95 % and 99 % of |dZ| to the millimetre. None: no cell was compared."""
+        if not self.cells:
+            return None
+        size = self.signed[HISTOGRAM_HALF:].copy()
+        size[1:] += self.signed[:HISTOGRAM_HALF][::-1]
+        p95_m = float(np.searchsorted(np.cumsum(size), 0.95 * self.cells)) * HISTOGRAM_STEP_M
+        median = int(np.searchsorted(np.cumsum(self.signed), 0.5 * self.cells)) - HISTOGRAM_HALF
+        p99_m = float(np.searchsorted(np.cumsum(size), 0.99 * self.cells)) * HISTOGRAM_STEP_M
+        mean_m = sum(row["cells"] * row["mean_m"] for row in self.rows) / self.cells
+        return {
+            "cells": self.cells,
+            "median_m": median * HISTOGRAM_STEP_M,
+            "mean_m": mean_m,
+            "std_m": math.sqrt(max(self.squares / self.cells - mean_m**2, 0.0)),
+            "rms_m": math.sqrt(self.squares / self.cells),
+            "p95_m": p95_m,
+            "p99_m": p99_m,
+            "max_m": self.largest_m,
+        }
+
+
+def compare(cells: StripCells) -> Overlap:
+    """All strips against each other, in cells as large as `StripCells.settle` finds right."""
+    cells.settle()
+    rows, columns = (size * TILE for size in cells.tiles.shape[1:])
+    overlap = Overlap(np.full((rows, columns), np.nan, np.float32))
+    for pair in cells.pairs():
+        overlap.add(pair)
+    return overlap

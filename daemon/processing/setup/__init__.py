@@ -1,0 +1,1 @@
+"""What processing is set up with: sources, models, terrain."""

@@ -1,0 +1,241 @@
+"""`swath strips --adjust`: corrections of the trajectory, strip by strip, while the calibration is held.
+
+returns of the strips, placed with the calibration               calibration_flight
+planes, control                                                  swath.calib.planes.search, swath.calib.control.points
+corrections; planes found anew with them; corrections again      swath.calib.strips.corrections
+height differences of strips, before and after                   swath.calib.strips.differences
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from swath.calib.control.points import ControlError, control_planes
+from swath.calib.equations.normals import NormalError
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.plane_settings import PlaneError
+from swath.calib.planes.search import find_planes
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.corrections import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips
+from swath.calib.strips.differences import differences
+from swath.calib.strips.effects import SeenFrom
+from swath.calib.strips.signatures import signatures
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.directory import nearest_there
+from swath.daemon.processing.calibration.inputs import control_of
+from swath.daemon.processing.calibration.returns import (
+    KeptFlight,
+    read_flight,
+    refuse_without_noise,
+    replaced,
+    smoothed_prior,
+)
+from swath.daemon.processing.calibration.run import PLANES, refuse_lost_control, refuse_no_planes
+from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
+from swath.daemon.processing.flights.read import Flight as LoggedFlight
+from swath.daemon.processing.flights.read import Wish, verdicts_of
+from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
+from swath.daemon.processing.strips.compare import is_of_logs, refuse_installations
+from swath.daemon.processing.trajectory.files import TrajectoryFiles
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.mapping.frame import MappingError
+from swath.georef.strips import StripError as StripTimesError
+from swath.georef.trajectory.trajectory import TrajectoryError
+
+Steps = Callable[[str, int, int], None]  # what is done, how much, of how much
+
+AUTO = "auto"
+CHOICES = (*MODELS, AUTO)
+REFUSED = (
+    ControlError,
+    FlightError,
+    MappingError,
+    NormalError,
+    PlaneError,
+    StripError,
+    StripTimesError,
+    TrajectoryError,
+)
+
+
+@dataclass(frozen=True)
+class AdjustWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs: what is read and how; what it says of products does not count.
+        output: folder for the corrected trajectories and the record.
+        control: CSV of surveyed points; None: none.
+        model: that all strips get, of `swath.calib.strips.corrections.MODELS`; ``auto``: each what its returns ask for.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Wish
+    output: Path
+    control: Path | None = None
+    model: str = AUTO
+    overwrite: bool = False
+
+    @property
+    def settings(self) -> Settings:
+        """Of the adjustment."""
+        return DEFAULTS if self.model == AUTO else replace(DEFAULTS, models=(self.model,))
+
+
+@dataclass(frozen=True, eq=False)
+class StripsCorrected:
+    """What came of it.
+
+    Attributes:
+        kept: the flight as read, placed with the calibration that is held.
+        features: by which it was corrected.
+        control: surveyed points; none: there are none.
+        adjusted: corrections and trajectories.
+        before, after: differences of strips.
+        notes: for people, a line each.
+    """
+
+    kept: KeptFlight
+    features: Features
+    control: tuple[ControlPoint, ...]
+    adjusted: StripAdjusted
+    before: FlightStrips
+    after: FlightStrips
+    notes: tuple[str, ...]
+
+
+def _refuse_output(wish: AdjustWish) -> None:
+    """UserError where no folder can be there, or it holds an adjustment already; before anything lasts long."""
+    there, permitted = nearest_there(wish.output.absolute())
+    if permitted and not there.is_dir():
+        raise UserError(f"--adjust {wish.output}: {there} is a file; want a folder", ExitCode.USAGE)
+    if not permitted or not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"--adjust {wish.output}: {there} cannot be written to", ExitCode.IO)
+    if (wish.output / ADJUSTMENT).exists() and not wish.overwrite:
+        raise UserError(
+            f"{wish.output / ADJUSTMENT}: is there already; want another folder, or --overwrite", ExitCode.USAGE
+        )
+
+
+def files_of(wish: AdjustWish, flight: LoggedFlight) -> TrajectoryFiles:
+    """Names of a session's files; UserError where they are there, or are what the trajectory was read from."""
+    files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
+    paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
+    read = wish.logs.trajectory.file
+    for path in paths:
+        if path.exists() and read is not None and path.samefile(read):
+            raise UserError(f"--adjust: {path} is what is corrected; want another folder", ExitCode.USAGE)
+        if path.exists() and not wish.overwrite:
+            raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
+    return files
+
+
+def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+    """Adjust strips; nothing is written.
+
+    Args:
+        wish: what is asked for.
+        folder: for the returns, some 150 bytes each, while it goes on.
+        tell: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    if wish.model not in CHOICES:
+        raise UserError(f'--strip-model: got "{wish.model}", want one of {", ".join(CHOICES)}', ExitCode.USAGE)
+    if not is_of_logs(wish.logs.logs):
+        raise UserError(
+            f"--adjust: corrects the trajectory of logs, {wish.logs.logs[0]} holds points; want the logs they are of",
+            ExitCode.USAGE,
+        )
+    _refuse_output(wish)
+    with told_in_a_line(folder, *REFUSED):
+        return _corrected(wish, folder, tell)
+
+
+def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+    kept = read_flight(wish.logs, folder, tell)
+    with told_before(verdicts_of(kept.logged), *REFUSED):
+        return _of_flight(wish, kept, folder, tell)
+
+
+def _of_flight(wish: AdjustWish, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
+    _refuse(wish, kept)
+    for logged in kept.logged:
+        files_of(wish, logged)
+    flight, calibrations, workers = kept.flight, kept.flight.starts(), wish.logs.workers
+    points, notes = ((), []) if wish.control is None else control_of(wish.control, flight, ())
+
+    def features_of(placed: Flight) -> Features:
+        with ThreadPoolExecutor(workers) as pool:
+            planes = find_planes(placed, PLANES, pool.map)
+        refuse_no_planes(str(kept.logged[0].log), planes)
+        return Features.joined([planes, *([control_planes(placed, points)] if points else [])])
+
+    def moved(adjusted: StripAdjusted, name: str) -> Flight:
+        return replaced(replace(flight, trajectories=adjusted.trajectories), calibrations, folder, name, workers)
+
+    tell("planes", 0, 1)
+    features = features_of(flight)
+    tell("adjustment", 0, 1)
+    first = adjust_strips(flight, features, calibrations, replace(wish.settings, linearisations=1))
+    tell("planes again", 0, 1)  # what errors of the trajectory had left apart lies on each other now
+    features = features_of(moved(first, "matched"))
+    refuse_lost_control(wish.control, features)
+    tell("adjustment", 0, 1)
+    adjusted = adjust_strips(flight, features, calibrations, wish.settings)
+    tell("strips before and after", 0, 1)
+    before, after = before_and_after(flight, moved(adjusted, "adjusted"), kept.logged[0].setup.mapping)
+    notes += [*kept.notes, *_notes(wish, kept, features, before.cells.frame.cell_m), *adjusted.notes]
+    return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
+
+
+def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
+    log = kept.logged[0].log
+    strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
+    if len(strips) < 2:
+        raise UserError(
+            f"{log}: {len(strips) or 'no'} strip with returns; an adjustment compares strips: want at least two that "
+            "overlap"
+        )
+    refuse_installations(kept.logged)
+    refuse_without_noise(kept)
+    for head in kept.flight.heads:
+        if head.start.method == "nominal" and head.name not in wish.logs.options.calibrations:
+            raise UserError(
+                f"{log}: {head.name}: has the nominal calibration only, whose errors would go into the trajectory; "
+                "want --calibration FILE of swath calibrate",
+                ExitCode.USAGE,
+            )
+
+
+def _notes(wish: AdjustWish, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
+    notes, flight = [], kept.flight
+    if not wish.control:
+        settings = wish.settings
+        notes.append(
+            "no control: what all strips have in common, a shift or a tilt, is held by its prior of "
+            f"{100 * settings.position_m:.0f} cm and {_mdeg(settings.turn_rad):.0f} mdeg; the datum is not determined"
+        )
+    seen = {flight.swaths[patch.swath].strip for plane in features.planes for patch in plane.patches}
+    for strip in sorted({swath.strip for swath in flight.swaths} - seen):
+        notes.append(f"strip {strip:02d}: no plane of it is seen by another: not corrected")
+    found = signatures(
+        differences(flight, StripRules(cell_m=cell_m)).checks, SeenFrom.of(flight), smoothed_prior(kept)
+    ).found
+    told = dict.fromkeys(one.words for one in found if one.level in ("significant", "rough"))
+    notes += [
+        f"before, strips differed as by an error of the calibration, which is for swath calibrate: {words}"
+        for words in told
+    ]
+    return notes
+
+
+def _mdeg(turn_rad: float) -> float:
+    return 1e3 * math.degrees(turn_rad)

@@ -1,0 +1,210 @@
+"""What `swath strips --adjust` writes: each log's corrected trajectory, and a record of what was done to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath import __version__
+from swath.calib.strips.corrections import StripChoice
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration.products import Told, strips_entry
+from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
+from swath.daemon.processing.flights.read import Flight as LoggedFlight
+from swath.daemon.processing.flights.read import verdict_of
+from swath.daemon.processing.georeferencing.sidecar import sha256_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, files_of
+from swath.daemon.processing.trajectory.files import gone_on_failure, put_in_place, write_aside, write_trajectory
+from swath.daemon.processing.trajectory.summary import write_json
+from swath.georef.trajectory.trajectory import Trajectory
+
+FloatArray = NDArray[np.float64]
+
+WHAT = (
+    "Correction of the trajectory by strips (ISO/TS 19159-2, 6.3.3). No calibration: the scanners' parameters were "
+    "held. Corrections are what was added: position north, east, down, then small turns of the body about these axes."
+)
+KEPT = "velocities and sigmas of the trajectories are those from before"
+AXES = ("north", "east", "down")
+UNCORRECTED = "none"
+TOLD = 0.7  # of its prior's sigma: returns say as much as the prior does
+
+
+def write_adjustment(wish: AdjustWish, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
+    """Write all of it; the record last, as a folder with a record is whole.
+
+    Raises:
+        UserError: it cannot be written; nothing is left then.
+    """
+    tell("trajectories", 0, 1)
+    files = [files_of(wish, flight) for flight in done.kept.logged]
+    written: list[tuple[Path, Path]] = []
+    made = not wish.output.exists()
+    try:
+        with gone_on_failure(written):
+            for flight, own, trajectory in zip(done.kept.logged, files, done.adjusted.trajectories, strict=True):
+                written += write_trajectory(own, _as_given(flight, trajectory), None)
+            record = finite(_record(wish, done, written))
+            path = wish.output / ADJUSTMENT
+            written.append((write_aside(path, partial(write_json, record)), path))
+        put_in_place(written)
+    except OSError as error:
+        if made and wish.output.is_dir() and not any(wish.output.iterdir()):
+            wish.output.rmdir()
+        raise UserError(f"{error.filename or wish.output}: {error.strerror or error}", ExitCode.IO) from error
+    told = [str(path) for _, path in written]
+    return Told(record | {"files": told}, [*first_lines(record["verdict"]), *_lines(done), *told])
+
+
+def _as_given(flight: LoggedFlight, trajectory: Trajectory) -> Trajectory:
+    """With the attitude referring to what the log's own refers to, as it is turned to the normal when it is read."""
+    if flight.setup.deflection_rad is None:
+        return trajectory
+    xi_rad, eta_rad = flight.setup.deflection_rad
+    return trajectory.with_deflection(-xi_rad, -eta_rad)
+
+
+# ---------------------------------------------------------------------- for scripts
+
+
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """What a strip got, and how far it was from the others, and is.
+
+    Attributes:
+        time_ns: (k,) of its knots.
+        corrections, sigmas, priors: (k, 6) north, east, down, metres, turns about these, rad; sigmas after and before.
+        before_m, after_m: RMSDz; nan: no other strip shares ground with it.
+    """
+
+    choice: StripChoice
+    time_ns: NDArray[np.int64]
+    corrections: FloatArray
+    sigmas: FloatArray
+    priors: FloatArray
+    before_m: float
+    after_m: float
+
+    @property
+    def told(self) -> NDArray[np.bool_]:
+        """(6,) what its returns determine, more than the prior does."""
+        return np.asarray(self.sigmas.mean(axis=0) < TOLD * self.priors.mean(axis=0))
+
+
+def _strips(done: StripsCorrected) -> Iterator[_Strip]:
+    fit = done.adjusted.fit
+    corrections = np.concatenate([fit.position_l, fit.attitude_rad], axis=1)
+    sigmas = np.concatenate([fit.position_sigma_l, fit.attitude_sigma_rad], axis=1)
+    priors = np.concatenate([fit.prior_position_sigma_l, fit.prior_attitude_sigma_rad], axis=1)
+    for choice in done.adjusted.choices:
+        mine = (fit.flown == choice.flown) & (fit.strip == choice.strip)
+        names = {swath.name for swath in done.kept.flight.swaths if swath.strip == choice.strip}
+        own = (fit.time_ns[mine], corrections[mine], sigmas[mine], priors[mine])
+        yield _Strip(choice, *own, done.before.rms_of(names), done.after.rms_of(names))
+
+
+def _record(wish: AdjustWish, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
+    adjusted, settings = done.adjusted, wish.settings
+    heads = done.kept.flight.heads
+    inputs = [part.path for flight in done.kept.logged for part in flight.session.parts]
+    inputs += [path for path in (wish.logs.trajectory.file, wish.control) if path is not None]
+    inputs += [Path(file) for _, file in wish.logs.options.calibrations.values()]
+    return {
+        "format": "swath.strip-adjustment",
+        "version": 1,
+        "software": f"swath {__version__}",
+        "what": f"{WHAT} {KEPT[0].upper()}{KEPT[1:]}.",
+        "verdict": verdict_of(wish.logs, done.kept.logged),
+        "flights": [
+            {
+                "session": flight.session.session_id,
+                "trajectory": trajectory_entry(trajectory, flight.source, flight.trajectory_verdicts),
+            }
+            for flight, trajectory in zip(done.kept.logged, done.adjusted.trajectories, strict=True)
+        ],
+        "calibrations_held": {head.name: head.start.id for head in heads},
+        "strip_model": wish.model,
+        "settings": asdict(settings),
+        "strips": [_strip_entry(done, strip) for strip in _strips(done)],
+        "planes": len(done.features.planes),
+        "control": sum(len(plane.control) for plane in done.features.planes),
+        "observations": adjusted.observations,
+        "parameters_determined": adjusted.parameters,
+        "variance": {"before": adjusted.variance_before, "after": adjusted.variance_after},
+        "differences": {"before": strips_entry(done.before), "after": strips_entry(done.after)},
+        "refused": dict(done.features.refused),
+        "notes": [*done.notes, KEPT],
+        "inputs": [{"name": path.name, "sha256": sha256_of(path)} for path in inputs],
+        "trajectories": [{"name": path.name, "sha256": sha256_of(aside)} for aside, path in written],
+    }
+
+
+def _strip_entry(done: StripsCorrected, strip: _Strip) -> dict[str, Any]:
+    """A strip without corrections has none, and no sigmas of them."""
+    corrected = strip.choice.model != UNCORRECTED
+    knots = zip(strip.time_ns.tolist(), strip.corrections, strip.sigmas, strip.priors, strict=True)
+    means = (strip.corrections.mean(axis=0), strip.sigmas.mean(axis=0), strip.priors.mean(axis=0))
+    return {
+        "strip": strip.choice.strip,
+        "log": done.kept.logged[strip.choice.flown].log.name,
+        "model": strip.choice.model,
+        "criterion_gains": dict(strip.choice.gains),
+        "rms_dz_m": {"before": strip.before_m, "after": strip.after_m},
+        "mean": _named(*means) if corrected else None,
+        "knots": [{"gps_ns": time_ns} | _named(*values) for time_ns, *values in knots] if corrected else [],
+    }
+
+
+def _named(*sixes: FloatArray) -> dict[str, float]:
+    """A correction (6,), its sigmas and those before, by names with units."""
+    entry: dict[str, float] = {}
+    for prefix, six in zip(("", "sigma_", "prior_sigma_"), sixes, strict=True):
+        entry |= {f"{prefix}{axis}_m": float(value) for axis, value in zip(AXES, six[:3], strict=True)}
+        turns = np.degrees(six[3:])
+        entry |= {f"{prefix}turn_{axis}_deg": float(value) for axis, value in zip(AXES, turns, strict=True)}
+    return entry
+
+
+# ---------------------------------------------------------------------- for people
+
+
+def _lines(done: StripsCorrected) -> list[str]:
+    adjusted, strips = done.adjusted, list(_strips(done))
+    held = ", ".join(f"{head.name} {head.start.id}" for head in done.kept.flight.heads)
+    titles = [*(f"{axis} cm" for axis in AXES), *(f"turn {axis[0]} mdeg" for axis in AXES), "RMSDz cm"]
+    lines = [f"correction of the trajectory, no calibration; held: {held}"]
+    lines.append(f"{'strip':<7}{'model':<10}" + "".join(f"{title:>14}" for title in titles))
+    lines += [_row(strip) for strip in strips]
+    control = sum(len(plane.control) for plane in done.features.planes)
+    lines.append(
+        f"{len(done.features.planes)} planes"
+        + (f", {control} of {len(done.control)} control points" if done.control else "")
+        + f"; misclosures {math.sqrt(adjusted.variance_before):.2f} → {math.sqrt(adjusted.variance_after):.2f} sigmas"
+    )
+    rms = [100.0 * strips.rms_m for strips in (done.before, done.after)]
+    lines.append(f"all strips: RMSDz {rms[0]:.1f} → {rms[1]:.1f} cm")
+    if any(not strip.told.all() for strip in strips if strip.choice.model != UNCORRECTED):
+        lines.append("not told: the planes of the strip do not determine it, so it is left as it was")
+    return [*lines, *(f"note: {note}" for note in (*done.notes, KEPT))]
+
+
+def _row(strip: _Strip) -> str:
+    """Means along the strip; where nothing is corrected there is nothing to be unsure of."""
+    factors = np.array([100.0] * 3 + [1e3 * 180.0 / np.pi] * 3)
+    means, sigmas = factors * strip.corrections.mean(axis=0), factors * strip.sigmas.mean(axis=0)
+    columns = [
+        f"{mean:+.1f} ± {sigma:.1f}" if told else "not told"
+        for mean, sigma, told in zip(means, sigmas, strip.told, strict=True)
+    ]
+    if strip.choice.model == UNCORRECTED:
+        columns = ["–"] * len(columns)
+    columns.append(f"{100 * strip.before_m:.1f} → {100 * strip.after_m:.1f}" if math.isfinite(strip.after_m) else "–")
+    return f"{strip.choice.strip:02d}     {strip.choice.model:<10}" + "".join(f"{column:>14}" for column in columns)

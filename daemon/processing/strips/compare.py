@@ -1,0 +1,298 @@
+"""`swath strips`: how far strips are from each other, what it looks like, and what specifications say to it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from swath.calib.flight import FlightError
+from swath.calib.strips.cells import StripRules
+from swath.calib.strips.differences import Numbers, PairReport, StripReport, report_of
+from swath.calib.strips.signatures import Signatures, record_of, signatures
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration.returns import read_flight, smoothed_prior
+from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
+from swath.daemon.processing.flights.read import Wish, verdicts_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.strip_agreement import Agreement, difference_of
+from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.mapping.frame import MappingError
+from swath.georef.strips import StripError
+
+Told = Callable[[str, int, int], None]
+
+RECORD = "strips.json"
+LOG_SUFFIX = ".mcap"
+POINT_SUFFIXES = (".las", ".laz")
+
+
+@dataclass(frozen=True)
+class StripsWish:
+    """What the command line asks for.
+
+    Attributes:
+        paths: logs, or LAS or LAZ files, or folders of either.
+        before: likewise, of the same strips before; none: there is nothing to compare with.
+        logs: how logs are read; its logs are not looked at.
+        rules: of the comparison.
+        output: folder for pictures and record; None: none.
+        level: a USGS level that must be kept; None: none must.
+    """
+
+    paths: Sequence[Path]
+    logs: Wish
+    before: Sequence[Path] = ()
+    rules: StripRules = field(default_factory=StripRules)
+    output: Path | None = None
+    level: str | None = None
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The record for scripts, lines for people, and what is wrong: nothing, or a line."""
+
+    record: dict[str, Any]
+    lines: list[str]
+    problem: str
+
+
+def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
+    """Compare.
+
+    Args:
+        wish: what is asked for.
+        folder: for returns of logs, while it goes on.
+        told: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    with told_in_a_line(folder, FlightError, StripError, MappingError):
+        now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
+        then = _judged(_read(wish.before, wish, folder / "before", told), wish, told) if wish.before else None
+    record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
+    record["verdict"] = verdict_entry(now.strips.carried, accepted=wish.logs.accept_verdict)
+    pictures = _draw(wish, now, then)
+    if wish.output is not None:
+        record["pictures"] = [str(path) for path in pictures]
+        path = wish.output / RECORD
+        path.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    lines = [*first_lines(record["verdict"]), *now.lines(then), *map(str, pictures)]
+    return Compared(record, lines, "; ".join(filter(None, (refusal(record["verdict"]), now.problem(wish.level)))))
+
+
+def rules_of(most_cells: int, cell_m: float | None) -> StripRules:
+    """Return rules for so many cells of a side in metres; None: the side goes by the strips' density."""
+    return StripRules(cell_m=cell_m, most_cells=most_cells)
+
+
+def is_of_logs(paths: Sequence[Path]) -> bool:
+    """Whether paths are logs rather than points; UserError where they are neither, or both.
+
+    A folder with points in it is one of points.
+    """
+    kinds = {_kind(path) for path in paths}
+    if len(kinds) > 1:
+        raise UserError("logs and points together; want logs, or LAS or LAZ files", ExitCode.USAGE)
+    return kinds == {"logs"}
+
+
+def _kind(path: Path) -> str:
+    if path.is_dir():
+        inside = {one.suffix.lower() for one in path.rglob("*") if one.is_file()}
+        if inside & set(POINT_SUFFIXES):
+            return "points"
+        if LOG_SUFFIX in inside:
+            return "logs"
+        raise UserError(f"{path}: holds neither LAS or LAZ files nor logs", ExitCode.IO)
+    if not path.exists():
+        raise UserError(f"{path}: no such file or folder", ExitCode.IO)
+    return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
+
+
+def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> Strips:
+    if not is_of_logs(paths):
+        strips = strips_of_files(paths, wish.rules, told, wish.logs.trajectory.week)
+        strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
+        return strips
+    folder.mkdir(parents=True, exist_ok=True)
+    kept = read_flight(replace(wish.logs, logs=paths), folder, told)
+    refuse_installations(kept.logged)
+    mapping = kept.logged[0].setup.mapping
+    carried = verdicts_of(kept.logged)
+    with told_before(carried, FlightError):
+        strips = strips_of_flight(", ".join(map(str, paths)), kept.flight, wish.rules, mapping, smoothed_prior(kept))
+    strips.notes.extend(kept.notes)
+    strips.carried.extend(carried)
+    return strips
+
+
+def refuse_installations(logged: Sequence[Any]) -> None:
+    """UserError where flights as logged are not of one installation."""
+    places = [flight.setup.config.profile.installation for flight in logged]
+    for flight, place in zip(logged, places, strict=True):
+        if place != places[0]:
+            raise UserError(
+                f'{flight.log}: is of installation "{place}", {logged[0].log} of "{places[0]}"; want logs of one'
+            )
+
+
+# ---------------------------------------------------------------------- what is made of it
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Strips, their differences, what these look like, and what they keep."""
+
+    strips: Strips
+    report: StripReport
+    signatures: Signatures | None
+
+    @property
+    def agreement(self) -> Agreement:
+        """Return how well strips agree, by which they are judged."""
+        return self.strips.look.agreement
+
+    def wrong(self) -> list[str]:
+        """Return sentences of effects that are in the strips and matter, or that strips are too far apart to tell."""
+        found = () if self.signatures is None else self.signatures.found
+        return list(dict.fromkeys(one.words for one in found if one.level in ("significant", "rough")))
+
+    def problem(self, level: str | None) -> str:
+        """What is wrong, a line; empty: nothing."""
+        wrong = self.wrong()
+        if self.agreement.no_verdict:
+            wrong.append(self.agreement.no_verdict)
+        elif level is not None and (broken := self.agreement.broken(level)):
+            wrong.append(f"{level} is not kept, for its limit of {', '.join(broken)}")
+        return f"{self.strips.what}: {'; '.join(wrong)}" if wrong else ""
+
+    def _rows(self) -> dict[tuple[str, str], dict[str, Any]]:
+        """Return the rows of the overlap by names of strips."""
+        names = self.strips.look.names
+        return {(names[row["first"]], names[row["second"]]): row for row in self.strips.look.overlap.rows}
+
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
+        repeats = {self.strips.look.names[number]: one for number, one in self.agreement.repeatability_m.items()}
+        densities = dict(zip(self.strips.look.names, self.strips.look.cells.single_densities(), strict=False))
+        return {
+            "input": self.strips.what,
+            "strips": [
+                {
+                    "name": name,
+                    "roughness_m": self.report.roughness_m.get(name),
+                    "repeatability_m": repeats.get(name),
+                    "single_returns_m2": densities.get(name) or None,
+                }
+                for name in self.report.names
+            ],
+            "cell_m": self.report.cell_m,
+            "pairs": [
+                {"first": first, "second": second}
+                | _to_plane(to_plane.get((first, second)))
+                | {"gridded": _gridded(heights.get((first, second)))}
+                for first, second in sorted({*heights, *to_plane}, key=self._place)
+            ],
+            "all": _to_plane(self.report.all) | {"gridded": self.agreement.numbers},
+            "refused": dict(self.report.refused),
+            "signatures": None if self.signatures is None else record_of(self.signatures),
+            "quality": self.agreement.record(),
+            "notes": self.strips.notes,
+        }
+
+    def _place(self, pair: tuple[str, str]) -> tuple[int, int]:
+        names = self.strips.look.names
+        return names.index(pair[0]), names.index(pair[1])
+
+    def lines(self, before: Judgement | None) -> list[str]:
+        """For people."""
+        lines = [_row("strips", "cells", "mean", "RMSDz", "95 %", "max", "to plane", "RMS", "noise") + "  cm"]
+        heights, to_plane = self._rows(), {(pair.first, pair.second): pair for pair in self.report.pairs}
+        for pair in sorted({*heights, *to_plane}, key=self._place):
+            lines.append(_line(f"{pair[0]} − {pair[1]}", heights.get(pair), to_plane.get(pair)))
+        lines.append(_line("all", self.agreement.numbers, self.report.all))
+        lines.append(self.agreement.measure)
+        lines.append("to plane: single returns above the other strip's plane, RMS along its normal, all slopes to 45°")
+        lines += self.signatures.lines if self.signatures else []
+        lines += self.agreement.verdicts()
+        if before is not None and (was := before.agreement.numbers) and (now := self.agreement.numbers):
+            told = [f"RMSDz {100 * one['rms_m']:.1f} cm, largest {100 * one['max_m']:.1f} cm" for one in (was, now)]
+            lines.append(f"before: {told[0]}; now: {told[1]}")
+        return lines + self.strips.notes
+
+
+def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:
+    told(f"comparing {strips.what}", 0, 1)
+    report = report_of(strips.look.names, strips.gathered, wish.rules, strips.cell_m)
+    found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
+    return Judgement(strips, report, found)
+
+
+def _draw(wish: StripsWish, now: Judgement, then: Judgement | None) -> list[Path]:
+    if wish.output is None:
+        return []
+    from swath.daemon.processing.quicklook.maps import draw_differences
+
+    made = []
+    try:
+        wish.output.mkdir(parents=True, exist_ok=True)
+        for name, one in (("differences.png", now), ("differences_before.png", then)):
+            if one is not None:
+                draw_differences(one.strips.look, wish.output / name)
+                made.append(wish.output / name)
+    except OSError as error:
+        raise UserError(f"{wish.output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+    return made
+
+
+def _row(name: str, *values: str) -> str:
+    return f"{name:<14}" + "".join(f"{value:>9}" for value in values)
+
+
+def _line(name: str, heights: dict[str, Any] | None, to_plane: PairReport | None) -> str:
+    """Return a row of the table, centimetres: of heights, then of returns above planes."""
+    values = ["–"] * 5
+    if heights is not None:
+        told = (heights["mean_m"], heights["rms_m"], heights["p95_m"], heights["max_m"])
+        values = [f"{heights['cells']:,}", *(f"{100.0 * value:.1f}" for value in told)]
+    if to_plane is None or not to_plane.distance.count:
+        return _row(name, *values, "–", "–", "–")
+    distance = to_plane.distance
+    more = (f"{100.0 * value:.1f}" for value in (distance.rms_m, to_plane.noise_m))
+    return _row(name, *values, f"{distance.count:,}", *more)
+
+
+def _to_plane(pair: PairReport | None) -> dict[str, Any]:
+    """Return point to plane for JSON; ``dz`` is its vertical part, on slopes below 10°."""
+    if pair is None:
+        return dict.fromkeys(("point_to_plane", "dz", "noise_m", "systematic_m"))
+    return {
+        "point_to_plane": _values(pair.distance),
+        "dz": _values(pair.height),
+        "noise_m": _number(pair.noise_m),
+        "systematic_m": _number(pair.systematic_m),
+    }
+
+
+def _gridded(row: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Return the heights of planes for JSON, the measure that is judged."""
+    if row is None:
+        return None
+    kept = {key: value for key, value in row.items() if key not in ("first", "second")}
+    return kept | {"std_m": difference_of(row).std_m}
+
+
+def _values(numbers: Numbers) -> dict[str, Any]:
+    names = ("count", "mean_m", "std_m", "rms_m", "max_m", "median_m", "p95_m")
+    return {name: _number(getattr(numbers, name)) for name in names}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

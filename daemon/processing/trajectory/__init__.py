@@ -1,0 +1,1 @@
+"""`swath trajectory`: files, figures, pages, verdict."""

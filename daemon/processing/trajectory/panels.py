@@ -1,0 +1,193 @@
+"""Panels over one axis of time, and what they show a flight from."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from PIL import Image
+
+from swath.daemon.processing.quicklook.maps import INK, MUTED
+from swath.daemon.processing.trajectory.series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
+from swath.georef.navigation.inputs import Solution
+from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS
+
+FloatArray = NDArray[np.float64]
+
+COLOURS_OF_PICTURE = 128
+OUTAGE, BRIDGED = "#d9dcd7", "#f3b8a8"
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """Of a picture: its width, its panels' height, and how fine it is."""
+
+    width_in: float
+    panel_in: float
+    dpi: int
+    ticks: int
+
+
+WIDE, NARROW = Format(10.4, 1.45, 112, 8), Format(4.1, 1.3, 180, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A flight with what several pictures need of it."""
+
+    flight: Flight
+    course: Course
+    separation: Separation | None
+
+    @cached_property
+    def outages_s(self) -> FloatArray:
+        """(k, 2) seconds from the first epoch."""
+        return (outages_of(self.flight) - self.flight.start_ns) / SECOND_NS
+
+    @cached_property
+    def bridged_s(self) -> FloatArray:
+        """(k, 2) seconds from the first epoch."""
+        return (bridged_spans(self.flight.best) - self.flight.start_ns) / SECOND_NS
+
+    @cached_property
+    def _bands(self) -> dict[tuple[int, str], FloatArray]:
+        return {}
+
+    def band(self, pixels: Pixels, solution: Solution, column: str) -> FloatArray:
+        """(2, m, …) of a solution's column; found once, drawn twice."""
+        key = id(solution), column
+        if key not in self._bands:
+            self._bands[key] = pixels.band(getattr(solution, column))
+        return self._bands[key]
+
+    @cached_property
+    def filter_pixels(self) -> Pixels:
+        """Of the filter's epochs."""
+        return Pixels(self.flight.forward.time_ns, self.flight.start_ns)
+
+    @cached_property
+    def node_pixels(self) -> Pixels:
+        """Of the nodes of the best solution."""
+        return Pixels(self.flight.best.node_time_ns, self.flight.start_ns)
+
+    def since_start_s(self, time_ns: Int64Array) -> FloatArray:
+        """(n,) of GPS times."""
+        seconds: FloatArray = (time_ns - self.flight.start_ns) / SECOND_NS
+        return seconds
+
+
+class Sheet:
+    """Panels one below the other over one axis of time."""
+
+    def __init__(self, drawn: Drawn, form: Format, words: Sequence[str], panel: float = 1.0) -> None:
+        self.drawn, self.form = drawn, form
+        count = len(words)
+        panel_in = panel * form.panel_in
+        gap_in, top_in, bottom_in = 0.33, 0.32, 0.48
+        height_in = top_in + bottom_in + count * panel_in + (count - 1) * gap_in
+        self.figure = Figure(figsize=(form.width_in, height_in), facecolor="white")
+        self.panels: list[Axes] = list(np.ravel(self.figure.subplots(count, 1, sharex=True, squeeze=False)))
+        self.figure.subplots_adjust(
+            left=0.6 / form.width_in,
+            right=1.0 - 0.12 / form.width_in,
+            top=1.0 - top_in / height_in,
+            bottom=bottom_in / height_in,
+            hspace=gap_in / panel_in,
+        )
+        duration_s = drawn.flight.duration_s
+        self.unit_s, unit = (
+            next(
+                (size_s, word)
+                for size_s, word in ((3600.0, "h"), (60.0, "min"), (1.0, "s"))
+                if duration_s >= 3 * size_s
+            )
+            if duration_s >= 3.0
+            else (1.0, "s")
+        )
+        self.panels[-1].set_xlabel(f"Time since the start ({unit})", fontsize=8.5, color=MUTED)
+        self.panels[-1].set_xlim(0.0, max(duration_s, 1e-3) / self.unit_s)
+        for axes, title in zip(self.panels, words, strict=True):
+            self._dress(axes, title)
+
+    def _dress(self, axes: Axes, title: str) -> None:
+        dress(axes)
+        axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
+        axes.xaxis.set_major_locator(MaxNLocator(self.form.ticks, steps=[1, 2, 5, 10]))
+        axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        for spans_s, colour in ((self.drawn.outages_s, OUTAGE), (self.drawn.bridged_s, BRIDGED)):
+            ends = spans_s / self.unit_s
+            if len(ends):
+                axes.broken_barh(
+                    list(zip(ends[:, 0], ends[:, 1] - ends[:, 0], strict=True)),
+                    (0.0, 1.0),
+                    transform=axes.get_xaxis_transform(),
+                    color=colour,
+                    lw=0.0,
+                    zorder=0.5,
+                )
+
+    def line(
+        self, axes: Axes, pixels: Pixels, band: FloatArray, colour: str, broken: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Of bands (2, m); ``broken`` (m − 1,): where it is besides."""
+        at_s, values = pixels.line(band, broken)
+        axes.plot(at_s / self.unit_s, values, color=colour, lw=0.9, solid_joinstyle="round")
+
+    def fill(self, axes: Axes, pixels: Pixels, low: FloatArray, high: FloatArray, colour: str) -> None:
+        """Between two lines (m,)."""
+        axes.fill_between(pixels.at_s / self.unit_s, low, high, color=colour, lw=0.0, alpha=0.18)
+
+    def legend(self, axes: Axes, handles: Sequence[tuple[str, str]]) -> None:
+        """Colours and words, at the right of a panel's title."""
+        lines = [Line2D([], [], color=colour, lw=1.8, label=word) for colour, word in handles]
+        self.legend_of(axes, lines)
+
+    def legend_of(self, axes: Axes, handles: Sequence[Any]) -> None:
+        """Any handles, likewise."""
+        axes.legend(
+            handles=list(handles),
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=len(handles),
+            frameon=False,
+            fontsize=8,
+            labelcolor=INK,
+            handlelength=1.0,
+            handletextpad=0.4,
+            columnspacing=1.0,
+            borderaxespad=0.1,
+        )
+
+    def picture(self) -> bytes:
+        """As PNG."""
+        return picture_of(self.figure, self.form)
+
+
+def dress(axes: Axes) -> None:
+    """A panel's colours."""
+    axes.tick_params(labelsize=8, colors=MUTED, length=3)
+    axes.spines[:].set_color("#b9bdb8")
+    axes.grid(color="#7c858c", lw=0.4, alpha=0.35)
+    axes.set_axisbelow(True)
+
+
+def picture_of(figure: Figure, form: Format) -> bytes:
+    """PNG of few colours: a third of the bytes, and no difference to the eye."""
+    figure.set_dpi(form.dpi)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    small = io.BytesIO()
+    image.quantize(COLOURS_OF_PICTURE, method=Image.Quantize.FASTOCTREE).save(small, format="png")
+    return small.getvalue()

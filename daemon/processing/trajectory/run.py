@@ -1,0 +1,192 @@
+"""`swath trajectory`: from logs to the files of one trajectory, its summary and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.ins_as_is import ins_as_is
+from swath.daemon.processing.navigation.inputs import Mark
+from swath.daemon.processing.navigation.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
+from swath.daemon.processing.refusals import refuse_no_name
+from swath.daemon.processing.trajectory.event_marks import EventTable, event_table
+from swath.daemon.processing.trajectory.files import (
+    TrajectoryFiles,
+    put_in_place,
+    remove,
+    write_aside,
+    write_trajectory,
+)
+from swath.daemon.processing.trajectory.summary import pages_of, summary_head, summary_of_run, write_json
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
+
+Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+Written = list[tuple[Path, Path]]
+AS_IS = "as-is"
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryWish:
+    """What the command line asks for.
+
+    Attributes:
+        logs, output: where from, where to.
+        navigate: how.
+        csv: a CSV file too.
+        events: event marks go there; None: nowhere.
+        page: the page of plots is made.
+        overwrite: files of an earlier run are replaced.
+    """
+
+    logs: Sequence[Path]
+    output: Path
+    navigate: NavigateWish = field(default_factory=NavigateWish)
+    csv: bool = False
+    events: Path | None = None
+    page: bool = True
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class TrajectoryReport:
+    """What was made: the summary's content, and where it is."""
+
+    record: dict[str, Any]
+    summary: Path
+    files: list[Path]
+
+
+def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
+    """Make the files.
+
+    Raises:
+        UserError: there is no trajectory, a line each; no file is left then.
+    """
+    with told_in_a_line(wish.output, TrajectoryError):
+        passed_over: list[str] = []
+        sessions = open_logs(wish.logs, passed_over)
+        for session in sessions:
+            refuse_no_name(session.session_id, session.parts[0].path)
+        holes = [f"passed over: {line}" for line in passed_over]
+        files = TrajectoryFiles.of_output(wish.output, sessions[0].session_id, csv=wish.csv)
+        _refuse_one_name(wish.events, files)
+        if not wish.overwrite:
+            files.refuse_existing(wish.events)
+        if wish.navigate.inputs.ins == AS_IS:
+            return _write_as_is(wish, files, sessions, holes)
+        flights = [navigate_session(session, wish.navigate, tell) for session in sessions]
+        flights.sort(key=lambda flight: int(flight.solutions()[0].time_ns[0]))  # the hosts' clocks may be wrong
+        flights[0].holes.extend(holes)
+        return _write(wish, files, flights, tell)
+
+
+def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell) -> TrajectoryReport:
+    tell("files", 0, 1)
+    trajectory = _joined(flights)
+    sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
+    written = write_trajectory(files, trajectory, sigma)
+    try:
+        events = _write_events(wish, flights, trajectory, written)
+        verdicts, figures = _write_pages(wish, files, flights, written)
+        record = summary_of_run(wish, flights, verdicts, figures, events)
+        record["files"] = [path.name for _, path in written]
+        written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
+    except BaseException:
+        remove(written)
+        raise
+    put_in_place(written)
+    tell("files", 1, 1)
+    return TrajectoryReport(record, files.summary, [path for _, path in written])
+
+
+def _write_as_is(
+    wish: TrajectoryWish, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
+) -> TrajectoryReport:
+    """The devices' own INS, without a page."""
+    if wish.events is not None:
+        raise UserError("--events: the marks are placed with a navigated trajectory; leave --ins as-is", ExitCode.USAGE)
+    read = [(session, ins_as_is(session, wish.navigate.inputs.config)) for session in sessions]
+    read.sort(key=lambda pair: pair[1].trajectory.span)  # the hosts' clocks may be wrong
+    sessions, found = [session for session, _ in read], [one for _, one in read]
+    _refuse_overlap([(session.parts[0].path, one.trajectory) for session, one in read])
+    trajectory = joined_trajectory([one.trajectory for one in found], found[0].trajectory.name)
+    record = summary_head(wish, AS_IS, sessions, [*(line for one in found for line in one.holes), *holes], [])
+    record["sessions"] = [
+        {"session": session.session_id, "ins": one.source, "solutions": dict(sorted(one.solutions.items()))}
+        for session, one in zip(sessions, found, strict=True)
+    ]
+    written = write_trajectory(files, trajectory, None)
+    record["files"] = [path.name for _, path in written]
+    try:
+        written.append((write_aside(files.summary, partial(write_json, record)), files.summary))
+    except BaseException:
+        remove(written)
+        raise
+    put_in_place(written)
+    return TrajectoryReport(record, files.summary, [path for _, path in written])
+
+
+def _joined(flights: Sequence[Navigated]) -> Trajectory:
+    """All sessions' trajectories as one; UserError where two are of one time."""
+    parts = [flight.trajectory(flight.session_id) for flight in flights]
+    _refuse_overlap([(flight.inputs.log, part) for flight, part in zip(flights, parts, strict=True)])
+    return joined_trajectory(parts, parts[0].name)
+
+
+def _refuse_overlap(parts: Sequence[tuple[Path, Trajectory]]) -> None:
+    for (first, one), (second, other) in pairwise(parts):
+        if other.span[0] <= one.span[1]:
+            raise UserError(
+                f"{second}: begins at {gps_text(other.span[0])}, before {first} ends at {gps_text(one.span[1])}: two "
+                "recordings of one time; navigate them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
+    """UserError where the marks would go into a file of the trajectory."""
+    if events is not None and events.resolve() in [path.resolve() for path in files.all()]:
+        raise UserError(f"--events {events}: is a file of the trajectory itself; want another name", ExitCode.USAGE)
+
+
+def _write_events(
+    wish: TrajectoryWish, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
+) -> EventTable | None:
+    marks: list[Mark] = [mark for flight in flights for mark in flight.inputs.marks]
+    if wish.events is None:
+        return event_table(marks, trajectory) if marks else None
+    table = event_table(marks, trajectory)
+    data = table.text.encode()
+
+    def write(stream: IO[bytes]) -> None:
+        stream.write(data)
+
+    written.append((write_aside(wish.events, write), wish.events))
+    return table
+
+
+def _write_pages(
+    wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
+) -> tuple[list[Any], list[Any]]:
+    """A page a leg; verdicts and figures of all legs, in order."""
+    verdicts: list[Any] = []
+    figures: list[Any] = []
+    for page in pages_of(flights):
+        path = files.page if not verdicts else files.page.with_stem(f"{files.page.stem}_{len(verdicts) + 1}")
+        if wish.page:
+            verdict, own, aside = page.write(path)
+            written.append((aside, path))
+        else:
+            verdict, own = page.judge()
+        verdicts.append(verdict)
+        figures.append(own)
+    return verdicts, figures

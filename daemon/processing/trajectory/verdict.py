@@ -1,0 +1,426 @@
+"""Whether a navigated flight may be used: a table of limits on its figures, and a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol
+
+from swath.daemon.processing.trajectory.figures import ANGLES, AXES_B, AXES_L, Figures, accuracy_words
+
+Measure = Callable[[Figures], Iterator[tuple[str, float | None]]]
+
+
+class Level(IntEnum):
+    """Of a reason, and of the whole."""
+
+    GOOD = 0
+    CARE = 1
+    UNUSABLE = 2
+
+    @property
+    def words(self) -> str:
+        """As the page says it."""
+        return ("good", "usable with care", "not to be used")[self]
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a flight is not simply good.
+
+    Attributes:
+        level: how bad it is.
+        name: of the rule or of the finding.
+        what: what is the matter, with the figure.
+        change: what to do about it.
+        excess: value over its limit, to put the worst first.
+    """
+
+    level: Level
+    name: str
+    what: str
+    change: str
+    excess: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One limit.
+
+    Attributes:
+        name: short.
+        measure: figures → (of what, value); None is not judged.
+        care, unusable: a value above is a reason of that level; None: never.
+        what: a sentence of ``{value}`` and ``{of}``.
+        change: what to do.
+        least: the limits are from below.
+    """
+
+    name: str
+    measure: Measure
+    care: float | None
+    unusable: float | None
+    what: str
+    change: str
+    least: bool = False
+
+    def judged(self, figures: Figures) -> Iterator[Reason]:
+        """Reasons that its measure gives, one for each thing measured."""
+        for of, value in self.measure(figures):
+            level, limit = self._level(value)
+            if value is not None and level > Level.GOOD and limit is not None:
+                excess = (limit / value if value else float("inf")) if self.least else value / max(limit, 1e-12)
+                yield Reason(level, self.name, self.what.format(value=value, of=of), self.change, excess)
+
+    def _level(self, value: float | None) -> tuple[Level, float | None]:
+        for level, limit in ((Level.UNUSABLE, self.unusable), (Level.CARE, self.care)):
+            if value is not None and limit is not None and ((value < limit) if self.least else not value <= limit):
+                return level, limit
+        return Level.GOOD, None
+
+
+class Found(Protocol):
+    """A finding of `swath.georef.navigation.diagnosis.diagnose`."""
+
+    @property
+    def code(self) -> str: ...
+
+    @property
+    def severity(self) -> str: ...
+
+    @property
+    def text(self) -> str: ...
+
+
+def _one(*keys: str) -> Measure:
+    """The figure at a path of keys."""
+
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        value: Any = figures
+        for key in keys:
+            value = None if value is None else value.get(key)
+        yield "", value
+
+    return measure
+
+
+def _largest(group: str, *keys: str) -> Measure:
+    """The largest of some figures of a group; not judged where none is known."""
+
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        known = [(figures[group][key], key) for key in keys if figures[group][key] is not None]
+        if known:
+            value, key = max(known)
+            yield key.partition("_")[0], value
+
+    return measure
+
+
+def _share(*fates: str) -> Measure:
+    """Of observations of each kind, how many met one of these fates."""
+
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        for kind, row in figures["observations"].items():
+            yield kind.replace("_", " "), sum(row[fate] for fate in fates) / max(row["seen"], 1)
+
+    return measure
+
+
+def _of_kinds(key: str, *, inverse: bool = False) -> Measure:
+    """A figure of each kind of observation."""
+
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        for kind, row in figures["observations"].items():
+            value = row[key]
+            yield kind.replace("_", " "), (1 / max(value, 1e-3) if inverse and value is not None else value)
+
+    return measure
+
+
+def _noise_found(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    """Factors on sigmas that the flight asked for."""
+    yield from figures["noise_found"].items()
+
+
+def _sensor(*names: str) -> Measure:
+    """Largest estimate of an axis, in sigmas that the configuration gives."""
+
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        for name in names:
+            for axis, row in figures["sensors"].get(name, {}).items():
+                yield f"{name.replace('_', ' ')} {axis}", row["largest_over_expected"]
+
+    return measure
+
+
+def _separations(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    yield from (figures["separation"] or {}).items()
+
+
+def _worst_separations(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    for name, worst in (figures["separation_worst"] or {}).items():
+        yield f"{name} {worst['at_s']:.0f} s after the start", worst["value"]
+
+
+def _arm(key: str) -> Measure:
+    def measure(figures: Figures) -> Iterator[tuple[str, float | None]]:
+        if figures["lever_arm"] is not None:
+            yield from zip(AXES_B, figures["lever_arm"][key], strict=True)
+
+    return measure
+
+
+def _offset_ms(figures: Figures) -> Iterator[tuple[str, float | None]]:
+    found = figures["time_offset"]
+    if found is not None and found["significant"]:
+        yield ("early" if found["estimate_s"] > 0 else "late"), abs(1e3 * found["estimate_s"])
+
+
+NOISE = "the noise in [imu.NAME.noise] (grade, or its single keys)"
+RULES: tuple[Rule, ...] = (
+    Rule(
+        "not finite",
+        _one("not_finite"),
+        0,
+        0,
+        "{value:.0f} epochs are not numbers",
+        "look for damage in the log with swath info; navigate without the source that breaks off",
+    ),
+    Rule(
+        "missing",
+        _one("missing_s"),
+        0.5,
+        None,
+        "{value:.1f} s of the log's inertial samples have no trajectory",
+        "the holes below say from when to when and why; navigate anew when their cause is mended",
+    ),
+    Rule(
+        "missing share",
+        _one("missing_share"),
+        None,
+        0.5,
+        "{value:.0%} of the log's inertial samples have no trajectory",
+        "the holes below say from when to when and why; navigate anew when their cause is mended",
+    ),
+    Rule(
+        "positions used",
+        _one("positions", "used"),
+        60,
+        10,
+        "only {value:.0f} positions were used",
+        "give positions that cover the flight (--gnss), or look below for why they were rejected",
+        least=True,
+    ),
+    Rule(
+        "position sigma",
+        _largest("sigma_p95", *(f"{axis}_m" for axis in AXES_L)),
+        0.15,
+        3.0,
+        "5 % of the flight have a position sigma ({of}) above {value:.2f} m",
+        "give post-processed positions (--gnss), or shorten the outages",
+    ),
+    Rule(
+        "tilt sigma",
+        _largest("sigma_p95", *(f"{angle}_deg" for angle in ANGLES[:2])),
+        0.02,
+        0.5,
+        "5 % of the flight have a {of} sigma above {value:.3f}°",
+        f"check {NOISE} against the data sheet; fly turns before and after the lines",
+    ),
+    Rule(
+        "heading sigma",
+        _one("sigma_p95", "heading_deg"),
+        0.05,
+        2.0,
+        "5 % of the flight have a heading sigma above {value:.3f}°",
+        "fly turns or S-curves before and after the lines, or use a second antenna",
+    ),
+    Rule(
+        "outage",
+        _one("positions", "longest_outage_s"),
+        30.0,
+        600.0,
+        "{value:.0f} s passed without a position that could be used",
+        "give post-processed positions (--gnss); do not use lines flown meanwhile unless their sigma suits",
+    ),
+    Rule(
+        "rejected",
+        _share("rejected"),
+        0.02,
+        0.25,
+        "{value:.1%} of the {of} observations were rejected",
+        "look when it happens; check lever_arm_m, the time source, and the receiver's sigmas",
+    ),
+    Rule(
+        "inflated",
+        _share("inflated", "reacquired"),
+        0.05,
+        0.5,
+        "{value:.1%} of the {of} observations were beyond the gate and taken with a larger sigma",
+        "the receiver's sigmas are too small, or the lever arm or the time of one sensor is wrong",
+    ),
+    Rule(
+        "unusable",
+        _share("unusable"),
+        0.02,
+        0.9,
+        "{value:.1%} of the {of} observations could not be used (not finite, or no sigma)",
+        "let the receiver send sigmas with each solution",
+    ),
+    Rule(
+        "innovations large",
+        _of_kinds("sigma_factor"),
+        1.5,
+        4.0,
+        "innovations of {of} are {value:.1f} times as large as their sigmas say",
+        f"check lever_arm_m, rotation_b_imu, the time source and {NOISE}",
+    ),
+    Rule(
+        "innovations small",
+        _of_kinds("sigma_factor", inverse=True),
+        5.0,
+        None,
+        "innovations of {of} are {value:.1f} times smaller than their sigmas say: sigmas here are too careful",
+        f"check {NOISE}",
+    ),
+    Rule(
+        "noise found",
+        _noise_found,
+        5.0,
+        None,
+        "errors of {of} are {value:.1f} times what the receiver says, or what is assumed of it; they were taken so",
+        "check lever_arm_m and the time source: a fault there looks like a receiver's noise",
+    ),
+    Rule(
+        "innovations correlated",
+        _of_kinds("correlation"),
+        0.5,
+        None,
+        "innovations of {of} are correlated from one to the next ({value:.2f})",
+        "their errors change slowly: sigmas of the trajectory may be too small unless that is in the noise model",
+    ),
+    Rule(
+        "separation",
+        _separations,
+        2.0,
+        5.0,
+        "filter and smoother differ in {of} by {value:.1f} times what their sigmas say",
+        f"check {NOISE}; a disturbance in the middle of the flight shows in the separation's plot",
+    ),
+    Rule(
+        "separation at worst",
+        _worst_separations,
+        8.0,
+        None,
+        "filter and smoother differ in {of} by {value:.0f} times what their sigmas say, over 30 s",
+        "do not use lines flown then, or leave out the positions of that time (--gnss): a wrong fix looks like this",
+    ),
+    Rule(
+        "bridged share",
+        _one("bridged", "share"),
+        0.001,
+        0.05,
+        "{value:.2%} of the inertial samples are missing and were made up",
+        "look with swath info why samples are missing: bus load, wiring, a host too busy",
+    ),
+    Rule(
+        "bridged run",
+        _one("bridged", "longest_s"),
+        1.0,
+        30.0,
+        "inertial samples are missing for {value:.1f} s on end",
+        "do not use lines flown meanwhile; look with swath info why samples are missing",
+    ),
+    Rule(
+        "bias",
+        _sensor("gyro_bias", "accel_bias"),
+        4.0,
+        20.0,
+        "{of} is {value:.1f} times what the noise lets expect",
+        f"check {NOISE}, rotation_b_imu and the units of the samples",
+    ),
+    Rule(
+        "scale",
+        _sensor("gyro_scale", "accel_scale", "gyro_misalignment", "accel_misalignment"),
+        4.0,
+        20.0,
+        "{of} is {value:.1f} times what the noise lets expect",
+        f"check {NOISE} and the units of the samples",
+    ),
+    Rule(
+        "lever arm moved",
+        _arm("moved_m"),
+        0.05,
+        1.0,
+        "the antenna was found {value:.2f} m from where lever_arm_m has it ({of})",
+        "measure the lever arm again, or enter the estimate below and navigate once more",
+    ),
+    Rule(
+        "lever arm unseen",
+        _arm("sigma_over_prior"),
+        0.5,
+        None,
+        "lever arm {of} can hardly be told from this flight (its sigma is {value:.0%} of what it was before)",
+        "measure it and do not estimate it; the vertical one shows in steep turns only",
+    ),
+    Rule(
+        "time offset",
+        _offset_ms,
+        2.0,
+        None,
+        "GNSS stamps are {value:.1f} ms {of} against the inertial unit's; the trajectory is corrected for it",
+        "correct the time where it comes from: pps, names_edge, stamp, or the device's delay",
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The judgement.
+
+    Attributes:
+        level: the worst of the reasons.
+        sentence: it in words.
+        reasons: the worst first.
+    """
+
+    level: Level
+    sentence: str
+    reasons: tuple[Reason, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "level": self.level.name.lower(),
+            "sentence": self.sentence,
+            "reasons": [
+                {"level": reason.level.name.lower(), "name": reason.name, "what": reason.what, "change": reason.change}
+                for reason in self.reasons
+            ],
+        }
+
+
+def judge(figures: Figures, findings: Iterable[Found] = ()) -> Verdict:
+    """The verdict on figures; what the diagnosis found are reasons too."""
+    reasons = [reason for rule in RULES for reason in rule.judged(figures)]
+    reasons += [reason_of(finding) for finding in findings]
+    reasons.sort(key=lambda reason: (-reason.level, -reason.excess))
+    level = max((reason.level for reason in reasons), default=Level.GOOD)
+    return Verdict(level, _sentence(level, figures, reasons), tuple(reasons))
+
+
+def reason_of(finding: Found) -> Reason:
+    """A finding's, which says in one sentence what is the matter and what to change."""
+    level = Level.UNUSABLE if finding.severity == "error" else Level.CARE
+    return Reason(level, finding.code, finding.text.rstrip("."), "", float("inf"))
+
+
+def _sentence(level: Level, figures: Figures, reasons: list[Reason]) -> str:
+    word = level.words[0].upper() + level.words[1:]
+    if level is Level.GOOD:
+        return f"{word}: {accuracy_words(figures)}."
+    told = [reason.what for reason in reasons if reason.level is level]
+    more = len(reasons) - 1
+    tail = f"; {more} more {'reason' if more == 1 else 'reasons'}" if more else ""
+    return f"{word}: {told[0]}{tail}."

@@ -1,0 +1,327 @@
+"""`swath validate`: a calibration against logs, control and its own history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from swath.calib.adjust import adjust
+from swath.calib.control.points import ControlError, control_planes
+from swath.calib.equations.normals import NormalError
+from swath.calib.equations.trajectory_prior import TrajectoryPrior
+from swath.calib.features import ControlPoint, Features
+from swath.calib.flight import Flight, FlightError
+from swath.calib.parameters import Wish as Model
+from swath.calib.plane_settings import PlaneError
+from swath.calib.planes.search import find_planes
+from swath.calib.record.record import Document
+from swath.calib.validation.history import History, HistoryError, history
+from swath.calib.validation.methods import (
+    SIGMAS_DEG,
+    SIGMAS_M,
+    Asked,
+    Method,
+    Validation,
+    same_logs,
+    validate,
+    with_sigmas,
+)
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.processing.calibration.inputs import control_of
+from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, replaced
+from swath.daemon.processing.calibration.run import PLANES, prior_of
+from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
+from swath.daemon.processing.flights.read import Wish, verdicts_of
+from swath.daemon.processing.georeferencing.sidecar import sha256_of
+from swath.daemon.processing.json_values import finite
+from swath.daemon.processing.strips.compare import refuse_installations
+from swath.daemon.processing.trajectory.files import write_whole
+from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.validation.record import record_files, records_of
+from swath.daemon.text_files import text_of
+from swath.georef.mapping.frame import MappingError
+from swath.georef.scanner.calibration import Calibration, CalibrationError, read_calibration
+from swath.georef.strips import StripError
+from swath.georef.text_encoding import decoded
+
+Told = Callable[[str, int, int], None]
+RECORD, PICTURE = "validation.json", "history.png"
+REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, CalibrationError, ControlError)
+
+
+@dataclass(frozen=True)
+class ValidateWish:
+    """What the command line asks for.
+
+    Attributes:
+        calibrations: files to be validated, one a scanner.
+        logs: what is read and how; its calibrations are those.
+        control: CSV of surveyed points; None: none.
+        histories: calibration files, or folders of them.
+        anew: parameters are estimated anew from the logs, and compared.
+        output: folder for what was found, the picture, and records anew; None: none.
+        record: record of a calibration, or a folder of them, that shall tell of this; None: beside the files.
+    """
+
+    calibrations: Sequence[Path]
+    logs: Wish
+    control: Path | None = None
+    histories: Sequence[Path] = ()
+    anew: bool = False
+    output: Path | None = None
+    record: Path | None = None
+
+
+@dataclass(frozen=True)
+class Validated:
+    """The record for scripts, lines for people, and what is wrong: nothing, or a line."""
+
+    record: dict[str, Any]
+    lines: list[str]
+    problem: str
+
+
+@dataclass
+class _Found:
+    calibrations: dict[str, Calibration]
+    validation: Validation | None = None
+    histories: tuple[History, ...] = ()
+    logs: list[tuple[str, str]] = field(default_factory=list)
+    documents: Mapping[str, Document] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    carried: list[Carried] = field(default_factory=list)
+
+
+def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
+    """Validate.
+
+    Args:
+        wish: what is asked for.
+        folder: for returns, while it goes on.
+        told: is told how far it is.
+
+    Raises:
+        UserError: it cannot be, one line.
+    """
+    with told_in_a_line(folder, *REFUSED):
+        calibrations = [read_file(path) for path in wish.calibrations]
+        found = _Found({one.scanner: one for one in calibrations})
+        if wish.histories:
+            found.histories = _histories(wish.histories, calibrations)
+        if wish.logs.logs:
+            if wish.output is not None:
+                recorded = records_of(list(zip(wish.calibrations, calibrations, strict=True)), wish.record)
+                found.documents, found.notes = recorded.documents, list(recorded.notes)
+            _against_logs(wish, found, folder, told)
+    return _written(wish, found)
+
+
+def read_file(path: Path) -> Calibration:
+    """A calibration file; UserError where it cannot be read."""
+    try:
+        return read_calibration(text_of(path, "a calibration file"), str(path))
+    except CalibrationError as error:
+        raise UserError(str(error), ExitCode.USAGE) from error
+
+
+def _histories(paths: Sequence[Path], validated: Sequence[Calibration]) -> tuple[History, ...]:
+    """Of the scanners and installations of those that are validated."""
+    files = [one for path in paths for one in (sorted(path.rglob("*.toml")) if path.is_dir() else [path])]
+    entries = [entry for path in files if (entry := _entry(path, paths)) is not None]
+    read = {one.id: one for one in [*entries, *validated]}
+    wanted = {(one.scanner, one.header.get("installation")) for one in validated}
+    own = [one for one in read.values() if (one.scanner, one.header.get("installation")) in wanted]
+    return history(own)
+
+
+def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
+    """A calibration; of a folder's files those that are none are passed over, as configurations are TOML too."""
+    if path in named or "[calibration]" in decoded(path.read_bytes(), "replace"):
+        return read_file(path)
+    return None
+
+
+def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -> None:
+    kept = read_flight(wish.logs, folder, told)
+    refuse_installations(kept.logged)
+    found.carried += verdicts_of(kept.logged)
+    with told_before(found.carried, *REFUSED):
+        _against_flight(wish, found, kept, folder, told)
+
+
+def _against_flight(wish: ValidateWish, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
+    _refuse_others(wish, found, kept)
+    flight = kept.flight
+    points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])
+    named = sorted(found.calibrations)
+    found.notes += _assumed(kept)
+    _along(kept, found)
+    told("planes", 0, 1)
+    planes = find_planes(flight)
+    if not planes.planes:
+        raise UserError(f"{wish.logs.logs[0]}: no planes that two strips see; a validation wants strips that overlap")
+    anew, why_not = _anew(wish, found, kept, points or (), folder, told) if wish.anew else (None, "")
+    told("tests", 0, 1)
+    asked = Asked(points, anew, why_not, named)
+    validation = validate(flight, planes, found.calibrations, asked, _prior(kept))
+    paths = [part.path for logged in kept.logged for part in logged.session.parts]
+    found.logs = [(path.name, sha256_of(path)) for path in paths]
+    dependent = tuple(line for one in found.calibrations.values() for line in same_logs(one, found.logs))
+    found.validation = replace(validation, dependent=dependent)
+    found.notes += [*kept.notes, *notes]
+
+
+def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
+    """UserError where the logs are not of the calibrations' scanners, or are one strip; what is odd is noted."""
+    scanners = {head.name for head in kept.flight.heads}
+    log = kept.logged[0].log
+    for name, calibration in found.calibrations.items():
+        if name not in scanners:
+            raise UserError(f"{log}: has no scanner {name}, whose calibration {calibration.id} is; {sorted(scanners)}")
+        made, flown = calibration.header.get("installation", ""), kept.logged[0].setup.config.profile.installation
+        if made and flown and made != flown:
+            found.notes.append(f'{log}: is of installation "{flown}", calibration {calibration.id} of "{made}"')
+    if len({(swath.flown, swath.strip) for swath in kept.flight.swaths}) < 2:
+        raise UserError(f"{log}: one strip only; a validation wants at least two strips that overlap")
+
+
+def _along(kept: KeptFlight, found: _Found) -> None:
+    """Take the log's own calibration of scanners whose none was named; noted."""
+    for head in kept.flight.heads:
+        if head.name not in found.calibrations:
+            found.calibrations[head.name] = head.start
+            note = f"{kept.logged[0].log}: {head.name}: no calibration named; validated along with {head.start.id}"
+            found.notes.append(note)
+
+
+def _prior(kept: KeptFlight) -> TrajectoryPrior | None:
+    """Return the trajectory's errors as navigation knows them; None: a trajectory was given, and has sigmas at most."""
+    navigated = [flight.navigated for flight in kept.logged]
+    if any(one is None or len(one.legs) != 1 for one in navigated):
+        return None
+    return prior_of(kept)
+
+
+def _assumed(kept: KeptFlight) -> list[str]:
+    """Return a note for each trajectory that says no sigmas."""
+    filled = with_sigmas(kept.flight).trajectories
+    return [
+        f"{flight.log}: its trajectory lacks sigmas; {100 * SIGMAS_M:g} cm of position, {roll:g}° of roll and pitch "
+        f"and {heading:g}° of heading are assumed where it does"
+        for flight, before, after in zip(kept.logged, kept.flight.trajectories, filled, strict=True)
+        for roll, _, heading in [SIGMAS_DEG]
+        if not (
+            np.array_equal(before.position_sigma_l, after.position_sigma_l)
+            and np.array_equal(before.attitude_sigma_rad, after.attitude_sigma_rad)
+        )
+    ]
+
+
+def _anew(
+    wish: ValidateWish, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
+) -> tuple[Mapping[str, Calibration], str]:
+    """Return parameters from these logs and control alone, as `swath calibrate` finds them, or none and why."""
+
+    def features(flight: Flight) -> Features:
+        told("parameters anew", 0, 1)
+        return Features.joined([find_planes(flight, PLANES), control_planes(flight, points)])
+
+    def found_anew(calibrations: Mapping[str, Calibration]) -> Features:
+        return features(replaced(kept.flight, calibrations, folder, "anew", wish.logs.workers))
+
+    start = found.calibrations
+    try:
+        adjusted = adjust(
+            kept.flight, features(kept.flight), Model("scanner"), prior_of(kept), start=start, rematch=found_anew
+        )
+    except (FlightError, NormalError) as error:
+        return {}, str(error)
+    if not adjusted.converged:
+        return {}, "the adjustment does not converge"
+    return adjusted.calibrations, ""
+
+
+# ---------------------------------------------------------------------- what is told
+
+
+def _written(wish: ValidateWish, found: _Found) -> Validated:
+    record: dict[str, Any] = {"calibrations": {name: one.id for name, one in found.calibrations.items()}}
+    record["verdict"] = verdict_entry(found.carried, accepted=wish.logs.accept_verdict)
+    lines: list[str] = first_lines(record["verdict"])
+    wrong: list[str] = list(filter(None, [refusal(record["verdict"])]))
+    if found.validation is not None:
+        record["validation"] = _record(found.validation)
+        lines += [method.sentence for method in found.validation.methods] + [found.validation.sentence]
+        wrong += [] if found.validation.holds else [found.validation.sentence]
+        found.notes += found.validation.dependent
+    if found.histories:
+        record["history"] = [one.record() for one in found.histories]
+        for one in found.histories:
+            lines += _table(one) + list(one.sentences)
+            wrong += list(one.sentences) if one.moved or not one.steps else []  # no step: nothing could be tested
+    record["notes"] = found.notes
+    record = finite(record)
+    if wish.output is not None:
+        lines += _write(wish.output, record, found)
+    return Validated(record, [*lines, *found.notes], "; ".join(wrong))
+
+
+def _record(validation: Validation) -> dict[str, Any]:
+    return {
+        "passed": validation.passed,
+        "sentence": validation.sentence,
+        "independent": not validation.dependent,
+        "undone": list(validation.undone),
+        "smallest_errors": [one.record() for one in validation.detectable],
+        "methods": [_method(method) for method in validation.methods],
+    }
+
+
+def _method(method: Method) -> dict[str, Any]:
+    numbers = method.numbers
+    names = ("count", "mean_m", "std_m", "rms_m", "max_m", "median_m", "p95_m")
+    tests = [
+        {"kind": one.kind, "value": one.value, "freedom": one.freedom, "p": one.p, "passed": one.passed}
+        for one in method.tests
+    ]
+    return {
+        "method": method.name,
+        "code": method.code,
+        "passed": method.passed,
+        "numbers": None if numbers is None else {name: getattr(numbers, name) for name in names},
+        "tests": tests,
+        "sentence": method.sentence,
+        "smallest_errors": [one.record() for one in method.detectable],
+    } | dict(method.more)
+
+
+def _table(one: History) -> list[str]:
+    lines = [f"{'calibration':<28}{'created':<22}" + "".join(f"{key:>20}" for key in ("omega °", "phi °", "kappa °"))]
+    for row in one.table():
+        values = [
+            f"{row[key]:.4f} ± {row[f'{key}_sigma']:.4f}" if row[f"{key}_sigma"] else f"{row[key]:.4f}"
+            for key in ("omega_deg", "phi_deg", "kappa_deg")
+        ]
+        lines.append(f"{row['id']:<28}{row['created']:<22}" + "".join(f"{value:>20}" for value in values))
+    return lines
+
+
+def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
+    files: dict[Path, bytes] = {}
+    if found.validation is not None and found.validation.passed is not None:
+        files |= record_files(output, found.documents, found.validation, found.logs)
+    if found.histories:
+        from swath.daemon.processing.calibration.report.history_picture import history_png
+
+        files[output / PICTURE] = history_png(found.histories)
+    files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
+    try:
+        write_whole(files)
+    except OSError as error:
+        raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
+    return [str(path) for path in files]

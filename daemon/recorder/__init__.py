@@ -1,0 +1,1 @@
+"""The recorder: from wires to the log."""

@@ -1,0 +1,350 @@
+"""The control socket: what an operator says to a running recorder, one line of JSON a connection.
+
+    {"command": "mark", "text": "line 4 start"}      {"command": "split"}
+
+The thread does a bounded amount of work in each turn and rests between two, so that neither a flood of connections nor
+peers that say nothing cost the recording anything. Only the recorder's own user and root can connect.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import logging
+import os
+import select
+import socket
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swath.daemon.errors import one_line
+from swath.daemon.log.directory import CONTROL_LINK
+from swath.daemon.log.events import Severity
+from swath.daemon.recorder.writer import Writing
+from swath.daemon.system import name_thread
+
+if TYPE_CHECKING:
+    from swath.daemon.recorder.run import Assembly
+
+log = logging.getLogger("swath")
+
+LINE_BYTES = 4096  # of a request, its end included
+NOTE_CHARACTERS = 500
+PEERS = 8  # at a time, and as many more wait in the kernel
+PEER_S = 2.0  # to say a line
+TURN_S = 0.05  # rest after each turn
+NOTES_AT_ONCE = 20
+NOTES_PER_S = 5.0
+SPLITS_AT_ONCE = 3  # a new part costs a few syncs
+SPLITS_PER_S = 1.0
+IGNORED_TOLD_S = 60.0
+LOOK_S = 1.0  # between two looks whether the socket is still where people look for it
+_SUN_PATH_BYTES = 107  # unix(7), without the end
+
+
+class BadRequestError(Exception):
+    """A line that is no request; one line: why."""
+
+
+def control_place(directory: Path) -> Path:
+    """Where the socket is made: in the unit's runtime directory, by hand in the log directory."""
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    return Path(runtime) / "control" if runtime else directory / CONTROL_LINK
+
+
+@contextlib.contextmanager
+def socket_address(place: Path) -> Iterator[str]:
+    """A path as an address, through a descriptor of its folder where it is longer than addresses may be."""
+    if len(os.fsencode(place)) <= _SUN_PATH_BYTES:
+        yield str(place)
+        return
+    folder = os.open(place.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{folder}/{place.name}"
+    finally:
+        os.close(folder)
+
+
+def listen(place: Path) -> socket.socket:
+    """A socket at a place that its owner alone can connect to. One that nobody listens at any more is replaced.
+
+    Raises:
+        OSError: somebody listens there, something else stands there, or the file system has no sockets.
+    """
+    folder = os.open(place.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two that start at once do not remove each other's
+        _make_way(place)
+        os.fchmod(sock.fileno(), 0o600)  # before bind, which makes the file with it: it never stands open
+        with socket_address(place) as address:
+            sock.bind(address)
+        sock.listen(PEERS)
+    except OSError:
+        sock.close()
+        raise
+    finally:
+        os.close(folder)
+    return sock
+
+
+def _make_way(place: Path) -> None:
+    """Remove what a recorder that is gone has left."""
+    try:
+        mode = os.lstat(place).st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISSOCK(mode):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+            with contextlib.suppress(ConnectionRefusedError), socket_address(place) as address:
+                probe.connect(address)
+                raise OSError(errno.EADDRINUSE, "another recorder listens there")
+    elif not stat.S_ISLNK(mode):
+        raise OSError(errno.EEXIST, "something else stands there")
+    place.unlink()
+
+
+def place_link(link: Path, target: Path) -> None:
+    """Let a name in the log directory lead to the socket; raises OSError."""
+    if link == target:
+        return
+    with contextlib.suppress(FileNotFoundError):
+        mode = os.lstat(link).st_mode
+        if not (stat.S_ISLNK(mode) or stat.S_ISSOCK(mode)):
+            raise OSError(errno.EEXIST, f"something else stands at {link}")
+    new = link.with_name(f"{link.name}.new")
+    new.unlink(missing_ok=True)
+    new.symlink_to(target)
+    new.replace(link)
+
+
+@dataclass(slots=True)
+class _Peer:
+    """A connection that has not said its line yet."""
+
+    sock: socket.socket
+    until_s: float
+    said: bytes = b""
+
+
+@dataclass(slots=True)
+class _Allowance:
+    """So many at once, and so many a second for long."""
+
+    most: float
+    per_s: float
+    left: float = field(init=False)
+    at_s: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self.left = self.most
+
+    def take(self) -> bool:
+        """Whether one more is allowed now."""
+        now_s = time.monotonic()
+        self.left = min(self.most, self.left + (now_s - self.at_s) * self.per_s)
+        self.at_s = now_s
+        if self.left < 1.0:
+            return False
+        self.left -= 1.0
+        return True
+
+
+class Control(threading.Thread):
+    """Listens to an operator for an `Assembly`; a defect here ends this thread and nothing else.
+
+    Attributes:
+        ignored: connections that did not bring a request: too long, too late, not understood.
+    """
+
+    def __init__(self, assembly: Assembly) -> None:
+        super().__init__(name="control", daemon=True)
+        directory = assembly.parts.directory
+        self.place = control_place(directory)
+        self.ignored = 0
+        self._link = directory / CONTROL_LINK
+        self._assembly = assembly
+        self._events = assembly.shared.events
+        self._end = threading.Event()
+        self._sock: socket.socket | None = None
+        self._inode: tuple[int, int] | None = None
+        self._peers: list[_Peer] = []
+        self._notes = _Allowance(NOTES_AT_ONCE, NOTES_PER_S)
+        self._splits = _Allowance(SPLITS_AT_ONCE, SPLITS_PER_S)
+        self._told_ignored = (0, 0.0)  # how many, CLOCK_MONOTONIC
+        self._look_s = 0.0  # CLOCK_MONOTONIC of the next look
+
+    # ------------------------------------------------------------------ its life
+
+    def open(self) -> None:
+        """Begin to listen; where that cannot be, an event says so and the recording goes on without."""
+        try:
+            self._listen()
+        except OSError as error:
+            text = f"no control socket at {self.place}: {error.strerror or error}; swath mark and split cannot be used"
+            self._events.post(Severity.WARNING, "recorder", "control_absent", text)
+        if self._sock is not None:
+            self.start()
+
+    def _listen(self) -> None:
+        self._sock = listen(self.place)
+        found = os.stat(self.place)
+        self._inode = found.st_dev, found.st_ino
+        place_link(self._link, self.place)
+
+    def _come_back(self, now_s: float) -> None:
+        """Listen anew where the socket was removed, and lead to it anew: with the log directory, when it is back."""
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
+        with contextlib.suppress(OSError):
+            if not os.path.lexists(self.place):
+                gone = self._sock
+                self._listen()
+                if gone is not None:
+                    gone.close()
+            elif not os.path.lexists(self._link):
+                place_link(self._link, self.place)
+
+    def close(self) -> None:
+        """Stop listening and leave nothing behind that others could take for a recorder."""
+        self._end.set()
+        if self._sock is not None:
+            self.join(1.0)
+            self._sock.close()
+        with contextlib.suppress(OSError):
+            found = os.lstat(self.place)
+            if (found.st_dev, found.st_ino) == self._inode:
+                self.place.unlink()
+        with contextlib.suppress(OSError):
+            if self._link.is_symlink() and self._link.readlink() == self.place and self._inode is not None:
+                self._link.unlink()
+
+    def run(self) -> None:
+        """Turn by turn until the end."""
+        name_thread("control")
+        try:
+            while not self._end.is_set():
+                self._turn()
+                self._end.wait(TURN_S)
+        except Exception as error:
+            text = f"the control socket failed, the recording goes on: {type(error).__name__}: {error}"
+            self._events.post(Severity.ERROR, "recorder", "control_failed", text)
+        finally:
+            for peer in self._peers:
+                peer.sock.close()
+            if self._sock is not None:  # who connects is refused at once, and does not wait for an answer
+                self._sock.close()
+
+    # ------------------------------------------------------------------ one turn
+
+    def _turn(self) -> None:
+        """Wait, then at most `PEERS` accepted and one read of each."""
+        assert self._sock is not None
+        listening = [self._sock] if len(self._peers) < PEERS else []
+        ready, _, _ = select.select([*listening, *(peer.sock for peer in self._peers)], [], [], 0.5)
+        if self._sock in ready:
+            self._accept()
+        now_s = time.monotonic()
+        self._peers = [peer for peer in self._peers if not self._is_done(peer, peer.sock in ready, now_s)]
+        self._tell_ignored(now_s)
+        self._come_back(now_s)
+
+    def _accept(self) -> None:
+        assert self._sock is not None
+        while len(self._peers) < PEERS:
+            try:
+                sock, _ = self._sock.accept()
+            except OSError:  # nobody more, gone again, or no descriptor left
+                return
+            sock.setblocking(False)
+            self._peers.append(_Peer(sock, time.monotonic() + PEER_S))
+
+    def _is_done(self, peer: _Peer, ready: bool, now_s: float) -> bool:
+        """Read what a peer says; whether it is through with, answered or not."""
+        try:
+            if ready:
+                got = peer.sock.recv(LINE_BYTES - len(peer.said))
+                peer.said += got
+                if b"\n" in got:
+                    self._answer(peer)
+                elif got and len(peer.said) < LINE_BYTES:
+                    return False
+                else:
+                    self.ignored += 1
+            elif now_s < peer.until_s:
+                return False
+            else:
+                self.ignored += 1
+        except OSError:
+            self.ignored += 1
+        peer.sock.close()
+        return True
+
+    def _answer(self, peer: _Peer) -> None:
+        try:
+            answer = {"ok": True} | self._do(_parse(peer.said.partition(b"\n")[0]))
+        except BadRequestError as error:
+            self.ignored += 1
+            answer = {"ok": False, "error": str(error)}
+        peer.sock.send(json.dumps(answer).encode() + b"\n")
+
+    def _tell_ignored(self, now_s: float) -> None:
+        told, told_s = self._told_ignored
+        if self.ignored > told and now_s - told_s > IGNORED_TOLD_S:
+            self._told_ignored = self.ignored, now_s
+            text = f"{self.ignored - told} connections to the control socket brought no request that can be followed"
+            self._events.post(Severity.WARNING, "recorder", "control_ignored", text)
+
+    # ------------------------------------------------------------------ what can be asked
+
+    def _do(self, request: dict[str, object]) -> dict[str, object]:
+        health = self._assembly.recorder.health
+        recording = health.state is Writing.RECORDING
+        answer: dict[str, object] = {
+            "session_id": self._assembly.info.session_id,
+            "part": self._assembly.parts.part,
+            "recording": recording,
+            "reason": health.reason if not recording else "",
+        }
+        match request.get("command"):
+            case "mark":
+                return answer | self._mark(request.get("text"))
+            case "split":
+                self._split()
+                return answer
+        raise BadRequestError("this recorder knows the commands mark and split")
+
+    def _mark(self, text: object) -> dict[str, object]:
+        note = one_line(text).strip() if isinstance(text, str) else ""
+        if not note or len(note) > NOTE_CHARACTERS:
+            raise BadRequestError(f"a note is a text of 1 to {NOTE_CHARACTERS} characters")
+        if not self._notes.take():
+            raise BadRequestError(f"too many notes; {NOTES_PER_S:g} a second are taken")
+        event = self._events.post(Severity.INFO, "operator", "mark", note)
+        return {"time_ns": event.time_ns, "text": note}
+
+    def _split(self) -> None:
+        recorder = self._assembly.recorder
+        if recorder.health.state is not Writing.RECORDING:
+            raise BadRequestError(f"nothing is being recorded: {recorder.health.reason}")
+        if not self._splits.take():
+            raise BadRequestError(f"too many new parts; {SPLITS_PER_S:g} a second is begun")
+        recorder.new_part.set()
+
+
+def _parse(line: bytes) -> dict[str, object]:
+    try:
+        request = json.loads(line)
+    except (ValueError, RecursionError):
+        request = None
+    if not isinstance(request, dict):
+        raise BadRequestError("a request is one JSON object in a line")
+    return request

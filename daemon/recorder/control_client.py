@@ -1,0 +1,102 @@
+"""Asks a running recorder for something, over the control socket of its log directory."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.log.directory import CONTROL_LINK
+from swath.daemon.log.parts import read_sign
+from swath.daemon.recorder.control import socket_address
+
+ANSWER_S = 5.0
+ANSWER_BYTES = 1 << 16
+SHOWN_CHARACTERS = 1000  # of a text in it
+LATEST_NS = 1 << 63
+NEW_PART_S = 15.0  # the next one is tried again after 10 s
+
+
+_OF_ALL: dict[str, type] = {"session_id": str, "part": int, "recording": bool, "reason": str}
+_OF_COMMAND: dict[str, dict[str, type]] = {"mark": {"time_ns": int, "text": str}}
+
+
+def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
+    """A request and its answer, which has every key that the command's answer has, its texts in one line.
+
+    Raises:
+        UserError: no recorder runs there, it may not be asked, it does not answer or not as one, or it refuses.
+    """
+    try:
+        said = _exchange(directory / CONTROL_LINK, json.dumps(request).encode() + b"\n")
+    except (FileNotFoundError, ConnectionRefusedError) as error:
+        raise UserError(f"{directory}: no recorder is running there", ExitCode.IO) from error
+    except PermissionError as error:
+        text = f"{directory}: not permitted; only the recorder's own user and root may, such as with sudo"
+        raise UserError(text, ExitCode.IO) from error
+    except OSError as error:  # a time-out is one
+        raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO) from error
+    if not said:
+        raise UserError(f"{directory}: the recorder there does not answer", ExitCode.IO)
+    try:
+        answer = _understood(said, _OF_ALL | _OF_COMMAND.get(request["command"], {}))
+    except (ValueError, RecursionError) as error:
+        text = f"{directory}: what answers there is no recorder of this version; start it anew after an update"
+        raise UserError(text, ExitCode.IO) from error
+    if not answer["ok"]:
+        raise UserError(f"{directory}: {answer['error']}", ExitCode.PROBLEM)
+    return answer
+
+
+def _understood(said: bytes, wanted: Mapping[str, type]) -> dict[str, Any]:
+    """An answer or a refusal; raises ValueError, RecursionError where it is neither."""
+    answer = json.loads(said)
+    refused = isinstance(answer, dict) and answer.get("ok") is False
+    wanted = {"ok": bool} | ({"error": str} if refused else dict(wanted))
+    if not isinstance(answer, dict) or not all(type(answer.get(key)) is kind for key, kind in wanted.items()):
+        raise ValueError(f"want {', '.join(wanted)}")
+    if "time_ns" in wanted and not 0 <= answer["time_ns"] < LATEST_NS:
+        raise ValueError("want a time of this age")
+    return {
+        key: one_line(answer[key])[:SHOWN_CHARACTERS] if kind is str else answer[key] for key, kind in wanted.items()
+    }
+
+
+def _exchange(place: Path, line: bytes) -> bytes:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock, socket_address(place) as address:
+        sock.settimeout(ANSWER_S)
+        _connect(sock, address)
+        sock.sendall(line)
+        answer = b""
+        while b"\n" not in answer and len(answer) < ANSWER_BYTES and (got := sock.recv(4096)):
+            answer += got
+        return answer
+
+
+def _connect(sock: socket.socket, address: str) -> None:
+    """Connect, in turn where others wait too."""
+    deadline_s = time.monotonic() + ANSWER_S
+    while True:
+        try:
+            sock.connect(address)
+        except BlockingIOError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.01)
+        else:
+            return
+
+
+def wait_for_part(directory: Path, session_id: str, after: int, timeout_s: float = NEW_PART_S) -> str | None:
+    """Name of the part that grows once it is a later one than ``after``; None: there was none in the time."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        sign = read_sign(directory)
+        if sign is not None and sign.session_id == session_id and sign.part > after:
+            return sign.path.name
+        time.sleep(0.05)
+    return None

@@ -1,0 +1,65 @@
+"""Whether the devices speak the protocols they are configured with, judged once from the first bytes of each.
+
+The recorder writes whatever comes; that it is not what the configuration says must not be found out after the flight.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from swath.daemon.config import DeviceEntry
+from swath.daemon.devices.identify import Heard, not_understood
+from swath.drivers.driver import find_driver
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import ChunkBatch, Int64Array
+
+JUDGED_BYTES = 64 * 1024  # several messages of every protocol
+JUDGED_AFTER_S = 10.0  # a slow device has sent several messages by then, and the start of the recording is over
+
+
+class FirstUnits:
+    """The first units of one device, kept until they are judged.
+
+    A receive thread adds, another thread judges; what has been taken away is no longer kept.
+    """
+
+    def __init__(self, entry: DeviceEntry) -> None:
+        self.entry = entry
+        self._kept: list[ChunkBatch] = []
+        self._bytes = 0
+        self._first_s: float | None = None
+        self._closed = False
+        self._lock = threading.Lock()
+
+    def add(self, log_time_ns: Int64Array, block: UnitBlock) -> None:
+        """Keep units while there is need of them."""
+        if self._closed:
+            return
+        room = max(1, (JUDGED_BYTES - self._bytes) // max(1, block.units.shape[1]))
+        with self._lock:
+            self._kept.append(ChunkBatch(self.entry.source, log_time_ns[:room], block.units[:room].copy()))
+            self._bytes += self._kept[-1].units.size
+            self._first_s = self._first_s or time.monotonic()
+            self._closed = self._bytes >= JUDGED_BYTES
+
+    def take(self) -> list[ChunkBatch] | None:
+        """What there is to judge, once; None while too little has come, and ever after."""
+        with self._lock:
+            waited = self._first_s is not None and time.monotonic() - self._first_s >= JUDGED_AFTER_S
+            if not self._kept or not waited:
+                return None
+            self._closed = True
+            kept, self._kept = self._kept, []
+            return kept
+
+
+def judge(entry: DeviceEntry, kept: list[ChunkBatch]) -> str | None:
+    """What a device is instead of what it was configured as, or that nothing of it is understood; None: all is well."""
+    parser = find_driver(entry.kind, entry.protocol).make_parser(entry.settings)
+    heard = Heard()
+    for batch in kept:
+        heard.add(parser.feed_batch(batch))
+    heard.add(parser.close())
+    counters = parser.counters
+    return not_understood(entry, heard, counters.messages.total(), kept, refused=counters.bad_messages)

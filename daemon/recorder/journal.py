@@ -1,0 +1,77 @@
+"""What the recorder says on stderr: written by a thread of its own, so that nobody who records waits for a reader."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import logging
+import os
+import queue
+import threading
+
+from swath.daemon.system import name_thread
+
+MAX_LINES = 10_000  # that wait; further ones are counted: what they tell is in the log too
+END_S = 1.0  # that the last lines may take
+
+_PRIORITY = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
+
+
+class JournalFormatter(logging.Formatter):
+    """Lines with the priority prefix that systemd-journald understands (sd-daemon(3))."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The prefix and the message."""
+        return f"<{_PRIORITY[record.levelno]}>{super().format(record)}"
+
+
+class JournalHandler(logging.Handler):
+    """Never blocks: a full pipe, a journal that stands still or a busy disk behind stderr hold up its thread alone.
+
+    Args:
+        fd: where the lines go; no stream of Python's, since the interpreter's end would wait for one that is stuck.
+    """
+
+    def __init__(self, fd: int) -> None:
+        super().__init__()
+        self._fd = fd
+        self._lines: queue.Queue[str | None] = queue.Queue(MAX_LINES)
+        self._left_out = 0
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Line up a message; handlers are called one at a time (`logging.Handler.acquire`)."""
+        try:
+            if self._left_out:
+                self._lines.put_nowait(f"{self._left_out} lines left out: nobody read them")
+                self._left_out = 0
+            self._lines.put_nowait(self.format(record))
+        except queue.Full:
+            self._left_out += 1
+
+    def _write(self) -> None:
+        name_thread("journal")
+        while (line := self._lines.get()) is not None:
+            rest = f"{line}\n".encode(errors="replace")
+            with contextlib.suppress(OSError):  # nobody is there any more; the recording goes on
+                while rest:
+                    rest = rest[os.write(self._fd, rest) :]
+
+    def close(self) -> None:
+        """Write what waits, for no longer than `END_S`."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+            self._thread.join(END_S)
+        super().close()
+
+
+def threads_text() -> str:
+    """Where every thread of this process stands; why it cannot be said, where it cannot."""
+    try:
+        with os.fdopen(os.memfd_create("threads"), "w+b") as file:
+            faulthandler.dump_traceback(file)
+            file.seek(0)
+            return file.read().decode(errors="replace")
+    except OSError as error:
+        return f"no word of the threads: {error}"

@@ -1,0 +1,349 @@
+"""One thread a wire: wait, take what the kernel has, stamp it, hand it to the recorder. Nothing here knows a protocol.
+
+Only GNSS bytes are looked at besides, for the time messages in them, after they have been handed over.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from swath.daemon.log.block_queue import BlockQueue, QueueItem, SourceCount
+from swath.daemon.log.channels import ChannelTable
+from swath.daemon.log.events import Events, Severity
+from swath.daemon.log.format import ChannelSpec, ChunkClass
+from swath.daemon.log.host_clock import HostClock, StampConverter, read_clock_pair
+from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
+from swath.daemon.recorder.wire_trouble import WireTrouble
+from swath.daemon.system import name_thread
+from swath.drivers.session import Session, SessionState
+from swath.drivers.transports.base import UnitBlock
+from swath.georef.records import Int64Array
+
+WAIT_S = 0.2  # a receive thread comes back from its wait at least this often
+ACCOUNT_S = 0.25  # and says how much it has lost at least this often
+SILENT_AFTER_S = 3.0
+DRAIN_S = 1.0  # at the end, what the kernel already holds is still taken, for no longer than this
+MAX_SENDERS = 256  # of one UDP port with a channel each; a port scanner must not fill the log with channels
+QUEUE_TOLD_S = 1.0  # the queue counts as having room again when it refused nothing for so long
+BLOCK_BYTES = 512 * 1024  # a larger one is handed over in pieces, so that chunks stay near their 1 MiB
+
+UnitsSeen = Callable[[Int64Array, UnitBlock], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One port, socket or bus of a device, and where its units go in the log.
+
+    Attributes:
+        source: name of its account: ``kind/name``, with ``/aux`` for a scanner's second port.
+        topic: of the raw channel.
+        encoding: MCAP message encoding, ``x-swath-serial``, ``x-swath-can`` or ``x-swath-udp``.
+        chunk_class: "scanner" or "other".
+        metadata: of the channel, without a sender's.
+    """
+
+    source: str
+    topic: str
+    encoding: str
+    chunk_class: ChunkClass
+    metadata: dict[str, str]
+
+
+@dataclass(slots=True)
+class _Account:
+    """Running totals of one receiver; `snapshot` travels with the blocks."""
+
+    units: int = 0
+    bytes: int = 0
+    lost_kernel: int = 0
+    lost_queue: int = 0
+    last_unit_ns: int | None = None
+    receive_buffer_bytes: int = 0
+    state: str = "opening"
+    ambiguous: int = 0
+    trouble: dict[str, int] = field(default_factory=dict)
+
+    def snapshot(self) -> SourceCount:
+        return SourceCount(
+            units=self.units,
+            bytes=self.bytes,
+            lost_kernel=self.lost_kernel,
+            lost_queue=self.lost_queue,
+            stamp_ambiguous=self.ambiguous,
+            last_unit_ns=self.last_unit_ns,
+            receive_buffer_bytes=self.receive_buffer_bytes,
+            state=self.state,
+            trouble=self.trouble,
+        )
+
+
+@dataclass(slots=True)
+class Shared:
+    """What all receivers of a session work with."""
+
+    clock: HostClock
+    queue: BlockQueue
+    channels: ChannelTable
+    events: Events
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+class Receiver(threading.Thread, ABC):
+    """The life of a receive thread; subclasses take units and edges.
+
+    Attributes:
+        came_back_ns: CLOCK_MONOTONIC of the last return from a wait, for the watchdog.
+        failed: the thread ended by a defect.
+    """
+
+    def __init__(self, source: str, shared: Shared) -> None:
+        super().__init__(name=source, daemon=True)
+        self.source = source
+        self.came_back_ns = time.monotonic_ns()
+        self.failed = False
+        self.shared = shared
+        self.account = _Account()
+        self.stamps = StampConverter(shared.clock)
+        self._accounted_ns = 0
+        self._told_state = SessionState.CLOSED
+        self._told_error = ""
+        self._told_silent = False
+        self._opened_ns = self._silent_since_ns = shared.clock.now_ns()
+        self._refused_ns: int | None = None  # CLOCK_MONOTONIC when the queue last had no room
+        self._lost_before = 0  # lost_queue when it began to have none
+
+    def run(self) -> None:
+        """Receive until told to stop; an error here is a defect, which the watchdog turns into a restart."""
+        name_thread(self.source)
+        try:
+            while not self.shared.stop.is_set():
+                self.receive_once()
+                self.came_back_ns = time.monotonic_ns()
+            self.finish()
+        except Exception as error:
+            self.failed = True
+            text = f"receive thread failed: {type(error).__name__}: {error}"
+            self.shared.events.post(Severity.CRITICAL, self.source, "receiver_failed", text)
+            raise
+
+    @property
+    @abstractmethod
+    def opening(self) -> bool:
+        """Whether the device is being opened at this moment."""
+
+    @abstractmethod
+    def take(self, timeout_s: float) -> int | None:
+        """Wait, hand over what came; the host time of the newest unit, None when there was none."""
+
+    @abstractmethod
+    def receive_once(self) -> None:
+        """One wait and what came of it."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Close the device and give the last account."""
+
+    def drain(self) -> None:
+        """Take what the kernel held when the end was asked for."""
+        ended_ns, limit_ns = self.shared.clock.now_ns(), time.monotonic_ns() + int(DRAIN_S * 1e9)
+        while time.monotonic_ns() < limit_ns:
+            newest_ns = self.take(0.0)
+            if newest_ns is None or newest_ns >= ended_ns:
+                return
+
+    def hand_over(self, block: EncodedBlock) -> None:
+        """Put a block and the account so far into the queue; what it refuses is counted, and told once an episode."""
+        now_ns = time.monotonic_ns()
+        if not self.shared.queue.put(QueueItem(self.source, block, self.account.snapshot())):
+            if self._refused_ns is None:
+                self._lost_before = self.account.lost_queue
+                text = "the writer does not keep up and its queue is full; units are being dropped and counted"
+                self.shared.events.post(Severity.CRITICAL, self.source, "queue_full", text)
+            self._refused_ns = now_ns
+            self.account.lost_queue += block.count
+        elif self._refused_ns is not None and now_ns - self._refused_ns > QUEUE_TOLD_S * 1e9:
+            self._refused_ns = None
+            text = f"the queue has room again; {self.account.lost_queue - self._lost_before} units were dropped"
+            self.shared.events.post(Severity.WARNING, self.source, "queue_drained", text)
+
+    def tell_account(self, *, now: bool = False) -> None:
+        """Let the recorder know the totals even when no unit came."""
+        monotonic = time.monotonic_ns()
+        if now or monotonic - self._accounted_ns >= ACCOUNT_S * 1e9:
+            self._accounted_ns = monotonic
+            self.shared.queue.put(QueueItem(self.source, count=self.account.snapshot()))
+
+    def tell_state(self, state: SessionState, last_error: str) -> None:
+        """Report opening, loss, its reason when that changes, silence and return as events, each once."""
+        if state is not self._told_state:
+            self._tell_change(state, last_error)
+            self._told_state = state
+        elif state is SessionState.WAITING and last_error != self._told_error:
+            self.shared.events.post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
+        self._told_error = last_error
+        self.account.state = self._state_word(state)
+
+    def _tell_change(self, state: SessionState, last_error: str) -> None:
+        post = self.shared.events.post
+        if state is SessionState.OPEN:
+            self.account.last_unit_ns = None
+            self._opened_ns = self.shared.clock.now_ns()
+            self._told_silent = False
+            post(Severity.INFO, self.source, "device_opened", "opened")
+        elif self._told_state is SessionState.OPEN:
+            post(Severity.ERROR, self.source, "device_lost", f"{last_error}; waiting for it")
+        elif self._told_state is SessionState.CLOSED and state is SessionState.WAITING:
+            post(Severity.WARNING, self.source, "device_absent", f"{last_error}; waiting for it")
+
+    def _state_word(self, state: SessionState) -> str:
+        if state is not SessionState.OPEN:
+            return "absent" if state is SessionState.WAITING else "opening"
+        last = self.account.last_unit_ns or self._opened_ns
+        silent_s = (self.shared.clock.now_ns() - last) * 1e-9
+        if silent_s <= SILENT_AFTER_S:
+            return "receiving"
+        if not self._told_silent:
+            self._told_silent = True
+            self._silent_since_ns = last
+            self.shared.events.post(Severity.WARNING, self.source, "silent", f"no data for {silent_s:.0f} s")
+        return "silent"
+
+    def note_units(self, count: int, length: int, last_ns: int) -> None:
+        """Count units; tell when silence ended."""
+        if self._told_silent:
+            self._told_silent = False
+            gap_s = (last_ns - self._silent_since_ns) * 1e-9
+            self.shared.events.post(Severity.INFO, self.source, "resumed", f"data again after {gap_s:.1f} s")
+        self.account.units += count
+        self.account.bytes += count * length
+        self.account.last_unit_ns = last_ns
+
+
+class UnitReceiver(Receiver):
+    """Takes serial reads, datagrams or CAN frames of one wire."""
+
+    def __init__(
+        self, wire: Wire, session: Session[UnitBlock], shared: Shared, units_seen: Sequence[UnitsSeen] = ()
+    ) -> None:
+        super().__init__(wire.source, shared)
+        self._wire = wire
+        self._session = session
+        self._units_seen = units_seen
+        self._channel_ids: dict[tuple[str, int] | None, int] = {}
+        self._sequences: dict[int, int] = {}
+        self._told_buffer = False
+        self._trouble = WireTrouble(wire.source, shared.events)
+
+    @property
+    def opening(self) -> bool:
+        """Whether the device is being opened at this moment."""
+        return self._session.state is SessionState.OPENING
+
+    def take(self, timeout_s: float) -> int | None:
+        """Wait for units, stamp them, hand them over, then look for time in them."""
+        blocks = self._session.receive(timeout_s)
+        if not blocks:
+            return None
+        times = self._stamp(blocks)
+        self._update_kernel_losses(force=False)
+        for block, log_time_ns in zip(blocks, times, strict=True):
+            self._hand_over(block, log_time_ns)
+        for units_seen in self._units_seen:
+            for block, log_time_ns in zip(blocks, times, strict=True):
+                units_seen(log_time_ns, block)
+        return int(times[-1][-1])
+
+    def receive_once(self) -> None:
+        """One wait; then what there is to tell of the device and of losses."""
+        took = self.take(WAIT_S) is not None
+        self.tell_state(self._session.state, self._session.last_error)
+        self._update_kernel_losses(force=not took)
+        self.tell_account()
+
+    def finish(self) -> None:
+        """Take the rest and close; the kernel's last word on losses is that of the closed socket."""
+        if self._session.state is SessionState.OPEN:
+            self.drain()
+        self._session.close()
+        self._update_kernel_losses(force=True)
+        self.tell_account(now=True)
+
+    def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
+        counts = [len(block.units) for block in blocks]
+        if all(block.kernel_realtime_ns is None for block in blocks):  # of a serial port: the time they were read
+            read_ns = self.shared.clock.now_ns()
+            return [np.array([read_ns] * count, dtype=np.int64) for count in counts]
+        pair = read_clock_pair()
+        if len(blocks) == 1:
+            host = self.stamps.convert_at(blocks[0].kernel_realtime_ns, counts[0], pair)
+            self.account.ambiguous = self.stamps.ambiguous
+            return [host]
+        joined = np.concatenate(
+            [
+                np.zeros(count, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
+                for block, count in zip(blocks, counts, strict=True)
+            ]
+        )
+        host = self.stamps.convert_at(joined, sum(counts), pair)
+        self.account.ambiguous = self.stamps.ambiguous
+        return np.split(host, np.cumsum(counts)[:-1])
+
+    def _hand_over(self, block: UnitBlock, log_time_ns: Int64Array) -> None:
+        count, length = block.units.shape
+        channel_id = self._channel(block.peer)
+        step = max(1, BLOCK_BYTES // (length + MESSAGE_HEADER_BYTES))
+        for first in range(0, count, step):
+            units, times = block.units[first : first + step], log_time_ns[first : first + step]
+            sequence = self._sequences[channel_id]
+            self._sequences[channel_id] = (sequence + len(units)) & 0xFFFFFFFF
+            self.note_units(len(units), length, int(times[-1]))
+            rows = None if block.rows is None else block.rows[first : first + step]
+            self.hand_over(encode_block(channel_id, sequence, times, units, rows=rows))
+
+    def _channel(self, peer: tuple[str, int] | None) -> int:
+        channel_id = self._channel_ids.get(peer)
+        if channel_id is None:
+            if len(self._channel_ids) >= MAX_SENDERS:
+                peer = None
+            channel_id = self._channel_ids.get(peer) or self._add_channel(peer)
+        return channel_id
+
+    def _add_channel(self, peer: tuple[str, int] | None) -> int:
+        metadata = dict(self._wire.metadata)
+        if peer is not None:
+            metadata |= {"source_address": peer[0], "source_port": str(peer[1])}
+        elif self._channel_ids:
+            text = f"more than {MAX_SENDERS} senders; the further ones are recorded on one channel that names no sender"
+            self.shared.events.post(Severity.WARNING, self.source, "many_senders", text)
+        wire = self._wire
+        spec = ChannelSpec(wire.topic, wire.encoding, metadata, None, wire.chunk_class)
+        channel_id = self.shared.channels.add(self.source, spec)
+        self._channel_ids[peer] = channel_id
+        self._sequences[channel_id] = 0
+        return channel_id
+
+    def _update_kernel_losses(self, *, force: bool) -> None:
+        now = time.monotonic_ns()
+        if not force and now - self._accounted_ns < ACCOUNT_S * 1e9:
+            return
+        counters = self._session.poll_counters()
+        lost = counters.lost_kernel - self.account.lost_kernel
+        if lost > 0:
+            self.account.lost_kernel += lost
+            self.account.units += lost
+            text = f"the kernel dropped {lost} units: the receive buffer was full"
+            self.shared.events.post(Severity.ERROR, self.source, "lost_kernel", text)
+        self.account.trouble = self._trouble.look(counters)
+        granted = counters.receive_buffer_bytes
+        self.account.receive_buffer_bytes = granted
+        wanted = counters.receive_buffer_asked_bytes
+        if granted < wanted and not self._told_buffer:
+            self._told_buffer = True
+            text = f"receive buffer of {granted} bytes granted, {wanted} wanted: sysctl -w net.core.rmem_max=67108864"
+            self.shared.events.post(Severity.WARNING, self.source, "receive_buffer_small", text)

@@ -1,0 +1,127 @@
+"""After recording has begun: logs that a crash left open are completed, by another process, one at a time.
+
+The repair never competes with the recording: it runs at idle CPU and I/O priority and starts on a log only while the
+disk keeps the reserve and room for the whole copy. The original is not touched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.events import Events, Severity
+from swath.daemon.log.format import LogError
+from swath.daemon.log.reader import read_part_head
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+_LOOK_AGAIN_S = 60.0
+_HEAD_BYTES = 4096  # of a part at most: header and session
+
+
+def unfinished_logs(directory: Path) -> list[Path]:
+    """Logs of a directory without their end and without a repaired copy, oldest first.
+
+    What a crash leaves at a part's very beginning is none: nothing is in it that could be repaired.
+    """
+    found: list[tuple[float, Path]] = []
+    with contextlib.suppress(FileNotFoundError):  # the directory itself
+        for path in directory.glob("*.mcap"):
+            if path.name.endswith(".recovered.mcap") or path.with_suffix(".recovered.mcap").exists():
+                continue
+            with contextlib.suppress(OSError):  # moved away meanwhile, or not ours to read
+                if (changed_s := _left_open_since(path)) is not None:
+                    found.append((changed_s, path))
+    return [path for _, path in sorted(found)]
+
+
+def _left_open_since(path: Path) -> float | None:
+    """When a log without its end was last written to; None where it has its end."""
+    with path.open("rb") as file:
+        stat = os.fstat(file.fileno())
+        file.seek(max(0, stat.st_size - len(MCAP_MAGIC)))
+        if file.read() == MCAP_MAGIC or (stat.st_size < _HEAD_BYTES and not _has_head(path)):
+            return None
+        return stat.st_mtime
+
+
+def _has_head(path: Path) -> bool:
+    try:
+        read_part_head(path)
+    except LogError:
+        return False
+    return True
+
+
+async def repair_left_open(
+    directory: Path, reserve_bytes: int, is_current: Callable[[Path], bool], events: Events
+) -> None:
+    """Repair what a crash left open; waits while there is no room, ends when nothing is left to do.
+
+    What somebody recovers by hand meanwhile is looked at again later: it is done then, or was given up.
+    """
+    tried: set[Path] = set()
+    told: set[str] = set()
+    while True:
+        candidates = await asyncio.to_thread(unfinished_logs, directory)
+        waiting = [path for path in candidates if path not in tried and not is_current(path)]
+        if not waiting:
+            return
+        path = next((path for path in waiting if not _is_being_recovered(path)), None)
+        if path is None:
+            await _wait(f"{waiting[0].name} is being recovered by another process", told, events)
+            continue
+        try:
+            room = shutil.disk_usage(directory).free > reserve_bytes + path.stat().st_size
+        except OSError:  # moved away meanwhile
+            tried.add(path)
+            continue
+        if not room:
+            await _wait(f"{path.name} was left open by a crash; no room to repair it now", told, events)
+            continue
+        await _repair(path, reserve_bytes, events)
+        tried.add(path)
+
+
+def _is_being_recovered(path: Path) -> bool:
+    return is_being_written(path.with_suffix(".recovered.mcap.part"))
+
+
+async def _wait(text: str, told: set[str], events: Events) -> None:
+    """Say once why, and let some time pass."""
+    if text not in told:
+        told.add(text)
+        events.post(Severity.WARNING, "recorder", "repair_waits", text)
+    await asyncio.sleep(_LOOK_AGAIN_S)
+
+
+async def _repair(path: Path, reserve_bytes: int, events: Events) -> None:
+    """One log in its own process; 0 and 4 (damage found, what is whole was saved) both leave a repaired copy."""
+    # a child inherits the recorder's real-time priority: it must be idle before its interpreter even starts
+    command = ["chrt", "--idle", "0"] if shutil.which("chrt") else []
+    command += [sys.executable, "-m", "swath.daemon.cli.main", "recover", "--background"]
+    command += ["--keep-free-mb", str(reserve_bytes // 1_000_000), str(path)]
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        _, errors = await process.communicate()
+    except asyncio.CancelledError:
+        process.terminate()
+        await process.wait()
+        raise
+    if process.returncode in (0, 4):
+        text = f"{path.name}, left open by a crash, was repaired beside it"
+        events.post(Severity.INFO, "recorder", "log_repaired", text)
+        return
+    lines = errors.decode(errors="replace").strip().splitlines()
+    text = f"{path.name} could not be repaired: {lines[-1] if lines else f'exit status {process.returncode}'}"
+    events.post(Severity.WARNING, "recorder", "repair_failed", text)

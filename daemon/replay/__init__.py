@@ -1,0 +1,1 @@
+"""A log's units, and their way back onto wires."""

@@ -1,0 +1,1 @@
+"""The virtual aircraft into a log, files or onto wires."""

@@ -1,0 +1,88 @@
+"""Where a flight into a log is written: out of sight while it is made, whole in its place when it is done."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.exchange.log_maker import refuse_session
+from swath.daemon.log.durable import sync_directory
+
+_AGAIN = "is there already; remove it or give another place"
+
+
+class FlightFolder:
+    """A folder of its own inside the one that is asked for; what is not kept at the end is removed.
+
+    Args:
+        output: a folder, or the name of the log, which ends in ``.mcap``.
+
+    Attributes:
+        work: where everything is written.
+        place: where it goes.
+
+    Raises:
+        UserError: it cannot be made, or another flight is at work there.
+    """
+
+    def __init__(self, output: Path) -> None:
+        self.log_name = output.name if output.suffix == ".mcap" else ""
+        self.place = output.parent if self.log_name else output
+        self.work = self.place / f".{output.name}.flying"
+        self._made = not self.place.exists()
+        try:
+            self.place.mkdir(parents=True, exist_ok=True)
+            self.work.mkdir()
+        except FileExistsError as error:
+            text = f"{error.filename}: another flight is at work there, or was killed there; wait for it, or remove it"
+            if error.filename == str(self.place):
+                text = f"{self.place}: is a file; give a folder, or a name that ends in .mcap"
+            raise UserError(text, ExitCode.IO) from error
+        except OSError as error:
+            raise UserError(f"{error.filename}: {error.strerror}; cannot write there", ExitCode.IO) from error
+
+    def __enter__(self) -> FlightFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Remove what has not been kept, and the folder where it was made for it."""
+        shutil.rmtree(self.work, ignore_errors=True)
+        if self._made:
+            with contextlib.suppress(OSError):  # there is something in it
+                self.place.rmdir()
+
+    def refuse_taken(self, names: Iterable[str]) -> None:
+        """Refuse to put a file where another stands; raises UserError."""
+        for name in (self.log_name, *sorted(names)):
+            if name and os.path.lexists(self.place / name):
+                raise UserError(f"{self.place / name}: {_AGAIN}", ExitCode.IO)
+
+    def refuse_session(self, session_id: str) -> None:
+        """Refuse a folder that holds a log of this session; raises UserError."""
+        if not self.log_name:
+            refuse_session(self.place, session_id)
+
+    def write(self, files: Mapping[str, bytes]) -> None:
+        """Small files; raises OSError."""
+        for name, data in files.items():
+            (self.work / name).write_bytes(data)
+
+    def keep(self, logs: list[Path]) -> list[Path]:
+        """Put everything in its place; where the parts of the log are now. Raises UserError, OSError.
+
+        Args:
+            logs: the parts, within ``work``; one where the log has a name.
+        """
+        goes = {path: path.name for path in sorted(self.work.iterdir())}
+        if self.log_name:
+            goes[logs[0]] = self.log_name
+        self.refuse_taken(goes.values())
+        for path, name in goes.items():
+            path.rename(self.place / name)
+        sync_directory(self.place)
+        return [self.place / goes[path] for path in logs]

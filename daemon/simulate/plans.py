@@ -1,0 +1,135 @@
+"""The one place where `daemon` takes the virtual aircraft from `sim`, when a command is run that needs it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.drivers.extras import how_to_install
+
+if TYPE_CHECKING:
+    from swath.daemon.simulate.flight import Flight
+
+NEEDS = ("scipy", "pyproj", "numba", "matplotlib")
+WARM_UP_S = 0.3  # a block of every source
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """A plan as it is asked for on the command line.
+
+    Attributes:
+        plan: a file, or a preset's name.
+        seed: instead of the plan's own.
+        seconds: the first ones only.
+    """
+
+    plan: str
+    seed: int | None = None
+    seconds: float | None = None
+
+    def load(self) -> Any:
+        """The plan.
+
+        Raises:
+            UserError: it is not there, or a key is wrong; or what `sim` needs is not installed.
+        """
+        _check_installed()
+        from swath.sim.plan.plan import load_plan
+
+        with self.told():
+            plan = load_plan(self.plan)
+            return plan if self.seed is None else plan.with_seed(self.seed)
+
+    @contextlib.contextmanager
+    def told(self, *names: str) -> Iterator[None]:
+        """What is wrong with the plan as an error of the user's.
+
+        Args:
+            names: of files beside the plan's that may be what is wrong.
+        """
+        from swath.sim.plan.errors import PlanError
+
+        try:
+            yield
+        except PlanError as error:
+            text = str(error) if error.key in (self.plan, *names) else f"{self.plan}: {error}"
+            raise UserError(one_line(text), ExitCode.USAGE) from error
+
+
+def _check_installed() -> None:
+    missing = [name for name in NEEDS if importlib.util.find_spec(name) is None]
+    if missing:
+        text = f"swath sim needs {', '.join(missing)}, not installed here: {how_to_install('sim')}"
+        raise UserError(text, ExitCode.USAGE)
+
+
+def make_flight(wish: Wish, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
+    """A flight, and the files that stand beside it but for the configuration.
+
+    Args:
+        wish: what to fly.
+        truth: where the truth goes; None: nowhere.
+
+    Raises:
+        UserError: it cannot be flown.
+        OSError: the truth cannot be written.
+    """
+    plan = wish.load()
+    from swath.sim.companions import companion_files
+    from swath.sim.fly import VirtualFlight, open_truth
+
+    writer = None if truth is None else open_truth(plan, truth)
+    try:
+        with wish.told():
+            flight = VirtualFlight(plan, writer, math.inf if wish.seconds is None else wish.seconds)
+            return flight, companion_files(plan, flight.site, flight.scene)
+    except BaseException:
+        if writer is not None:
+            writer.abandon()
+        raise
+
+
+def make_flight_in_time(wish: Wish) -> tuple[Flight, dict[str, bytes]]:
+    """`make_flight` for real time: what is compiled when it is first used has been used before.
+
+    A moment of the same flight is flown with all scanners on.
+    """
+    plan = wish.load()
+    from swath.sim.fly import VirtualFlight
+
+    always_on = {name: {"on_lines_only": False} for name in plan.tables.scanner}
+    with wish.told():
+        for _ in VirtualFlight(plan.changed({"scanner": always_on}), None, WARM_UP_S).units():
+            pass
+    return make_flight(wish)
+
+
+def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> bytes:
+    """The configuration that records a flight.
+
+    Args:
+        plan: of `Wish.load`.
+        wires: transports and PPS sources by source; None: those of an aircraft's computer.
+        directory: for logs.
+    """
+    from swath.sim.companions import config_text, default_wires
+
+    text: str = config_text(plan, default_wires(plan) if wires is None else wires, directory)
+    return text.encode()
+
+
+def draw(wish: Wish, picture: Path) -> list[dict[str, Any]]:
+    """Draw a plan; what it covers, a row a line and one for all. Raises UserError, OSError."""
+    plan = wish.load()
+    from swath.sim.preview.picture import draw_plan
+
+    with wish.told(str(picture)):
+        rows: list[dict[str, Any]] = draw_plan(plan, picture)
+        return rows
