@@ -1,4 +1,7 @@
-"""A calibration as the text of its file (CONVENTIONS, "Calibration file"); `swath.georef.scanner.calibration` reads it."""
+"""Write a calibration as the text of its file (CONVENTIONS, "Calibration file").
+
+`swath.georef.scanner.calibration` reads it.
+"""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class Flight:
     swaths: tuple[Swath, ...]
 
     def rays(self, swath: Swath, calibration: Calibration, at: Rows = slice(None), *, with_axes: bool = True) -> Rays:
-        """Some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model.SensorModel.rays`, air applied."""
+        """Some of a swath's returns with a calibration: `swath.georef.scanner.sensor_model`, air applied."""
         head, trajectory = self.heads[swath.head], self.trajectories[swath.flown]
         model = head.model(calibration)
         count = len(swath.time_ns[at])

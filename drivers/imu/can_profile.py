@@ -1,4 +1,4 @@
-"""Named devices over `swath.drivers.imu.dbc.parser`: their messages are known, their CAN identifiers are what the user set."""
+"""Named devices over `swath.drivers.imu.dbc`: messages are known, CAN identifiers are what the user set."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Georeferences(Protocol):
 
 
 class Resolver(Protocol):
-    """Finds emissions of returns with pulses in air, may hold some back: `swath.georef.scanner.ranging.ZoneResolver`."""
+    """Finds emissions of returns with pulses in air; may hold some back (`swath.georef.scanner.ranging`)."""
 
     counts: Counter[str]
 
@@ -80,7 +80,7 @@ Moving = tuple[StructArray, Int64Array, NDArray[np.float64], NDArray[np.float64]
 
 
 class Motion(Protocol):
-    """Finds the encoder's rate and acceleration from readings around: `swath.georef.scanner.encoder_motion.EncoderMotion`."""
+    """Finds the encoder's rate and acceleration from readings around (`swath.georef.scanner.encoder_motion`)."""
 
     def feed(self, rows: StructArray, time_ns: Int64Array) -> Moving:
         """Rows whose neighbourhood is known now, their GPS times, rad/s, rad/s²."""
