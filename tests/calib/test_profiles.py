@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.calib.profile_plots import draw, svg
+from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.calib.profiles.check import Check
 from swath.calib.profiles.measure import Settings
 from swath.calib.profiles.stepwise import (

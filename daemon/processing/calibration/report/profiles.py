@@ -12,7 +12,7 @@ import numpy as np
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.labels import decimals_of, number, unknown
-from swath.calib.profile_plots import draw, svg
+from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.calib.profiles.check import Check, Comparison
 from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
