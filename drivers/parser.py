@@ -8,20 +8,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from swath.georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, NamesEdge, Record
+from swath.georef.records import ByteRows, Chunk, ChunkBatch, Int64Array, Record
 
 if TYPE_CHECKING:
-    from swath.drivers.startup import StartupMessage, StartupWish
+    pass
 
 DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
-TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
 
 
 class DriverSettingsError(ValueError):
@@ -152,48 +151,3 @@ class DeviceSettings:
     config: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     compiled: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Driver:
-    """What a protocol file declares in its ``DRIVERS`` tuple.
-
-    Attributes:
-        protocol: the name in the configuration.
-        kind: gnss, imu, scanner or corrections.
-        transports: kinds of transport it can come by.
-        yields: record types it gives.
-        summary: one line for ``swath devices``.
-        make_parser: builds the parser of everything.
-        make_time_parser: builds the parser the recorder runs: time messages (and device clock samples) only; None
-            where the device says no time.
-        make_probe: builds the parser that only counts what looks like this protocol, where make_parser needs more than
-            defaults; it is asked when another protocol was configured.
-        names_edge: which edge its time messages name by default; None where mixed or none.
-        tells_pps: whether a latch in its clock samples is the device's own word, not only the configuration's.
-        needs: configuration keys without which it cannot work.
-        line_scanner: of a scanner: one beam, which goes as the configuration's ``geometry`` declares. The parser of any
-            other has ``beams``, a `swath.drivers.scanner.beams.BeamTable`, by which returns are georeferenced.
-        wavelength_nm: of a scanner's light, by its maker's data sheet; None: 1064, as of most airborne ones.
-        eight_bit_intensity: whether a scanner's intensities are 0 to 255.
-        past_hour: whether a scanner's device time is that past the full hour of UTC.
-        startup: builds the messages a device needs before a survey, in the order they are sent, and raises
-            `DriverSettingsError`; None where there are none.
-    """
-
-    protocol: str
-    kind: DeviceKind
-    transports: tuple[TransportKind, ...]
-    yields: tuple[type, ...]
-    summary: str
-    make_parser: Callable[[DeviceSettings], Parser]
-    make_time_parser: Callable[[DeviceSettings], Parser] | None = None
-    make_probe: Callable[[DeviceSettings], Parser] | None = None
-    names_edge: NamesEdge | None = None
-    tells_pps: bool = True
-    needs: tuple[str, ...] = ()
-    line_scanner: bool = False
-    wavelength_nm: float | None = None
-    eight_bit_intensity: bool = False
-    past_hour: bool = False
-    startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None

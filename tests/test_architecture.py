@@ -171,7 +171,8 @@ def test_every_event_is_explained() -> None:
 
 
 def test_the_example_of_a_new_device_is_a_driver() -> None:
-    from swath.drivers.parser import DeviceSettings, Driver
+    from swath.drivers.driver import Driver
+    from swath.drivers.parser import DeviceSettings
     from swath.georef.records import Chunk
 
     (example,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/adding-a-device.md").read_text(), re.M | re.S)

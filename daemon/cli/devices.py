@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from swath.drivers.parser import Driver
+    from swath.drivers.driver import Driver
 
 
 def describe_driver(driver: Driver) -> dict[str, Any]:

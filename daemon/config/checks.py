@@ -16,8 +16,8 @@ from pydantic import BaseModel
 from swath.daemon.config.calibration import check_calibration
 from swath.daemon.config.config import Config, DeviceTable
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
-from swath.drivers.driver import UnknownProtocolError, find_driver
-from swath.drivers.parser import DeviceKind, Driver, DriverSettingsError
+from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceKind, DriverSettingsError
 from swath.drivers.startup import StartupWish
 
 if TYPE_CHECKING:

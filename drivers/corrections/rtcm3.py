@@ -6,9 +6,10 @@ they came: the log holds the bytes.
 
 from __future__ import annotations
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import RTCM3
-from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import Chunk, DeviceStatus, Record
 
 HEADER_BYTES, CRC_BYTES = 3, 3

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swath.drivers.can_frames import decode_can_frames
+from swath.drivers.driver import Driver
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.dbc.signals import SignalLayout, find_signal, load_database
-from swath.drivers.parser import DeviceSettings, Driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import (
     ByteRows,
     DeviceStatus,

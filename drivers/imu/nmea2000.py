@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.can_frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
+from swath.drivers.driver import Driver
 from swath.drivers.imu.fast_packets import FastPackets
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.georef.records import (
     ByteRows,
     DeviceStatus,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from swath.drivers.driver import Driver
 from swath.drivers.gnss.novatel.parser import NovatelParser
 from swath.drivers.gnss.novatel.startup import imu_startup_messages
-from swath.drivers.parser import DeviceSettings, Driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ImuSamples, InsSolution
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from swath.drivers.driver import Driver
 from swath.drivers.gnss.sbf.parser import SbfParser
 from swath.drivers.gnss.sbf.startup import imu_startup_messages
-from swath.drivers.parser import DeviceSettings, Driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import ImuSamples, InsSolution
 
 

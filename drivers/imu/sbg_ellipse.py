@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from swath.drivers.driver import Driver
 from swath.drivers.imu.can_profile import profile_map
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.dbc.settings import SignalMap
-from swath.drivers.parser import DeviceSettings, Driver
+from swath.drivers.parser import DeviceSettings
 from swath.georef.records import DeviceClockSamples, ImuSamples
 
 DBC_PATH = Path(__file__).with_name("sbg-ellipse.dbc")

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from swath.drivers.driver import Driver
 from swath.drivers.imu.can_profile import profile_map
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.dbc.settings import SignalMap
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import ImuSamples
 
 BYTE_ORDERS = {"big": 0, "little": 1}  # as a DBC numbers them

@@ -22,10 +22,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
 from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, StreamParser
 from swath.georef.records import (
     IMU_DTYPE,
     Chunk,

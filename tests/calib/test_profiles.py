@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
-from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.calib.profiles.check import Check
 from swath.calib.profiles.measure import Settings
 from swath.calib.profiles.stepwise import (
@@ -29,6 +28,7 @@ from swath.calib.profiles.stepwise import (
     stepwise,
     survey,
 )
+from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.daemon.processing.calibration.report.profiles import pictures
 from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables, only, retold, truth_of
 

@@ -9,8 +9,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from swath.drivers.driver import all_drivers
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.driver import Driver, all_drivers
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.drivers.scanner.slots import PairRule, ReturnSlots, common_words, filler, in_order, returns_table
 from swath.drivers.scanner.slots_compiled import fill
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram

@@ -20,10 +20,10 @@ from swath.drivers.can_frames import (
     decode_can_frames,
     encode_can_frame,
 )
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import Driver, find_driver
 from swath.drivers.imu.counters import CounterUnwrapper
 from swath.drivers.imu.dbc.parser import DbcParser, make_clock_parser
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, Parser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.records import ChunkBatch, DeviceClockSamples, Int64Array, Record, StructArray
 from tests.drivers.harness import Snapshot, check_packet_damage, check_packets, packed_rows
 from tests.drivers.imu_dbc import (

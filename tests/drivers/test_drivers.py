@@ -17,8 +17,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swath.drivers.driver import KINDS, UnknownProtocolError, all_drivers, find_driver
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, Parser
+from swath.drivers.driver import KINDS, Driver, UnknownProtocolError, all_drivers, find_driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.records import Chunk, ChunkBatch
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.recordings import settings_of

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from swath.drivers.driver import find_driver
-from swath.drivers.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError
+from swath.drivers.driver import Driver, find_driver
+from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import Target
 from tests.fuzz.recordings import settings_of

@@ -13,8 +13,8 @@ from copy import deepcopy
 
 import numpy as np
 
-from swath.drivers.driver import KINDS, all_drivers
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, Parser, StreamParser
+from swath.drivers.driver import KINDS, Driver, all_drivers
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser, StreamParser
 from swath.georef.records import Chunk, ChunkBatch, Record
 from tests.drivers.harness import Outcome, assert_bytes_accounted, outcome, random_pieces
 from tests.fuzz.engine import FindingError, Target

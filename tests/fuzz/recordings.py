@@ -16,8 +16,9 @@ from swath.daemon.config.config import Config, plain_table
 from swath.daemon.config.tables import Tables
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.opening import read_candump, read_pcap
+from swath.drivers.driver import Driver
 from swath.drivers.imu.dbc.parser import DbcParser
-from swath.drivers.parser import DeviceSettings, Driver, Parser
+from swath.drivers.parser import DeviceSettings, Parser
 from swath.drivers.transports.base import TransportError
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.srep_cases import split_datagrams

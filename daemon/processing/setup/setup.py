@@ -29,8 +29,8 @@ from swath.daemon.processing.setup.models import (
     refuse_logged_gimbals,
 )
 from swath.daemon.processing.setup.terrain import terrain_of
-from swath.drivers.driver import UnknownProtocolError, find_driver
-from swath.drivers.parser import DeviceKind, DeviceSettings, Driver, DriverSettingsError, Parser
+from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError, Parser
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
 from swath.georef.mapping.frame import Mapping as MappingFrame

@@ -22,12 +22,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.nmea.sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
-from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
     FixType,

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_SHORT, RTCM3
 from swath.drivers.gnss.date_floor import ReceiverDates
@@ -27,7 +28,7 @@ from swath.drivers.gnss.novatel import tables
 from swath.drivers.gnss.novatel.records import DECODERS, Header, State
 from swath.drivers.gnss.novatel.startup import startup_messages
 from swath.drivers.gnss.record_rows import Row, join_rows
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, StreamParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, StreamParser
 from swath.georef.records import (
     Chunk,
     DeviceStatus,

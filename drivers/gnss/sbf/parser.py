@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA, RTCM3, SBF
 from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
@@ -30,7 +31,7 @@ from swath.drivers.gnss.sbf import frame as wire
 from swath.drivers.gnss.sbf import records
 from swath.drivers.gnss.sbf.records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
 from swath.drivers.gnss.sbf.startup import startup_messages
-from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
     EventMark,

@@ -26,6 +26,7 @@ import math
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
+from swath.drivers.driver import Driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
@@ -33,7 +34,7 @@ from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.gnss.ubx.fix import NavMessage, merge_epoch
 from swath.drivers.gnss.ubx.startup import startup_messages
-from swath.drivers.parser import DeviceSettings, Driver, StreamParser
+from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
     EventMark,

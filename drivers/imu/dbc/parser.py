@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.can_frames import CAN_ERR_FLAG, CAN_RTR_FLAG, decode_can_frames
+from swath.drivers.driver import Driver
 from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, LatchTracker, nanoseconds
 from swath.drivers.imu.dbc.groups import (
     Frames,
@@ -24,7 +25,7 @@ from swath.drivers.imu.dbc.groups import (
     no_frames,
 )
 from swath.drivers.imu.dbc.settings import MappedSignal, Part, SignalMap, map_signals
-from swath.drivers.parser import DeviceSettings, Driver, PacketParser
+from swath.drivers.parser import DeviceSettings, PacketParser
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     IMU_DTYPE,

@@ -16,7 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.parser import DeviceSettings, Driver, PacketParser, Parser
+from swath.drivers.driver import Driver
+from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable, FloatArray
 from swath.drivers.scanner.hesai.gps import GPS_BYTES, NS, GpsReader
 from swath.drivers.scanner.hesai.heads import QT64, XT32, HesaiHead, read_angle_file

@@ -17,7 +17,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.driver import Driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.drivers.scanner.ouster.head import FILE, SYNC_PULSE, read_head
 from swath.drivers.scanner.ouster.imu import imu_packet_bytes, imu_samples
 from swath.drivers.scanner.ouster.layout import (

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.parser import DeviceSettings, Driver, DriverSettingsError, PacketParser
+from swath.drivers.driver import Driver
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
 from swath.drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, filler, returns_table
 from swath.drivers.scanner.srep.datagrams import Datagrams, clock_samples

@@ -17,7 +17,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.parser import DeviceSettings, Driver, PacketParser, Parser
+from swath.drivers.driver import Driver
+from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable, FloatArray
 from swath.drivers.scanner.sequence import BoolArray, SampleThinner
 from swath.drivers.scanner.slots import Chosen, filler

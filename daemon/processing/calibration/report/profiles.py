@@ -12,12 +12,12 @@ import numpy as np
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.labels import decimals_of, number, unknown
-from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.calib.profiles.check import Check, Comparison
 from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
 from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.summary import Profile as Picture
+from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.daemon.processing.calibration.report.tables import Table
 
 MOST_DRAWN = 6
