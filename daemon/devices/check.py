@@ -29,7 +29,8 @@ from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.drivers.transports.can_bitrate import interface_bitrate
-from swath.drivers.transports.spec import TransportSpec, open_transport, parse_pps
+from swath.drivers.transports.opening import open_transport, parse_pps
+from swath.drivers.transports.spec import TransportSpec
 from swath.georef.records import ChunkBatch, TimeMessage
 from swath.georef.timescales import ahead_s, distance_text
 

@@ -19,7 +19,8 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.startup import Answer, StartupMessage, StartupWish
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.spec import TransportSpec, open_transport
+from swath.drivers.transports.opening import open_transport
+from swath.drivers.transports.spec import TransportSpec
 
 SLICE_S = 0.1
 SETTLE_S = 0.3  # for a device to change the rate of its line

@@ -32,7 +32,8 @@ from swath.daemon.recorder.writer import Recorder, RecorderSettings
 from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock
-from swath.drivers.transports.spec import TransportSpec, open_transport, parse_pps
+from swath.drivers.transports.opening import open_transport, parse_pps
+from swath.drivers.transports.spec import TransportSpec
 from swath.georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls

@@ -21,7 +21,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.spec import TransportSpec, open_transport
+from swath.drivers.transports.opening import open_transport
+from swath.drivers.transports.spec import TransportSpec
 
 EMPTY_LOOKS = 15  # of 10 ms, until a port counts as read to its end
 _PATIENCE_S = 1.0  # a reader that does not take its bytes for so long loses them, counted

@@ -10,8 +10,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.extras import how_to_install
-from swath.drivers.parser import DriverSettingsError
 from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, Int64Array, StructArray
 
 # Slots worked on at once: so few that columns stay in the second-level cache, so many that what NumPy spends on each
@@ -184,21 +182,6 @@ def _numbers(pulse: NDArray[np.intp], slots: int) -> tuple[NDArray[np.uint8], ND
         count[lag:] += same
         count[:-lag] += same
     return number, count
-
-
-def filler(*, compiled: bool) -> Fill:
-    """`ReturnSlots.fill`, or the same compiled.
-
-    Raises:
-        DriverSettingsError: numba is not installed.
-    """
-    if not compiled:
-        return ReturnSlots.fill
-    try:
-        from swath.drivers.scanner.slots_compiled import fill
-    except ImportError as error:
-        raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
-    return fill
 
 
 def in_order(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:

@@ -14,10 +14,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from swath.drivers.transports.base import PpsSource, Transport
-
 FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
-PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
 MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
 
@@ -96,7 +93,7 @@ def parse_transport(text: str) -> TransportSpec:
     Raises:
         ValueError: one line naming what is wrong and what would be right.
     """
-    _refuse_unprintable("transport", text)
+    refuse_unprintable("transport", text)
     kind, colon, rest = text.partition(":")
     if kind not in _CHECKS or not colon:
         raise ValueError(f"transport {text!r}: want {FORMS}")
@@ -107,7 +104,7 @@ def parse_transport(text: str) -> TransportSpec:
     return spec
 
 
-def _refuse_unprintable(what: str, text: str) -> None:
+def refuse_unprintable(what: str, text: str) -> None:
     """No path, name or address has any, and the system takes none with a zero in it."""
     if not text.isprintable():
         raise ValueError(f"{what} {text!r}: has an unprintable character in it; want a path, name or address")
@@ -311,57 +308,3 @@ _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "gnss": _check_gnss,
     "ntrip": _check_ntrip,
 }
-
-
-def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
-    """The transport for ``spec``, not yet opened; ``stopped`` is asked while opening waits for a distant computer.
-
-    Raises:
-        ValueError: the kind has no transport of its own (gnss).
-    """
-    if spec.kind == "udp":
-        from swath.drivers.transports.udp_socket import UdpTransport
-
-        return UdpTransport(spec)
-    if spec.kind == "serial":
-        from swath.drivers.transports.serial_port import SerialTransport
-
-        return SerialTransport(spec)
-    if spec.kind == "can":
-        return _open_can(spec)
-    if spec.kind == "ntrip":
-        from swath.drivers.transports.ntrip import NtripTransport
-
-        return NtripTransport(spec, stopped)
-    raise ValueError(f"transport {spec.text!r}: is inside another device's stream, there is nothing to open")
-
-
-def _open_can(spec: TransportSpec) -> Transport:
-    if spec.interface == "socketcan":
-        from swath.drivers.transports.can_socketcan import SocketCanTransport
-
-        return SocketCanTransport(spec)
-    from swath.drivers.transports.can_adapter import PythonCanTransport
-
-    return PythonCanTransport(spec)
-
-
-def parse_pps(text: str, edge: str = "assert") -> PpsSource:
-    """The PPS source for ``text``, not yet opened.
-
-    Raises:
-        ValueError: one line naming what is wrong and what would be right.
-    """
-    from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
-
-    _refuse_unprintable("PPS source", text)
-    if edge not in ("assert", "clear"):
-        raise ValueError(f"PPS edge {edge!r}: want assert or clear")
-    kind, colon, path = text.partition(":")
-    if text.startswith("/"):
-        return KernelPps(text, edge)
-    if kind == "serial-dcd" and path.startswith("/"):
-        return SerialDcdPps(path, edge)
-    if kind == "fixed" and colon and path:
-        return FixedPps(path, edge)
-    raise ValueError(f"PPS source {text!r}: want {PPS_FORMS}")

@@ -11,7 +11,8 @@ import pytest
 
 from swath.drivers.driver import Driver, all_drivers
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
-from swath.drivers.scanner.slots import PairRule, ReturnSlots, common_words, filler, in_order, returns_table
+from swath.drivers.scanner.row_writer import filler
+from swath.drivers.scanner.slots import PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.slots_compiled import fill
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser

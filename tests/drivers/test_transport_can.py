@@ -22,7 +22,8 @@ from swath.drivers.transports.can_bitrate import bitrate_of_link, interface_bitr
 from swath.drivers.transports.can_frame import pack_frame, unpack_frame
 from swath.drivers.transports.can_socketcan import SocketCanTransport
 from swath.drivers.transports.datagrams import MessageReader, ask_stamps
-from swath.drivers.transports.spec import open_transport, parse_transport
+from swath.drivers.transports.opening import open_transport
+from swath.drivers.transports.spec import parse_transport
 
 MULTICAST = "can:udp_multicast:239.74.163.2?port={}"
 

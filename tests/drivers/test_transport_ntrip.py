@@ -14,7 +14,8 @@ import pytest
 from swath.drivers.transports import ntrip as ntrip_client
 from swath.drivers.transports.base import Transport, TransportError
 from swath.drivers.transports.ntrip import NtripTransport, gga_sentence
-from swath.drivers.transports.spec import TransportSpec, open_transport, parse_transport
+from swath.drivers.transports.opening import open_transport
+from swath.drivers.transports.spec import TransportSpec, parse_transport
 from tests.drivers.caster import Caster, Script, caster, listen
 
 DATA = bytes(range(256)) * 20

@@ -8,9 +8,10 @@ import pytest
 
 from swath.drivers.transports.can_adapter import PythonCanTransport, keyword_value
 from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.opening import open_transport, parse_pps
 from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
-from swath.drivers.transports.spec import open_transport, parse_pps, parse_transport
+from swath.drivers.transports.spec import parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
 
 

@@ -33,16 +33,9 @@ from swath.drivers.scanner.ouster.layout import (
 )
 from swath.drivers.scanner.ouster.probe import OusterProbe
 from swath.drivers.scanner.ouster_health import HealthReader
+from swath.drivers.scanner.row_writer import filler
 from swath.drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
-from swath.drivers.scanner.slots import (
-    BLOCK_SLOTS,
-    PairRule,
-    ReturnSlots,
-    common_words,
-    filler,
-    in_order,
-    returns_table,
-)
+from swath.drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,

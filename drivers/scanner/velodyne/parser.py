@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable, FloatArray
+from swath.drivers.scanner.row_writer import filler
 from swath.drivers.scanner.sequence import BoolArray, SampleThinner
-from swath.drivers.scanner.slots import Chosen, filler
+from swath.drivers.scanner.slots import Chosen
 from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.drivers.scanner.stamps import StampTracker
 from swath.drivers.scanner.velodyne.calibration import read_calibration

@@ -1,0 +1,22 @@
+"""Chooses who fills the rows of returns: NumPy, or the same loops compiled."""
+
+from __future__ import annotations
+
+from swath.drivers.extras import how_to_install
+from swath.drivers.parser import DriverSettingsError
+from swath.drivers.scanner.slots import Fill, ReturnSlots
+
+
+def filler(*, compiled: bool) -> Fill:
+    """`ReturnSlots.fill`, or the same compiled.
+
+    Raises:
+        DriverSettingsError: numba is not installed.
+    """
+    if not compiled:
+        return ReturnSlots.fill
+    try:
+        from swath.drivers.scanner.slots_compiled import fill
+    except ImportError as error:
+        raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
+    return fill
