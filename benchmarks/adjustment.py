@@ -30,12 +30,11 @@ from swath.calib.flight import Flight, Head, Swath
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import Wish, unknowns
 from swath.daemon.memory import keep_freed_memory
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import Calibration, nominal
 from tests.calib.roofs import GROUND_M, LINES, NOISE, aimed, frame, ranges, trajectory
-
-FloatArray = NDArray[np.float64]
 
 SEED = 20_261_122
 TARGET_ROWS, TARGET_S, TARGET_BYTES = 3e6, 20.0, 1e9

@@ -27,12 +27,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.calibration_runs import Outcome, Reference, read_reference, run
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import PARAMETERS, read_calibration
-
-FloatArray = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parent.parent
 SEED_FILE = Path(__file__).with_name("calibration_seed.toml")

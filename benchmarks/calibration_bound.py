@@ -34,12 +34,10 @@ from swath.daemon.processing.calibration.run import prior_of
 from swath.daemon.processing.flights.read import Wish as Logs
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
 from swath.daemon.processing.setup.setup import Options
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.scanner.uncertainty import Noise
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
 from swath.sim.site import e_from_geodetic, rot_e_from_ned
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MODELS = {"basic": 4, "scanner": 8}
 NAMES = ("omega", "phi", "kappa", "range offset", "range scale", "scan angle scale", "scan plane tilt", "time offset")

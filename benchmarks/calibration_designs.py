@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.adjust import adjust
 from swath.calib.equations.normals import NormalError, TrajectoryWeight
@@ -32,8 +31,6 @@ from swath.calib.parameters import INSTALLED, MODELS, Wish, unknowns
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 from tests.calib.test_rows import shifted
-
-FloatArray = NDArray[np.float64]
 
 LIMIT = 4.0  # sigmas
 ALLOWED = 1.0 / 500.0

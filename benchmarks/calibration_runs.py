@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
 from swath.calib.adjust import adjust
@@ -30,11 +29,10 @@ from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, rep
 from swath.daemon.processing.flights.read import Wish as Logs
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
 from swath.daemon.processing.setup.setup import Options
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.cross_covariance import ErrorChain
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration, read_calibration
-
-FloatArray = NDArray[np.float64]
 
 MODEL = Wish("scanner")
 SETTINGS = Settings(huber=0.0, family=0.0)  # there are no blunders

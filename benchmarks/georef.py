@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.memory import keep_freed_memory
 from swath.georef.air.atmosphere import Air
+from swath.georef.arrays import FloatArray
 from swath.georef.georeference import BLOCK_ROWS, Georeferencer
 from swath.georef.mapping.frame import Mapping
 from swath.georef.records import RETURN_DTYPE, StructArray
@@ -33,8 +34,6 @@ from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.scanner.uncertainty import Noise, Uncertainty
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 RETURNS = 400_000
 PASSES = 5

@@ -29,8 +29,8 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, Fate, Solution
@@ -38,7 +38,6 @@ from tests.georef.navigation.flights import Fixes, Truth, drawn_start, fly, nois
 from tests.georef.navigation.honesty import judge, squares
 from tests.georef.navigation.receivers import DUAL_ANTENNAS, RECEIVERS, compared
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 LASTING = ((0.5, 60.0), (0.0, 60.0), (0.2, 60.0), (0.5, 10.0), (0.5, 300.0))  # share, s
 OPTIMISMS = {"honest": 1.0, "optimistic by 3": 3.0, "pessimistic by 3": 1.0 / 3.0}

@@ -25,14 +25,13 @@ from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.planes.matching import rematch
 from swath.calib.planes.search import find_planes
 from swath.daemon.memory import keep_freed_memory
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 STRIPS, RETURNS_PER_M = 6, 2_000  # of a strip
 HALF_WIDTH_M, HEIGHT_M = 200.0, 500.0

@@ -16,15 +16,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.memory import keep_freed_memory
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.plan import parse_plan
 from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.site import Site
-
-FloatArray = NDArray[np.float64]
 
 RAYS = 500_000
 SLOTS = 3

@@ -23,7 +23,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior, apply, draw
 from swath.calib.flight import Flight
@@ -35,11 +34,10 @@ from swath.daemon.processing.calibration.returns import read_flight, smoothed_pr
 from swath.daemon.processing.flights.read import Wish
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
 from swath.daemon.processing.setup.setup import Options
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration
 from tests.calib.cast_flight import cast_flight
 from tests.calib.village import village
-
-FloatArray = NDArray[np.float64]
 
 NEES = (0.8, 1.25)
 WAYS = ("joint covariance", "sigmas alone")

@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import astuple, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.normals import NormalError
 from swath.calib.equations.observability import spectrum
@@ -33,9 +32,9 @@ from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Considered
 from swath.calib.parameters import Unknowns, Wish, unknowns
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
-FloatArray = NDArray[np.float64]
 Rematch = Callable[[dict[str, Calibration]], Features | None]
 
 AS_USUAL = Settings()

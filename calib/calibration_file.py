@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import CONVENTIONS, PARAMETERS, Calibration, CalibrationError, read_calibration
-
-FloatArray = NDArray[np.float64]
 
 _DEG = math.pi / 180.0
 ROUNDING = 1e-9  # of a correlation with itself

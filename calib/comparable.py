@@ -7,11 +7,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.georef.scanner.calibration import PARAMETERS, BeamCorrection, Calibration
-
-FloatArray = NDArray[np.float64]
 
 LIKE = 1.0 / 3.0  # of a sigma: what differs by less adds a twentieth to the expected square
 DISTANCE_M = 500.0  # at which metres are told from angles

@@ -9,12 +9,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

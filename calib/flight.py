@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.georef.air.atmosphere import Air
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.points import Fate, Rays
 from swath.georef.records import Int64Array, StructArray
@@ -24,7 +24,6 @@ from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 Rows = Any  # slice, index array or mask of a swath's returns
 
 _ROT_L_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

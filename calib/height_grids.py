@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 SUPPORT = 0.9  # of what is typical for a swath: a kernel's share that lies on cells with points
 _TYPICAL = 75.0  # percentile of a swath's cells, how much support they have: thin samples leave cells empty

@@ -11,9 +11,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 # Nodes from a knot to the next. Read linearly they miss the cubic by 1.5 / STEPS² of what the knots differ, at most:
 # slopes are at most three secants, which bends it by 12 of these a knot's distance

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath
+from swath.georef.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 CHUNK = 1_000_000

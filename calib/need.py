@@ -12,16 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import ANGLES
 from swath.calib.strips.effects import SeenFrom, effect_columns
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
-
-FloatArray = NDArray[np.float64]
 
 POINT = "point"  # among what is wanted: of a point, metres
 SHARE = 0.5  # of a point's own sigma that a calibration may add

@@ -11,16 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots, curve, nodes_of
 from swath.calib.outcome import Held
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset
-
-FloatArray = NDArray[np.float64]
 
 _BASIC = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
 _SCANNER = (*_BASIC, "scan_angle_scale", "range_scale", "scan_plane_tilt_rad", "time_offset_s")

@@ -24,13 +24,12 @@ from swath.calib.parameters import Wish
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import CELL_SHORT_M, CELL_SIZES_M
 from swath.calib.planes.returns import RIM_M
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import boresight, rot_from_quaternion
 from swath.georef.records import RETURN_DTYPE, Int64Array
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 LEAST_POINTS = 10  # on a patch, for it to be found in a flight (FORMULAS 6.6)
 LEAST_MADE, MOST_MADE = 4, 24  # of a patch; each stands for as many as there would be

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import Segments
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _COPLANAR_M = 0.08  # by which parts of one face may lie apart in the same swath, besides their noise
 _SIGMAS = 4.0

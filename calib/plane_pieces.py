@@ -7,15 +7,12 @@ from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, sensor_t
 from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import CELLS_LEAST, Segments, cell_middles
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 FIFTHS, THIRDS, OCTANTS = 5, 3, 8
 _ROOF_SHARE = 0.8  # of all planes, where there are too many

@@ -18,10 +18,9 @@ from scipy.spatial import cKDTree
 from swath.calib.flight import Flight, Swath
 from swath.calib.height_grids import Lattice, Surface, surface
 from swath.calib.scale import Scale, area_spacing_m, scale_of
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
-
-FloatArray = NDArray[np.float64]
 
 NAMES = ("omega_rad", "phi_rad", "kappa_rad", "range_offset_m")
 _STEPS = (1e-4, 1e-4, 1e-4, 0.1)  # by which parameters are changed to see what that does

@@ -9,18 +9,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Residuals
 from swath.calib.record.values import Matrix
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, prime_vertical_radius_m, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.records import Int64Array
 from swath.georef.scanner.jacobian import observation_columns_e, parameter_columns_e
-
-FloatArray = NDArray[np.float64]
 
 MOST_ROWS = 200_000  # observations whose rows are kept; of more, every k-th
 BLOCK = 1 << 15

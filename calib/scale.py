@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, sensor_t
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 REFERENCE_HEIGHT_M = 800.0  # at which what is given in metres for any flight was found to be right
 _SAMPLE = 20_000  # returns of a swath that are looked at

@@ -6,17 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from swath.calib.calibration_file import Header
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.need import Need
 from swath.calib.outcome import Adjusted
 from swath.calib.profiles.check import Check
+from swath.georef.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 Pair = tuple[str, str]
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 
-FloatArray = NDArray[np.float64]
 ToGrid = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 STEPS = 30

@@ -20,11 +20,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray
+from swath.georef.compiled import kept
 from swath.georef.mapping.frame import Mapping, MappingError
-from swath.georef.points import ByteArray, Fate, Points, Rays, contiguous
+from swath.georef.points import Fate, Points, Rays, contiguous
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.scanner.encoder_motion import TellsMotion
-from swath.georef.scanner.kernels.columns import fill_columns
 from swath.georef.scanner.kernels.types import PointColumns
 from swath.georef.scanner.ranging import PulseRates
 from swath.georef.scanner.sensor_model import SensorModel
@@ -144,3 +145,18 @@ class Georeferencer:
         if rays.covariance_e is None:
             return rays.points_e, None
         return rays.points_e, np.sqrt(rays.covariance_e[:, [0, 3, 5]]).astype(np.float32)
+
+
+@kept
+def fill_columns(
+    rows: StructArray, time_ns: Int64Array, off_nadir_rad: FloatArray, range_m: FloatArray, to: PointColumns
+) -> None:
+    """From rows (n,) `RETURN_DTYPE` and of rays (n,)."""
+    times, angles, ranges, intensity, number, numbers, channel, zone = to
+    for i in range(len(rows)):
+        times[i] = time_ns[i]
+        angles[i], ranges[i] = off_nadir_rad[i], range_m[i]
+    for i in range(len(rows)):
+        row = rows[i]
+        intensity[i], channel[i] = row.intensity, row.channel
+        number[i], numbers[i], zone[i] = row.return_number, row.number_of_returns, row.mta_zone

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 OVERLAP_M = 40_000.0  # by which zones of UTM overlap
 DEGREE_M = 111_200.0  # of a great circle

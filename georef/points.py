@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray, SingleArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
-SingleArray = NDArray[np.float32]
-ByteArray = NDArray[np.uint8]
 
 
 def contiguous(array: NDArray[Any]) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.points import FloatArray
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
 SECOND_NS = 1_000_000_000

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.tables import AtmosphereTable
-
-FloatArray = NDArray[np.float64]
 
 ZERO_CELSIUS_K = 273.15
 CO2_PPM = 420.0

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from swath.georef.arrays import FloatArray
 from swath.sim.clocks import generator
 from swath.sim.gnss.wire import config_table as gnss_config
 from swath.sim.imu.wire import config_table as imu_config
@@ -21,7 +22,6 @@ from swath.sim.scanners.ouster_wire import os1_metadata
 from swath.sim.scanners.srep_wire import config_table as srep_config
 from swath.sim.scanners.velodyne_wire import config_table as velodyne_config
 from swath.sim.scene.scene import Scene
-from swath.sim.shots import FloatArray
 from swath.sim.site import Site, geodetic_from_e
 
 FIRST_UDP_PORT = 2368

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from swath.georef.arrays import FloatArray
 from swath.sim.atmosphere import Air
-from swath.sim.clocks import PulsePerSecond, generator
+from swath.sim.clocks import HostClock, PulsePerSecond, generator
 from swath.sim.companions import control_points_e
 from swath.sim.faults import Window, check_faults, windows, with_faults
 from swath.sim.flight.trajectory import Trajectory, fly
 from swath.sim.gnss.receiver import Receiver
 from swath.sim.gnss.wire import GnssWire
-from swath.sim.host import HostClock
 from swath.sim.imu.sensors import InertialUnit
 from swath.sim.imu.wire import ImuWire
 from swath.sim.plan.errors import PlanError
@@ -27,7 +27,7 @@ from swath.sim.scanners.calibration_files import check_latencies
 from swath.sim.scanners.ranging import Ranging
 from swath.sim.scanners.scan import Scanner
 from swath.sim.scene.scene import build_scene
-from swath.sim.shots import SURFACES, FloatArray, WireUnit
+from swath.sim.shots import SURFACES, WireUnit
 from swath.sim.site import Site
 from swath.sim.truth import POSE_TRUTH_DTYPE, RETURN_TRUTH_DTYPE, StructArray, TruthWriter
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.sim.site import geodetic_from_e
-
-FloatArray = NDArray[np.float64]
 
 # NIMA TR8350.2, tables 3.1, 3.3 and 3.4
 EARTH_RATE_RADPS = 7.292115e-5

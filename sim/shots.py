@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from swath.georef.arrays import FloatArray, IntArray
 
 SURFACES = ("none", "ground", "roof", "wall", "road", "marking", "water", "leaves", "wire", "car")
 NO_SURFACE, GROUND, ROOF, WALL, ROAD, MARKING, WATER, LEAVES, WIRE, CAR = range(len(SURFACES))

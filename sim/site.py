@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 _E_FROM_GEODETIC = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 _GEODETIC_FROM_E = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

@@ -10,16 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swath.calib.control.points import ControlRules, Ground, grounds_at
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.mapping.frame import Mapping, MappingError
 
-FloatArray = NDArray[np.float64]
 Undulation = Callable[[FloatArray], tuple[float, str] | None]  # of a position in e: metres, and by which geoid
 
 FEWEST_POINTS = 3

@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, Swath, Tangent
 from swath.calib.planes.local import LocalPlane, PlaneRules, is_inside, robust_plane
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = ("name", "lat_deg", "lon_deg", "h_ellipsoidal_m", "sigma_m")
 HEADER = ",".join(COLUMNS)

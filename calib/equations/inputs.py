@@ -6,12 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.tables import Beam, Head, Looks, Sigmas
 from swath.calib.flight import Flight, Swath
 from swath.calib.intensity_curve import at_knots, curve_by_knots
 from swath.calib.parameters import Unknowns
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Rays, contiguous
 from swath.georef.records import Int64Array
@@ -20,8 +20,6 @@ from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.kernels.types import Track
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 SECOND_NS = 1e9
 TRACKED = ("time_ns", "position_e", "q_e_from_b", "position_sigma_l", "attitude_sigma_rad")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 
 def scales(matrix: FloatArray) -> FloatArray:

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from swath.calib.equations.tables import OF_PLANE, STATES, Beam, Head, Knots, Planes, Sigmas, Task
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.vectors import cross, dot, matrix_at, plus, rot_of, times, transposed_times, vector_at
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX
-from swath.georef.scanner.kernels.types import FloatArray, Three, Track
+from swath.georef.scanner.kernels.types import Three, Track
 from swath.georef.trajectory.trajectory import locate_epoch
 
 _LEAST_COSINE_2 = 0.01  # of the incidence: no footprint grows without end

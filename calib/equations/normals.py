@@ -14,17 +14,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from swath.calib.equations.inverse import inverted, scales
-from swath.calib.equations.rows import Rows, SingleArray, State, tangents
+from swath.calib.equations.rows import Rows, State, tangents
 from swath.calib.equations.tables import OF_PLANE
 from swath.calib.equations.tie_rows import Seen, Ties, covariance_t
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 FLOOR = 1e-12  # of a plane's or tie point's normal matrix: what lies below it is not determined and stays
 

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from swath.calib.labels import sized
 from swath.calib.outcome import Held
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
-
-FloatArray = NDArray[np.float64]
 
 ALIKE = 0.8  # from here on two parameters take each other's errors
 NOTHING = 300.0  # sigma in plausible sizes that is as good as none

@@ -13,16 +13,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.normals import Extra, Feature, Normals, TrajectoryWeight, extras
 from swath.calib.equations.robust import least_detectable
-from swath.calib.equations.rows import Batch, Rows, Run, SingleArray, State
+from swath.calib.equations.rows import Batch, Rows, Run, State
 from swath.calib.equations.tables import OF_PLANE
 from swath.calib.equations.tie_rows import Seen, Ties
 from swath.calib.outcome import ControlFit, GroupFit, Residuals, TrajectoryFit
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray, SingleArray
 
 BLOCK = 1 << 20  # residuals summed up at a time
 

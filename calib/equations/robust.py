@@ -9,10 +9,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 HUBER = 1.5  # sigmas, from which an observation loses weight
 LEVEL = 0.001  # α0 of a single test (Baarda 1968)

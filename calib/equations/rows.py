@@ -15,7 +15,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.inputs import beam_table, head_table, new_looks, rays_of, sigmas_of, track_of, writeable
 from swath.calib.equations.sums import MODE_GIVE, MODE_LOOK, MODE_SUM, go_over
@@ -28,14 +27,12 @@ from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Plane
 from swath.calib.flight import Flight, Swath
 from swath.calib.parameters import BEAM_PARTS, Unknowns
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.points import contiguous
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.sensor_model import SensorModel
-
-FloatArray = NDArray[np.float64]
-SingleArray = NDArray[np.float32]
 
 BATCH = 16_384  # returns placed at once: what is known of them stays in the second cache
 SECOND_NS = 1e9

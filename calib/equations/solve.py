@@ -6,22 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.normals import Normals, TrajectoryWeight, moved, normals
 from swath.calib.equations.observability import Rules, decide
 from swath.calib.equations.quality import Quality, Solution, examine
 from swath.calib.equations.robust import HUBER, w_critical
-from swath.calib.equations.rows import Rows, SingleArray, State
+from swath.calib.equations.rows import Rows, State
 from swath.calib.equations.tie_rows import Ties
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Residuals
 from swath.calib.parameters import Unknowns
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 NOISE_TELLS = 1000.0  # redundancy from which on residuals say how much a scanner's returns scatter
 FEW = 1e-5  # of the rows: whether so many are rejected or not moves nothing

@@ -9,10 +9,11 @@ import numpy as np
 
 from swath.calib.equations.kernels import ALONG, AZIMUTH, COMMON, MISCLOSURE, ROWS, SPEED, VARIANCE, fill
 from swath.calib.equations.tables import OF_PLANE, STATES, Groups, Head, Knots, Looks, Sums, Task
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel, whole
 from swath.georef.geodesy.vectors import vector_at
 from swath.georef.records import Int64Array
-from swath.georef.scanner.kernels.types import FloatArray, Three
+from swath.georef.scanner.kernels.types import Three
 
 PIECE = 256  # returns at once
 MODE_SUM, MODE_LOOK, MODE_GIVE = whole(0), whole(1), whole(2)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.records import Int64Array, StructArray
-from swath.georef.scanner.kernels.types import ByteArray, FloatArray, Track
+from swath.georef.scanner.kernels.types import Track
 
 STATES, OF_PLANE = 8, 3  # columns of a row
 

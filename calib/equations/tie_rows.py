@@ -12,17 +12,15 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.inputs import new_looks
 from swath.calib.equations.rows import Batch, Rows, Run, State
 from swath.calib.equations.sums import MODE_GIVE, go_over
 from swath.calib.equations.tables import Planes as PlaneTable
 from swath.calib.features import ControlPoint, Sighting, TiePoint
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 AT_ONCE = 4096  # sightings
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.inverse import inverted
 from swath.calib.flight import Flight, FlightError
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import product
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
@@ -26,8 +26,6 @@ from swath.georef.navigation.cross_covariance import ErrorChain
 from swath.georef.records import Int64Array
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory, gps_text
-
-FloatArray = NDArray[np.float64]
 
 ERRORS = 6  # a knot
 MOST_KNOTS = 400  # (2400, 2400) is factorised at every linearisation

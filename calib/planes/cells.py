@@ -31,10 +31,9 @@ from swath.calib.planes.kernels import (
     grow,
 )
 from swath.calib.scale import spacing_m
+from swath.georef.arrays import FloatArray
 from swath.georef.points import contiguous
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 BLOCK = 1 << 18  # returns handed to a kernel at a time: mapped ones are copied so many at a time
 PIECE = 4 << 20  # returns a grid is laid over

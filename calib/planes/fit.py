@@ -8,14 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, sensor_t
 from swath.calib.plane_settings import PlaneSettings
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.uncertainty import Noise
-
-FloatArray = NDArray[np.float64]
 
 GATE = 4.0  # sigmas within which a return belongs to a plane
 _ROUNDS = 10

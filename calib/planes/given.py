@@ -14,9 +14,9 @@ from swath.calib.plane_settings import PlaneError, PlaneSettings, scaled_to
 from swath.calib.planes.cells import cell_size, keys_of
 from swath.calib.planes.fit import GATE, expected_sigma
 from swath.calib.planes.returns import plane_of, returns_near, sights_of
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
-FloatArray = NDArray[np.float64]
 Rings = Mapping[str, FloatArray] | Sequence[tuple[str, FloatArray]]
 
 _DEFAULT = PlaneSettings()

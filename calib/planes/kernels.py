@@ -11,11 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.compiled import kept, kernel, whole
 from swath.georef.records import Int64Array
 
-FloatArray = NDArray[np.float64]
-ByteArray = NDArray[np.uint8]
 Int32Array = NDArray[np.int32]
 
 MOMENTS = 10

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 TRIPLES = 60  # of returns that a first plane is drawn through
 INLIER_SIGMAS = 3.0

@@ -22,8 +22,6 @@ from swath.calib.planes.fit import GATE, Sight, fit_sight, refusal
 from swath.calib.planes.returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
 from swath.georef.records import Int64Array
 
-FloatArray = NDArray[np.float64]
-
 LOST = "no longer fits"
 _DEFAULT = PlaneSettings()
 _SLACK = 1.5  # of the tests, for what was a plane before

@@ -15,9 +15,8 @@ from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import BLOCK, blocks, keys_of
 from swath.calib.planes.fit import Sight, fit_sight, refusal
 from swath.calib.planes.kernels import fill_table, gather
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 WIDE_M = 0.5  # within which of a plane returns are looked at
 RIM_M = 0.5  # of a face: so far beyond a fold of 17° the other face is 0.15 m off, and out of a gate of that

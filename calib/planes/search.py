@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight, sensor_t
@@ -24,11 +23,11 @@ from swath.calib.planes.cells import Segments, cell_size, segments_of
 from swath.calib.planes.fit import GATE, expected_sigma
 from swath.calib.planes.given import given_planes
 from swath.calib.planes.returns import WIDE_M, cells_of, named, plane_of, pure, returns_near, sights_of, well_inside
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 
 __all__ = ["PlaneError", "PlaneRow", "PlaneSettings", "find_planes", "given_planes", "plane_rows"]
 
-FloatArray = NDArray[np.float64]
 _DEFAULT = PlaneSettings()
 _ROUNDS = 4
 

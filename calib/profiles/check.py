@@ -25,7 +25,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint
@@ -34,9 +33,8 @@ from swath.calib.outcome import Adjusted
 from swath.calib.profiles.influence import Influence, influence
 from swath.calib.profiles.measure import KINDS, PARAMETER, Settings
 from swath.calib.profiles.stepwise import MISSING, Profile, survey
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
-
-FloatArray = NDArray[np.float64]
 
 CHECK = Settings(search_rad=1e-4, most_a_pair=2)  # the strips lie on each other already
 

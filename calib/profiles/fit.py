@@ -16,14 +16,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight
 from swath.calib.profiles.places import Track
 from swath.calib.profiles.sections import Pieces
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from swath.georef.arrays import BoolArray, FloatArray
 
 STATES = 6  # a swath: north, east, down, roll, pitch, heading
 TURNS = {"roll": 3, "pitch": 4, "heading": 5}  # the trajectory's error that is the same as the angle's

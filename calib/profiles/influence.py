@@ -6,17 +6,15 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import ERRORS, TrajectoryPrior
 from swath.calib.flight import Flight, Swath
 from swath.calib.profiles.measure import PARAMETER, Ground
 from swath.calib.profiles.sections import Corridor
 from swath.calib.profiles.stepwise import Profile
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
-
-FloatArray = NDArray[np.float64]
 
 STEP = {"rad": 1e-5, "m": 1e-3, "s": 1e-6}  # of a parameter, by its unit; else
 PURE_STEP = 1e-5

@@ -14,9 +14,9 @@ from swath.calib.flight import Flight, Swath
 from swath.calib.profiles.fit import TURNS, Fit, comparable, levers, solve, trajectory_sigmas
 from swath.calib.profiles.places import SAMPLES, Place, Track
 from swath.calib.profiles.sections import Corridor, Pieces, best_shift, fit_pieces, heights_by_bin
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration
 
-FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 Drawn = tuple[FloatArray, FloatArray]
 """Distances and heights (n,)."""

@@ -10,14 +10,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath
 from swath.calib.profiles.sections import Corridor
+from swath.georef.arrays import FloatArray
 from swath.georef.points import Fate
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 SAMPLES = 2000  # returns of a swath from which its track is known
 PARALLEL = 0.985  # least cosine between tracks that count as parallel: 10°

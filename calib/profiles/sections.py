@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import BoolArray, FloatArray
+
 IndexArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 ROUNDS = 3  # of a piece's plane: once from all its returns, then without those far off
 FAR = 3.0  # beyond so many times the median deviation (as a sigma) a return is left out

@@ -17,7 +17,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
@@ -25,9 +24,8 @@ from swath.calib.profiles.measure import KINDS, PARAMETER, Ground, Measured, Set
 from swath.calib.profiles.places import Place, Track, places, tracks_of
 from swath.calib.profiles.sections import Corridor
 from swath.calib.profiles.targets import measure_range
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 _DEFAULT = Settings()
 

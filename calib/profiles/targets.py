@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
@@ -15,9 +14,8 @@ from swath.calib.profiles.fit import levers, solve, trajectory_sigmas
 from swath.calib.profiles.measure import Ground, Measured, Settings, part_of
 from swath.calib.profiles.places import Track
 from swath.calib.profiles.sections import Corridor, fit_pieces
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 
 def measure_range(

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.calibration_file import Header
 from swath.calib.features import ControlPoint, Features
@@ -15,11 +14,11 @@ from swath.calib.labels import unknown
 from swath.calib.outcome import Adjusted, TrajectoryFit
 from swath.calib.record.values import Matrix, Value, utc_text
 from swath.calib.record_matrices import matrices_of
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.geodesy.rotations import boresight
 from swath.georef.scanner.calibration import INDEX, Calibration
 
-FloatArray = NDArray[np.float64]
 Found = dict[str, Value]
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")

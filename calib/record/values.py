@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
-
-FloatArray = NDArray[np.float64]
 
 INLINE = 400  # numbers a matrix may have to stand in the record itself
 

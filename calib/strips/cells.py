@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Swath
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 BLOCK = 1_000_000  # returns that are looked through at a time
 RETURNS_A_CELL = 16.0

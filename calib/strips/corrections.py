@@ -22,21 +22,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.equations.normals import Normals, TrajectoryWeight, normals
-from swath.calib.equations.rows import Rows, SingleArray, State
+from swath.calib.equations.rows import Rows, State
 from swath.calib.equations.tie_rows import Ties
 from swath.calib.equations.trajectory_prior import ERRORS, TrajectoryPrior, apply, knots_of
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import TrajectoryFit
 from swath.calib.parameters import Wish, unknowns
+from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 MODELS = ("none", "constant", "linear", "spline")
 MOST_CHOSEN_SINGLY = 30  # strips; with more, all get one model

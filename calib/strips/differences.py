@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from swath.calib.flight import Flight
 from swath.calib.strips.cells import FlightStrip, Gathered, StripRules, blocks_of, gather, overlap_cells
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 OVERLAP_SLOPE_DEG = 10.0  # USGS: overlap is judged on gentler slopes only
 GENTLE = math.cos(math.radians(OVERLAP_SLOPE_DEG))  # least vertical part of their normals

@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.records import Int64Array
 from swath.georef.scanner.beams import SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.trajectory.trajectory import Poses, Trajectory
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

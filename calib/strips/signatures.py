@@ -22,12 +22,11 @@ from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior
 from swath.calib.flight import FlightError
 from swath.calib.strips.differences import Checks
 from swath.calib.strips.effects import EFFECTS, NAMES, Effect, SeenFrom, effect_columns, error_columns
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.records import Int64Array
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 SIGNIFICANT = 3.29  # sigmas; one in a thousand by chance
 MATTERS_M = 0.01  # on the ground, at the swath's edge

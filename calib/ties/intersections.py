@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swath.calib.features import Features, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 LEAST_RMS_M = 0.002  # no patch is taken for smoother than this
 SPACINGS = 2.5  # patches that end so many point spacings from a line may yet meet in it

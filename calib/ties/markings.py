@@ -19,8 +19,7 @@ from scipy.signal import fftconvolve
 from swath.calib.features import Features, Sighting, TiePoint
 from swath.calib.flight import Flight, Swath
 from swath.calib.marking_squares import Grid, Square, grid_of, near, squares_of
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 THIN = 0.05  # smoothed returns a cell below which an image has a hole, as a share of their mean
 

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Sighting, TiePoint
 from swath.calib.flight import Flight, Swath
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 HEADER = ("name", "strip", "x", "y", "z", "sigma_m")
 FARTHEST = 1e9  # in any unit of a map

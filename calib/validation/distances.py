@@ -19,11 +19,10 @@ from swath.calib.features import ControlPoint, Features, Plane
 from swath.calib.flight import Flight
 from swath.calib.planes.local import LocalPlane, plane_through
 from swath.calib.strips.effects import EFFECTS, SeenFrom, effect_columns
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX, Calibration
-
-FloatArray = NDArray[np.float64]
 
 FLOOR_M = 0.003  # of a distance, at most: what natural planes differ by from one sight to another
 HALF = math.sqrt(0.5)  # of the floor, each sight's

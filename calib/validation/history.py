@@ -14,13 +14,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.comparable import difference_between
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
-
-FloatArray = NDArray[np.float64]
 
 BORESIGHT = ("omega_rad", "phi_rad", "kappa_rad")
 ALPHA = 0.001

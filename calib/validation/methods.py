@@ -29,10 +29,9 @@ from swath.calib.strips.differences import Numbers
 from swath.calib.strips.effects import EFFECTS
 from swath.calib.validation.distances import Rows, control_rows, estimated_floor_m, plane_rows
 from swath.calib.validation.history import Compared, compare
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
-
-FloatArray = NDArray[np.float64]
 
 ALPHA = 0.001  # of each test: one true calibration in a thousand fails it
 POWER = 0.8  # with which an error of the size told would have been found

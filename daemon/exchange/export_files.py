@@ -24,7 +24,7 @@ from swath.drivers.captures.pcap_writer import (
     largest_payload,
     pcap_frames,
 )
-from swath.drivers.transports.rtklib_tag import TagWriter
+from swath.drivers.captures.serial import TagWriter
 from swath.drivers.transports.spec import TransportSpec, parse_transport
 from swath.georef.records import Int64Array
 

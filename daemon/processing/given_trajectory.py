@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.processing.navigation.observations import fix_observations, gps_times
 from swath.georef.agreement import (
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from swath.daemon.processing.setup.setup import Setup
     from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 
 REFUSED_M, REFUSED_SIGMAS, WARNED_SIGMAS = 3.0, 20.0, 5.0
 UNLIKE = 0.3  # correlation of turn rates below which two motions are hardly one

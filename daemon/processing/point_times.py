@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from laspy.header import GpsTimeType
-from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection, open_points
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import (
     GPS_EPOCH,
@@ -29,8 +28,6 @@ from swath.georef.timescales.gps_time import (
     WEEK_NS,
     WEEK_S,
 )
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 SAMPLED_POINTS = 1000
 OF_WEEK_BELOW_S = 2 * WEEK_S  # a flight that goes on beyond the week's end may be counted on

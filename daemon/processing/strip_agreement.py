@@ -28,9 +28,8 @@ from swath.daemon.processing.quicklook.strips import (
     compare,
     strip_frame,
 )
+from swath.georef.arrays import FloatArray
 from swath.georef.mapping.frame import Mapping
-
-FloatArray = NDArray[np.float64]
 
 BLOCK_POINTS = 500_000
 BORDER_M = 5.0  # around a flight's points in t, so that the map's corners hold them all

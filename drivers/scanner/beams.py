@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import StructArray
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray
 from swath.georef.records import Int64Array
-
-BoolArray = NDArray[np.bool_]
 
 _U32 = 1 << 32
 LATE_DATAGRAMS = 64  # a datagram at most this far behind its place was delayed by the network; further: a restart

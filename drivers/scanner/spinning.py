@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.scanner.beams import FloatArray
 from swath.drivers.scanner.slots import (
     BLOCK_SLOTS,
     Chosen,
@@ -20,6 +19,7 @@ from swath.drivers.scanner.slots import (
     in_order,
     returns_table,
 )
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array, StructArray
 
 # A return as one 32-bit number: range, reflectivity, and 1 for a pair's second. ``strength`` is all but the range.

@@ -11,13 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.earth import A_M, B_M, E2, EP2
-
-FloatArray = NDArray[np.float64]
 
 FLOOR_M, STEP_M, CELLS = -1000.0, 250.0, 84
 TOP_M = FLOOR_M + STEP_M * CELLS

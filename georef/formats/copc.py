@@ -16,10 +16,11 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept
 from swath.georef.formats.las import BLOCK, Clipped, LasSettings, PointPacker
 from swath.georef.formats.las_header import POINT_FORMAT, LasHeader, encode_copc_info, encode_evlr, encode_vlr
-from swath.georef.points import FloatArray, Points
+from swath.georef.points import Points
 from swath.georef.records import Int64Array
 
 NODE_POINTS = 65_536

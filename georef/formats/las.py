@@ -15,9 +15,10 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray, SingleArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
-from swath.georef.points import ByteArray, FloatArray, Points, SingleArray
+from swath.georef.points import Points
 from swath.georef.records import Int64Array
 
 ADJUSTED_GPS_EPOCH_S = 1_000_000_000

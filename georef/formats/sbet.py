@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.trajectory_columns import (
     Span,
     TrajectoryColumns,
@@ -31,8 +32,6 @@ from swath.georef.geodesy.quaternions import conjugate, rotated
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
-
-FloatArray = NDArray[np.float64]
 
 SBET_DOUBLES, SMRMSG_DOUBLES = 17, 10
 SBET_BYTES, SMRMSG_BYTES = 8 * SBET_DOUBLES, 8 * SMRMSG_DOUBLES

@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import (
@@ -19,8 +18,6 @@ from swath.georef.timescales.gps_time import (
     table_leap_seconds,
 )
 from swath.georef.trajectory.trajectory import TrajectoryError
-
-FloatArray = NDArray[np.float64]
 
 CLOCK = re.compile(r"(\d\d?):(\d\d?):(\d\d?(?:\.\d*)?)", re.ASCII)
 WEEK, SECONDS = re.compile(r"\d{1,4}", re.ASCII), re.compile(r"\d{1,7}(\.\d*)?", re.ASCII)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, WEEK_NS, WEEK_S, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
-FloatArray = NDArray[np.float64]
 Span = tuple[int, int]
 
 LOWEST_M, HIGHEST_M = -1000.0, 50_000.0

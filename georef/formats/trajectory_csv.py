@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.trajectory_columns import TrajectoryColumns, unsaid
 from swath.georef.geodesy.earth import meridian_radius_m, prime_vertical_radius_m
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
-
-FloatArray = NDArray[np.float64]
 
 HEADER = "gps_ns,lat_deg,lon_deg,height_m,vel_n_mps,vel_e_mps,vel_d_mps,roll_deg,pitch_deg,heading_deg"
 COLUMNS = HEADER.split(",")

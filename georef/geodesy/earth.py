@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
-
-FloatArray = NDArray[np.float64]
 
 A_M = 6_378_137.0
 F = 1.0 / 298.257223563

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.earth import A_M, B_M, E2, EP2, F
 from swath.georef.scanner.kernels.types import Matrix, Three
-
-FloatArray = NDArray[np.float64]
 
 EARTH_RATE_RADPS = 7.292115e-5  # NIMA TR8350.2, table 3.1
 EQUATOR_GRAVITY_MPS2 = 9.7803253359  # table 3.4

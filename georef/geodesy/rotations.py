@@ -7,11 +7,10 @@ length, scalar first. Functions take angles (…,) in radians and give (…, 3, 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import rot_e_from_l
-
-FloatArray = NDArray[np.float64]
 
 
 def rot_x(angle_rad: ArrayLike) -> FloatArray:

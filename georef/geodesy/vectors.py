@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kernel
-from swath.georef.scanner.kernels.types import FloatArray, Matrix, Three
+from swath.georef.scanner.kernels.types import Matrix, Three
 
 SMALL_ANGLE_2 = 1e-2  # below 0.1 rad the series below are exact to the last bit
 LARGE_ANGLE = 1e5  # up to here a whole number of quarter turns times the first part of π/2 is exact

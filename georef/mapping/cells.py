@@ -15,10 +15,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.compiled import kept, kernel
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Exact = Callable[[FloatArray], FloatArray]
 
 APPROXIMATION_M = 1e-4

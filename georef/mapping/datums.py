@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.crs import CoordinateOperation
 from pyproj.datadir import get_user_data_dir
@@ -24,9 +23,9 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.network import set_network_enabled
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import A_M, B_M, e_from_geodetic, geodetic_from_e
 
-FloatArray = NDArray[np.float64]
 Area = tuple[float, float, float, float]
 
 ACCURACY_M = 0.05

@@ -18,6 +18,7 @@ from pyproj.database import get_database_metadata
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.map_fit import degrees_text, misfit_of, outside_deg
 from swath.georef.mapping.cells import APPROXIMATION_M, ROOT_M, MapCells
@@ -35,7 +36,6 @@ from swath.georef.mapping.datums import (
 
 __all__ = ["Mapping", "MappingError"]
 
-FloatArray = NDArray[np.float64]
 
 EPOCHS = (1980.0, 2100.0)
 NEARBY_DEG = 0.5

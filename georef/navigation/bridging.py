@@ -15,13 +15,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.navigation.filter.strapdown import Samples
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 UNKNOWN_RATE_RADPS, UNKNOWN_FORCE_MPS2 = 0.05, 1.0  # how wrong a made-up sample may be while nothing is known
 LEVELS = 7

@@ -18,8 +18,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Kind, Setup
 from swath.georef.navigation.noise import (
     ENOUGH,
@@ -34,8 +34,6 @@ from swath.georef.navigation.noise import (
 )
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 LONGEST_S = 1000.0  # beyond, an error lasts for the whole flight as far as ten minutes tell
 LEAST_SHARE = 1e-4

@@ -10,13 +10,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 ARM_UNSAID_M = 2.0  # prior sigma of a lever arm that nobody says: it is estimated with the flight
 _SQRT_HOUR = 60.0  # √3600 s

@@ -26,13 +26,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.navigation.inputs import Fate, Kind, Setup
 from swath.georef.records import StructArray
 
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
 Run = Callable[[Setup], StructArray]
 
 ENOUGH = 120  # components of one source: 60 positions' horizontal ones

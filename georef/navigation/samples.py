@@ -13,12 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.navigation.inputs import Inertial, NavigationError
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 SampleRule = Literal["mean", "instant", "increment"]
 StampRule = Literal["end", "middle", "start"]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
@@ -27,8 +28,6 @@ from swath.georef.navigation.inputs import Inertial, Setup, Solution, Start
 from swath.georef.navigation.noise import OF_GNSS, NoiseFound, Run, find_noise, not_blunders, rescaled
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 MOST_PASSES = 3
 STRETCH_S = 600.0  # of the flight, on which hypotheses of noise are compared

@@ -7,15 +7,12 @@ be a hover or a slow roll.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 TURN_RADPS = 4e-3  # mean of a second: above it something turns; biases of a good unit are below
 FORCE_MPS2 = 0.08  # by which means of neighbouring seconds may differ

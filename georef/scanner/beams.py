@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration, is_rotation
 from swath.georef.scanner.kernels.beam import (
     BY_CHANNEL,
@@ -29,8 +29,6 @@ from swath.georef.scanner.kernels.beam import (
     RISLEY,
     SPINNING,
 )
-
-FloatArray = NDArray[np.float64]
 
 PRISM_RATIO = -93.0 / 128.0
 _NO_PLANE = ("scan_plane_tilt_rad", "pitch_slope")

@@ -12,11 +12,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.toml_tables import TomlError, key_text, toml_tables
-
-FloatArray = NDArray[np.float64]
 
 CONVENTIONS = 1  # version of docs/conventions.md
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")

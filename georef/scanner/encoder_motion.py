@@ -11,13 +11,12 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.return_rows import joined, words
 from swath.georef.scanner.kernels.motion import PLACE, REACH, TRAIN, cut, rates
 
-FloatArray = NDArray[np.float64]
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
 
 

@@ -7,16 +7,14 @@ the bending of the beam and, of the time offset, the gimbal's own motion.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_x, rot_y
 from swath.georef.points import Rays
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 OBSERVATIONS = ("x_e", "y_e", "z_e", "roll_rad", "pitch_rad", "heading_rad", "range_m", "encoder_rad")
 _SECOND_NS = 1e9

@@ -17,10 +17,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_l_from_b
 from swath.georef.records import Int64Array, StructArray
 
-FloatArray = NDArray[np.float64]
 DEFAULT_MAX_GAP_NS = 1_000_000_000
 
 

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.scanner.kernels.zones import (
     AMBIGUOUS,
@@ -33,8 +34,6 @@ from swath.georef.scanner.kernels.zones import (
     TICKS,
     resolve_zones,
 )
-
-FloatArray = NDArray[np.float64]
 
 ZONE_UNKNOWN = 255
 CONTEXT_FLAG = 128  # of a row's flags: it is there for its neighbours only

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.georef.air.atmosphere import Air
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_x, rot_y, rot_z
 from swath.georef.points import Fate, Rays, contiguous
 from swath.georef.records import Int64Array, StructArray
@@ -26,8 +26,6 @@ from swath.georef.scanner.kernels.types import Axes, Model, Mounted, Out, Rangin
 from swath.georef.scanner.mount import Mount
 from swath.georef.scanner.uncertainty import Uncertainty
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 IBRC_STEPS_A_KNOT = 16
 PRF_TOLERANCE = 0.01  # a nominal rate matches a measured one

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_x, rot_y
 from swath.georef.points import contiguous
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
@@ -35,7 +35,6 @@ from swath.georef.scanner.kernels.covariance import (
 )
 from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 _NONE = np.zeros(0)
 _ALONE = {
     "range_offset_m": LONGER,

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.points import FATE_NAMES, ByteArray, Fate, Points
+from swath.georef.arrays import ByteArray
+from swath.georef.points import FATE_NAMES, Fate, Points
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.return_rows import Held, any_has, beyond, compact, joined, split, taken
 from swath.georef.stream.clocks import StreamClocks

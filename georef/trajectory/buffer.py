@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.geodesy.quaternions import rotations_between
 from swath.georef.records import INS_DTYPE, Int64Array, StructArray
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 SIGMA_HOLDS_NS = 2_500_000_000  # INSPVAX says sigmas once a second beside INSPVAS, which has none
 FIRST_CAPACITY = 4096

@@ -13,17 +13,16 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_plumb
-from swath.georef.points import ByteArray, Fate
+from swath.georef.points import Fate
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS, week_from_gps
-
-FloatArray = NDArray[np.float64]
 
 DEFAULT_MAX_GAP_NS = 150_000_000  # 10 Hz with jitter; a missing epoch of 10 Hz may hide 15 mm and 1 mrad
 EARTH_RATE_RADPS = 7.292115e-5  # WGS 84

@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS, table_leap_seconds, utc_from_gps
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 STEP_NS = 50_000_000  # aircraft turn slower than 10 Hz, their engines faster
 REACH_S = 20.0  # more than all leap seconds

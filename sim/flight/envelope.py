@@ -7,14 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.route import Turning
 from swath.sim.flight.smoothing import PEAK, SPLINE_REACH, STEP_S
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import FlightTable, LineTable, Tables
 
-FloatArray = NDArray[np.float64]
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
 
 GRAVITY_MPS2 = 9.80665

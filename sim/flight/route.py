@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 TURN = 2.0 * math.pi
 _NO_TURN_RAD = 1e-9  # an angle this little short of a whole turn is rounding

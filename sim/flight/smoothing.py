@@ -8,10 +8,9 @@ their ends.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 STEP_S = 1.0 / 32.0  # between knots; exact in binary
 SPLINE_REACH = 5  # knots as far as which one value changes the spline

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
+from swath.georef.arrays import FloatArray
 from swath.sim.clocks import generator
 from swath.sim.flight.smoothing import STEP_S
-
-FloatArray = NDArray[np.float64]
 
 INTENSITY = {"none": 0.0, "light": 1.0, "moderate": 2.5, "severe": 5.0}
 VELOCITY_RMS_MPS = {"east": 0.2, "north": 0.2, "up": 0.3}  # in light turbulence

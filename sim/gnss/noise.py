@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
-from swath.sim.clocks import FloatArray, generator
+from swath.georef.arrays import FloatArray
+from swath.sim.clocks import generator
 
 BLOCK_ROWS = 512
 

@@ -10,16 +10,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.records import FixType
 from swath.sim.gnss import grades
 from swath.sim.gnss.noise import Noise
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import GnssTable
-from swath.sim.site import FloatArray, e_from_geodetic, geodetic_from_e, rot_e_from_ned
-
-IntArray = NDArray[np.int64]
+from swath.sim.site import e_from_geodetic, geodetic_from_e, rot_e_from_ned
 
 INS_RATE_HZ = 100
 VELOCITY_AGE_S = {"novatel": 0.05, "ubx": 0.0, "nmea": 0.0}  # velocity lags its epoch; BESTVEL says by how much

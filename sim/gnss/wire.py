@@ -3,26 +3,95 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from swath.drivers.gnss.nmea.sentences import (
+    encode_gga,
+    encode_gst,
+    encode_hdt,
+    encode_rmc,
+    encode_sentence,
+    encode_vtg,
+    encode_zda,
+)
 from swath.georef.records import FixType
 from swath.sim.clocks import PulsePerSecond, generator
-from swath.sim.gnss.calendar import Calendar
-from swath.sim.gnss.nmea import NmeaMessages
+from swath.sim.gnss.calendar import Calendar, Stamp
 from swath.sim.gnss.noise import Noise
 from swath.sim.gnss.novatel import NovatelMessages
 from swath.sim.gnss.pulse import Pulse
 from swath.sim.gnss.receiver import INS_RATE_HZ, Epochs, InsEpochs, Receiver
-from swath.sim.gnss.serial_line import BITS_PER_BYTE, SerialLine
 from swath.sim.gnss.ubx import UbxMessages
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import GnssTable
 from swath.sim.shots import WireUnit
+
+QUALITY = {FixType.SINGLE: 1, FixType.RTK_FIXED: 4, FixType.RTK_FLOAT: 5}  # GGA field 6
+
+
+class NmeaMessages:
+    """Encodes the sentences of an epoch; arguments as `swath.sim.gnss.novatel.NovatelMessages`."""
+
+    def __init__(self, table: GnssTable, calendar: Calendar, pulse: Pulse) -> None:
+        self._calendar = calendar
+        self._undulation_m = table.undulation_m
+        self._two_antennas = table.secondary_lever_arm_m is not None
+
+    def epoch(self, epochs: Epochs, row: int) -> list[bytes]:
+        """GGA, RMC, on whole seconds ZDA, VTG, GST, with a second antenna HDT: the direction of the baseline."""
+        stamp = self._calendar.at(float(epochs.time_s[row]))
+        there = epochs.fix[row] != FixType.NONE
+        sentences = self._solution(epochs, row, stamp) if there else _no_solution(stamp)
+        if stamp.second is not None:  # not last: what ends an epoch is in every epoch
+            sentences.insert(2, encode_zda(stamp.day_ns, stamp.date))
+        if self._two_antennas:
+            sentences.append(encode_hdt(float(epochs.heading_rad[row])) if there else encode_sentence("GNHDT,,T"))
+        return sentences
+
+    def ins_epoch(self, ins: InsEpochs, row: int) -> list[bytes]:
+        """NMEA receivers have no INS here."""
+        return []
+
+    def _solution(self, epochs: Epochs, row: int, stamp: Stamp) -> list[bytes]:
+        lat_rad, lon_rad = float(epochs.lat_rad[row]), float(epochs.lon_rad[row])
+        north, east, _ = map(float, epochs.velocity_l[row])
+        speed_mps, course_rad = math.hypot(north, east), math.atan2(east, north)
+        gga = encode_gga(
+            stamp.day_ns,
+            lat_rad,
+            lon_rad,
+            float(epochs.height_m[row]) - self._undulation_m,
+            self._undulation_m,
+            quality=QUALITY[FixType(int(epochs.fix[row]))],
+            satellites=int(epochs.satellites[row]),
+        )
+        return [
+            gga,
+            encode_rmc(stamp.day_ns, stamp.date, lat_rad, lon_rad, speed_mps, course_rad),
+            encode_vtg(speed_mps, course_rad),
+            encode_gst(stamp.day_ns, *map(float, epochs.position_sigma_l[row])),
+        ]
+
+
+def _no_solution(stamp: Stamp) -> list[bytes]:
+    """Time goes on; what there is no solution for stays empty."""
+    hour, minute, ms = stamp.clock
+    time = f"{hour:02d}{minute:02d}{ms / 1000.0:05.2f}"
+    return [
+        encode_sentence(f"GNGGA,{time},,,,,0,00,99.99,,,,,,"),
+        encode_sentence(f"GNRMC,{time},V,,,,,,,{stamp.date:%d%m%y},,,N"),
+        encode_sentence("GNVTG,,T,,M,,N,,K,N"),
+        encode_sentence(f"GNGST,{time},,,,,,,"),
+    ]
+
+
+BITS_PER_BYTE = 10  # 8N1
 
 VARIATION_S = 0.002  # one sigma of what an epoch takes longer than the least
 GREATEST_VARIATION_S = 0.010
@@ -198,3 +267,51 @@ def _lateness_s(table: GnssTable, second: list[tuple[float, int]], read_s: float
             if time_s == 0.0:
                 latest_s = max(latest_s, free_s - start_s + read_s)
     return latest_s
+
+
+class SerialLine:
+    """From a device to the recorder.
+
+    Args:
+        baud: bits a second.
+        read_s: from read to read.
+        first_read_s: when the recorder reads first.
+    """
+
+    def __init__(self, baud: int, read_s: float, first_read_s: float) -> None:
+        self._byte_s = BITS_PER_BYTE / baud
+        self._read_s, self._first_read_s = read_s, first_read_s
+        self._free_s = 0.0
+        self._queue: deque[tuple[float, bytes]] = deque()
+        self._taken = 0  # bytes of the queue's first message
+        self._reads = 0
+
+    def send(self, time_s: float, data: bytes) -> None:
+        """Put bytes behind those still waiting, at this time at the earliest."""
+        start_s = max(time_s, self._free_s)
+        self._free_s = start_s + len(data) * self._byte_s
+        self._queue.append((start_s, data))
+
+    def read_until(self, stop_s: float) -> list[tuple[float, bytes]]:
+        """The reads before ``stop_s`` that have bytes, each with its time; whatever arrives by then must be sent."""
+        reads = []
+        while (time_s := self._first_read_s + self._reads * self._read_s) < stop_s:
+            self._reads += 1
+            data = self._arrived(time_s)
+            if data:
+                reads.append((time_s, data))
+        return reads
+
+    def _arrived(self, time_s: float) -> bytes:
+        """Bytes whose last bit is there and that no read has taken."""
+        parts = []
+        while self._queue and self._queue[0][0] < time_s:
+            start_s, data = self._queue[0]
+            end = min(int((time_s - start_s) / self._byte_s), len(data))
+            parts.append(data[self._taken : end])
+            if end < len(data):
+                self._taken = end
+                break
+            self._queue.popleft()
+            self._taken = 0
+        return b"".join(parts)

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import Oscillator, generator
 from swath.sim.gravity import EARTH_RATE_RADPS, RATE_IE_E, gravity_e
 from swath.sim.imu.grades import sensor_grades
@@ -28,8 +28,6 @@ from swath.sim.plan.tables import ImuNoiseTable, ImuTable
 if TYPE_CHECKING:
     from swath.sim.flight.trajectory import Motion, Trajectory
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 PIECE_S = 0.006  # longest piece integrated in one go: a motion of 20 Hz is wrong by 1e-7 of itself, of 5 Hz by 2e-11
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)

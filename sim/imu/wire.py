@@ -11,20 +11,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.imu.dbc.encoder import encode_latch, encode_samples
 from swath.drivers.imu.dbc.settings import map_signals
 from swath.drivers.parser import DeviceSettings
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import PulsePerSecond, generator
 from swath.sim.imu.grades import noise_of
 from swath.sim.imu.sensors import InertialUnit
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ImuTable
 from swath.sim.shots import WireUnit
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FORCE_UNIT_MPS2 = 1e-7  # 32 bits reach 21 g; half a unit a sample is far below a navigation grade's noise
 RATE_UNIT_RADPS = 5e-9  # 32 bits reach 615 °/s

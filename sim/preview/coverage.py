@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
 from swath.sim.flight.trajectory import Trajectory, fly
 from swath.sim.flight.turbulence import ANGLE_RMS_DEG, INTENSITY
@@ -24,8 +25,6 @@ from swath.sim.scanners import mirrors
 from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.scene.terrain import MARGIN_M
 from swath.sim.site import Site
-
-FloatArray = NDArray[np.float64]
 
 NEIGHBOUR_DEG = 20.0  # lines whose directions, or opposites, differ by less are neighbours
 OS1_BEAMS, OS1_COLUMNS = 64, 1024

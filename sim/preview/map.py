@@ -17,8 +17,9 @@ from matplotlib.ticker import FuncFormatter
 from matplotlib.transforms import ScaledTranslation
 from pyproj import Transformer
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
-from swath.sim.preview.coverage import FloatArray, Strip, Survey, control_points
+from swath.sim.preview.coverage import Strip, Survey, control_points
 from swath.sim.scene.village import STREET_M
 
 INK, MUTED = "#22262b", "#5a6068"

@@ -13,10 +13,11 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
-from swath.sim.preview.coverage import FloatArray, Grid, Survey, grid_of, summary_of
+from swath.sim.preview.coverage import Grid, Survey, grid_of, summary_of
 from swath.sim.preview.map import INK, MUTED, colour_of, draw_ground, draw_map, heading, nice_step, page_of, shortened
 from swath.sim.scene.terrain import build_ground
 

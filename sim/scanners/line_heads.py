@@ -18,17 +18,14 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import Oscillator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners import mirrors, motions
 from swath.sim.scanners.motions import Motion, Swing
 from swath.sim.shots import Pulses
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 TICKS_PER_PULSE = 2  # fewer, and rounding to ticks would double or halve the time between two pulses
 LARGEST_ERROR_DEG = 10.0

@@ -8,9 +8,8 @@ through along z. FORMULAS 2.2.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 _FORWARD = np.array([1.0, 0.0, 0.0])
 _DOWN = np.array([0.0, 0.0, 1.0])

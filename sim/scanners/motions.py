@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 TURNING_SHARE = 0.2  # of the time of a triangle that its turning points take
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.compiled import kept, kernel
 from swath.sim.flight.trajectory import Poses
 from swath.sim.plan.tables import ScannerTable
-from swath.sim.shots import FloatArray, Pulses
+from swath.sim.shots import Pulses
 from swath.sim.site import Site
 
 Three = tuple[float, float, float]

@@ -13,6 +13,7 @@ import numpy as np
 
 from swath.drivers.scanner.ouster.head import SYNC_PULSE, read_head
 from swath.drivers.scanner.ouster.layout import LidarLayout
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -27,7 +28,7 @@ from swath.sim.scanners.spinning_wire import (
     head_config,
     in_slot,
 )
-from swath.sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from swath.sim.shots import Measured, Pulses, WireUnit
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 COLUMNS = 1024  # of a turn

@@ -8,16 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.atmosphere import Air
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.shots import Echoes, Measured, Pulses
 from swath.sim.truth import StructArray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 LIGHT_MPS = 299_792_458.0
 THRESHOLD = 0.005  # of full intensity: weaker echoes are not detected

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from swath.georef.arrays import FloatArray
 from swath.sim.atmosphere import Air
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.plan.tables import ScannerTable
@@ -18,7 +19,7 @@ from swath.sim.scanners.assembly import Head, Wire
 from swath.sim.scanners.mounting import Beams, Mounting
 from swath.sim.scanners.ranging import Ranging
 from swath.sim.scene.scene import Scene
-from swath.sim.shots import Echoes, FloatArray, Pulses, WireUnit
+from swath.sim.shots import Echoes, Pulses, WireUnit
 from swath.sim.site import Site
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 

@@ -18,11 +18,12 @@ import numpy as np
 
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import PLACES, VLP16
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import Oscillator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.ouster_wire import COLUMNS, os1_metadata
-from swath.sim.shots import FloatArray, IntArray, Pulses
+from swath.sim.shots import Pulses
 
 HEAD_HZ = 1_000_000_000  # a head's firings are timed in nanoseconds of its own oscillator
 SEQUENCE_NS = 55_296  # from one firing of all sixteen lasers to the next, 9.4

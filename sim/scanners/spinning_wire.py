@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import OscillatorTable, ScannerTable
-from swath.sim.shots import FloatArray, IntArray, Measured
+from swath.sim.shots import Measured
 
 Windows = Sequence[tuple[float, float]]
 

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.scanner.srep.layout import PULSE_WIDTH_UNIT_NS, RANGE_UNIT_M, ZONE_UNKNOWN, pulse_dtype
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.scanners.line_heads import emission_ticks
 from swath.sim.scanners.ranging import LIGHT_MPS, packed
 from swath.sim.shots import Measured, Pulses
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _U16, _U32 = 2**16 - 1, 2**32 - 1
 

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.scanner.srep.layout import (
     FLAG_LASER_ON,
@@ -19,6 +18,7 @@ from swath.drivers.scanner.srep.layout import (
     encode_datagrams,
     pulse_dtype,
 )
+from swath.georef.arrays import BoolArray, FloatArray, IntArray, UInt64Array
 from swath.sim.clocks import Oscillator, PulsePerSecond, generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import HostTable, ScannerTable
@@ -28,11 +28,6 @@ from swath.sim.scanners.ranging import LIGHT_MPS
 from swath.sim.scanners.srep_records import ApparentRanges, RecordMaker, Records, WholeRanges, no_records
 from swath.sim.shots import Measured, Pulses, WireUnit
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-UInt64Array = NDArray[np.uint64]
-BoolArray = NDArray[np.bool_]
 
 PROCESSING_S = 250e-6  # from a datagram's last pulse to the wire; longer than light takes from 30 km
 HOLD_S = 0.1  # after so long without a pulse a datagram is not filled up any more

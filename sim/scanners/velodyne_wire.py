@@ -15,6 +15,7 @@ from swath.drivers.gnss.nmea.sentences import encode_rmc
 from swath.drivers.scanner.velodyne.heads import BLOCKS, PLACES
 from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
 from swath.drivers.scanner.velodyne.position import HOUR_US, encode_position_packet
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.timescales import SECOND_NS, utc_from_gps
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.plan.plan import Plan
@@ -29,7 +30,7 @@ from swath.sim.scanners.spinning_wire import (
     head_config,
     in_slot,
 )
-from swath.sim.shots import FloatArray, IntArray, Measured, Pulses, WireUnit
+from swath.sim.shots import Measured, Pulses, WireUnit
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
 MICROSECOND_HZ = 1_000_000

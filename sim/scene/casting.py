@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.compiled import kernel, whole
 from swath.sim.scene.rays import (
     NEVER,
@@ -30,8 +28,6 @@ from swath.sim.scene.rays import (
 )
 from swath.sim.shots import GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, WATER, WIRE
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Pulse = tuple[float, int, int]
 """Time of emission, number, seed of all pulses."""
 Hit = tuple[float, int, float, float]

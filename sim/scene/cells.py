@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.scene.terrain import Ground
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 CELL_M = 20.0
 MOST_CELLS = 4_000_000  # above, they are made larger

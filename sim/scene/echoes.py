@@ -9,14 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim import compiled, shots
 from swath.sim.compiled import borrowed, digest, kept, kernel, whole
 from swath.sim.scene import casting, rays
 from swath.sim.scene.casting import RIM_SHARE, SPENT, Frame, Pulse, SceneArrays, march
 from swath.sim.scene.rays import NEVER, Ray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SOFT_HITS = 24
 _NONE = whole(0)

@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from swath.georef.arrays import BoolArray, FloatArray
 from swath.sim.clocks import generator
 from swath.sim.plan.terrain_tables import CarTable, ForestTable, RoadTable, WireTable
 from swath.sim.scene.rays import PLANE
 from swath.sim.scene.terrain import Ground, Lake, ups
 from swath.sim.scene.village import ROOFS, Houses
 from swath.sim.shots import CAR, ROOF, WALL
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 CAR_SIZE_M = (4.4, 1.8, 1.5)
 WIRE_PIECE_M = 6.0

@@ -14,11 +14,11 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from swath.drivers.extras import how_to_install
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.site import Site, geodetic_from_e
 
-FloatArray = NDArray[np.float64]
 Place = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 
 KEY = "terrain.raster"

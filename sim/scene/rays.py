@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.sim.compiled import kernel
 
-FloatArray = NDArray[np.float64]
 Ray = tuple[float, float, float, float, float, float, float, float]
 
 PLANE = 6  # numbers of a plane's row

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -36,8 +37,6 @@ from swath.sim.scene.village import Houses, build_village
 from swath.sim.shots import Echoes
 from swath.sim.site import Site
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Seen = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 
 FOOTPRINT_M = (1.0, 20.0)  # least and greatest radius of a beam for which objects are listed in the cells beside them

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from swath.georef.arrays import FloatArray
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -16,7 +17,6 @@ from swath.sim.plan.terrain_tables import TerrainTable
 from swath.sim.scene.raster import RasterHeights
 from swath.sim.site import Site
 
-FloatArray = NDArray[np.float64]
 HeightsOnGrid = Callable[[FloatArray, FloatArray], FloatArray]
 """Ellipsoidal heights (rows, columns) at east (columns,) and north (rows,)."""
 

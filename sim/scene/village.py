@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.sim.clocks import generator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.terrain_tables import BuildingTable, RoadTable, VillageTable
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Placed = Callable[[FloatArray], FloatArray]
 """East, north of places along and across a village's heading, (n, 2) both."""
 

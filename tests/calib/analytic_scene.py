@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
@@ -17,7 +18,6 @@ from swath.georef.scanner.calibration import Calibration, nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 Surface = Callable[[FloatArray, FloatArray], FloatArray]
 
 BETWEEN_NS = 1_000_000_000_000

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import Calibration, nominal
@@ -22,7 +23,6 @@ from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.shots import CAR, ROOF, WALL
 from swath.sim.site import Site, geodetic_from_e, rot_e_from_ned
 
-FloatArray = NDArray[np.float64]
 Line = tuple[float, float, float, float, float]
 """East and north from, east and north to, height."""
 

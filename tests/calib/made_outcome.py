@@ -11,20 +11,18 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.calibration_file import Header
 from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
 from swath.calib.summary import DifferenceMap, PairDifference, Profile, ReportInput
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 LAT, LON, HEIGHT_M, GROUND_M = math.radians(47.18), math.radians(9.0), 750.0, 450.0
 START_NS = 1_447_000_000 * 10**9

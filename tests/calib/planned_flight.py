@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.features import Features
 from swath.calib.flight import Flight, Head, Tangent
@@ -18,7 +17,6 @@ from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import exactly_known
 
-FloatArray = NDArray[np.float64]
 SECOND, BEGIN = 10**9, 1_400_000_000 * 10**9
 FRAME = Tangent.at(e_from_geodetic(np.radians(47.0), np.radians(9.0), 0.0))
 SPEED_MPS, LINE_S, APART_S = 60.0, 16.0, 90.0

@@ -8,19 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, Int64Array
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import START_NS, exactly_known, frame
-
-FloatArray = NDArray[np.float64]
 
 ARM = np.array([0.15, -0.08, 0.42])
 SIGMAS = np.array([0.03, 0.03, 0.05, *np.radians([0.003, 0.003, 0.007]), 0.02, np.radians(0.001)])

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE, Int64Array
 from swath.georef.scanner.beams import LineGeometry
@@ -21,7 +21,6 @@ from swath.georef.scanner.calibration import PARAMETERS, Calibration, nominal
 from swath.georef.scanner.uncertainty import Noise
 from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 START_NS = 1_479_297_618_000_000_000
 SPEED = 60.0
 GROUND_M = 400.0

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE
 
-FloatArray = NDArray[np.float64]
 Height = Callable[[FloatArray, FloatArray], FloatArray]
 
 LAT_RAD, LON_RAD = np.radians(47.4), np.radians(8.9)

@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.adjust import adjust, predict
@@ -22,6 +21,7 @@ from swath.calib.flight import Flight
 from swath.calib.intensity_curve import STEPS, at_knots, curve_by_knots
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import MODELS, Wish, unknowns
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.printed import TRUTH, Printed, printed
@@ -29,7 +29,6 @@ from tests.calib.roofs import LINES, NOISE, Line, Made, made, roofs
 from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
-FloatArray = NDArray[np.float64]
 PLAIN = Settings(huber=0.0, family=0.0, tolerance=1e-7)
 
 

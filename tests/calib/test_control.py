@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.calib.control.doubts import Doubt, doubts
@@ -12,11 +11,11 @@ from swath.calib.control.points import HEADER, ControlError, ControlRules, contr
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.planes.local import PlaneRules, is_inside, robust_plane
+from swath.georef.arrays import FloatArray
 from tests.calib.surface_flight import FRAME, surface_flight, swath_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ROW = "GCP1,47.4001,8.9001,512.34,0.02"
 
 

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from swath.calib.intensity_curve import STEPS, at_knots, curve, curve_by_knots, nodes_of
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 
 @st.composite

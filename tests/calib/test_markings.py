@@ -12,11 +12,11 @@ from scipy.special import erf
 
 from swath.calib.flight import Flight
 from swath.calib.ties.markings import Image, MarkingSettings, Shift, find_markings, shifted
+from swath.georef.arrays import FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 LINES = (Line(-60, 0, 90, 120, 300, 47.3), Line(60, 10, 271, 120, 300, 51.9))
 DENSE = Scanner(prf_hz=60_000.0, scan_hz=97.0, half_angle_deg=10.0)
 FOOTPRINT_M = 0.1  # of a beam, one sigma

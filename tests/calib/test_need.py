@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.calib.need import POINT, SHARE, Need, need_of
 from swath.calib.outcome import TrajectoryFit
@@ -15,7 +14,6 @@ from tests.calib.roofs import LINES, NOISE, Line, Made, made
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TILT_RAD, HEADING_RAD, POSITION_M = np.radians(0.003), np.radians(0.006), 0.02
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from swath.calib.equations.observability import RULES, Rules, decide, kind_of, spectrum
 from swath.calib.outcome import Held
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.records import RETURN_DTYPE
@@ -22,7 +23,6 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 SECOND, BEGIN = 10**9, 1_400_000_000 * 10**9
 LEVER_ARM = np.array([0.15, -0.08, 0.42])
 SPEED_MPS, HALF_ANGLE = 60.0, np.radians(30.0)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.calib.equations.normals import TrajectoryWeight, normals
@@ -17,6 +16,7 @@ from swath.calib.features import ControlPoint
 from swath.calib.flight import FlightError
 from swath.calib.parameters import Wish, unknowns
 from swath.calib.plan import MOST_MADE, Scan, planned, predict, search_cell_m
+from swath.georef.arrays import FloatArray
 from tests.calib.planned_flight import (
     FRAME,
     NOISE,
@@ -32,7 +32,6 @@ from tests.calib.planned_flight import (
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 DEG = float(np.radians(1.0))
 
 

@@ -6,18 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight
 from swath.calib.planes.matching import LOST, rematch
 from swath.calib.planes.returns import limited
 from swath.calib.planes.search import find_planes
+from swath.georef.arrays import FloatArray
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 LINES: tuple[Line, ...] = ((-100, 0, 100, 0, 850), (100, 30, -100, 30, 850), (0, 100, 0, -100, 850))
 TERRAIN = """
 height_m = 450.0

@@ -16,12 +16,12 @@ from swath.calib.flight import Flight
 from swath.calib.planes.fit import fit_sight
 from swath.calib.planes.kernels import GOOD, MOMENTS, accumulate, fill_table, fit_cells, gather, grow
 from swath.calib.planes.search import PlaneError, PlaneSettings, find_planes, given_planes, plane_rows
+from swath.georef.arrays import FloatArray
 from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, ROAD, ROOF, WALL, WATER
 from tests.calib.cast_flight import Cast, Line, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 LINES: tuple[Line, ...] = ((-140, 0, 140, 0, 850), (140, 50, -140, 50, 850), (0, 140, 0, -140, 850))
 TERRAIN = """
 height_m = 450.0

@@ -19,7 +19,8 @@ from swath.calib.profiles.influence import influence
 from swath.calib.profiles.measure import KINDS, PARAMETER
 from swath.calib.profiles.stepwise import Given, Profile, survey
 from swath.daemon.processing.calibration.report.profiles import comparison_table, pictures, profiles_table
-from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables
+from swath.georef.arrays import FloatArray
+from tests.calib.analytic_scene import Line, Scanner, fly, gables
 from tests.calib.roofs import exactly_known
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

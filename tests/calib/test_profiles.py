@@ -30,7 +30,8 @@ from swath.calib.profiles.stepwise import (
 )
 from swath.daemon.processing.calibration.report.profile_picture import draw, svg
 from swath.daemon.processing.calibration.report.profiles import pictures
-from tests.calib.analytic_scene import FloatArray, Line, Scanner, fly, gables, only, retold, truth_of
+from swath.georef.arrays import FloatArray
+from tests.calib.analytic_scene import Line, Scanner, fly, gables, only, retold, truth_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

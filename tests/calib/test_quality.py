@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from swath.calib.adjust import adjust
@@ -17,6 +16,7 @@ from swath.calib.equations.solve import Block, Settings, solved
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
 from swath.calib.parameters import Wish, unknowns
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from tests.calib.printed import printed
 from tests.calib.roofs import LINES, made
@@ -24,7 +24,6 @@ from tests.calib.test_adjust import controlled, in_planes
 from tests.calib.test_rows import design
 
 pytestmark = pytest.mark.xdist_group("kernels")
-FloatArray = NDArray[np.float64]
 PLAIN = Settings(huber=0.0, family=0.0)
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.calib.equations.rows import Rows, State
@@ -14,6 +13,7 @@ from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
 from swath.calib.parameters import Unknowns, Wish, unknowns
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, Calibration, nominal
@@ -23,7 +23,6 @@ from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.roofs import LINES, START_NS, frame, made, trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
-FloatArray = NDArray[np.float64]
 
 VALUES = {
     "omega_rad": 0.0044,

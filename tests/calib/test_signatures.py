@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.calib.equations.trajectory_prior import Taus, apply, draw, gauss_markov
@@ -17,6 +16,7 @@ from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import differences
 from swath.calib.strips.effects import NAMES, SeenFrom, effect_columns
 from swath.calib.strips.signatures import Signature, record_of, signatures
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.geodesy.rotations import rot_x
@@ -26,7 +26,6 @@ from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
-FloatArray = NDArray[np.float64]
 RULES = StripRules(most_cells=3000)
 
 

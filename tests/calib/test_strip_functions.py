@@ -7,18 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.calib.equations.trajectory_prior import TrajectoryPrior, apply, knots_of
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight
 from swath.calib.strips import corrections as strip_functions
 from swath.calib.strips.corrections import Settings, StripAdjusted, StripError, adjust_strips
+from swath.georef.arrays import FloatArray
 from tests.calib.planned_flight import ONE_HEIGHT, flown, noised
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TURN = float(np.radians(0.02))
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from swath.calib.flight import Flight
@@ -14,11 +13,11 @@ from swath.calib.planes.local import plane_through
 from swath.calib.strips.cells import Cells, FlightStrip, Gathered, StripRules, numbers_of, overlap_cells, thinned
 from swath.calib.strips.differences import Numbers, StripReport, differences, report_of
 from swath.calib.strips.standards import ASPRS_2014, USGS, best_of, judge
+from swath.georef.arrays import FloatArray
 from tests.calib.surface_flight import FRAME, surface_flight, swath_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 RULES = StripRules(cell_m=2.0)
 
 # FORMULAS 8 [chk 8.*]: a noisy patch of normal (0.3, −0.1, 1) and a point 0.12 m above it, as their script draws them

@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.calib.features import Features, Patch, Plane, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.ties.intersections import TieSettings, find_ties, fit_patch, meet
 from swath.calib.ties.picked import PickedError, PickedSettings, carried, picked_ties, read_picked
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
-
-FloatArray = NDArray[np.float64]
 
 SLOPE = np.radians(35.0)
 UP, OUT = np.cos(SLOPE), np.sin(SLOPE)

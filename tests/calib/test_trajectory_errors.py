@@ -21,6 +21,7 @@ from swath.calib.equations.trajectory_prior import (
     positive,
 )
 from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import rot_from_quaternion
 from swath.georef.navigation.cross_covariance import ErrorChain, error_chain
@@ -37,7 +38,6 @@ from tests.georef.navigation.vehicles import ns
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 SECOND = 10**9
 BEGIN = 1_400_000_000 * SECOND
 ARM = np.array([0.35, -0.12, -1.1])

@@ -26,13 +26,13 @@ from swath.calib.validation.methods import (
     smallest_errors,
     validate,
 )
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, Calibration
 from swath.sim.shots import ROOF
 from tests.calib.cast_flight import Cast, cast_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 LINES = ((-200, 0, 200, 0, 850), (200, 60, -200, 60, 850), (0, 200, 0, -200, 850), (60, -200, 60, 200, 1050))
 
 

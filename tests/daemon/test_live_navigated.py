@@ -18,13 +18,13 @@ from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import warm_up
+from swath.georef.arrays import FloatArray
 from swath.georef.points import Points
 from tests.daemon.rig import HANGS_S, Recorder, wait_until
 from tests.daemon.test_live_growing import config_of, running
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone, pytest.mark.xdist_group("kernels")]
 
-FloatArray = NDArray[np.float64]
 PLAN = """
 [flight]
 name = "navigated"

@@ -21,6 +21,7 @@ from swath.daemon.processing.setup.models import TerrainRanges, connect, make_re
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
+from swath.georef.arrays import FloatArray
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.points import Fate, Points
@@ -34,7 +35,6 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 
 C_MPS = 299_792_458.0
 LAT_DEG, LON_DEG = 47.2, 8.9

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from swath.daemon.config import parse_config
 from swath.daemon.processing.setup.models import make_motion
 from swath.daemon.processing.setup.setup import Options, Setup
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.points import Points
 from swath.georef.trajectory.trajectory import Trajectory
@@ -37,7 +38,6 @@ from tests.sim.test_proof import (
 
 pytestmark = pytest.mark.xdist_group("proof")
 
-FloatArray = NDArray[np.float64]
 STEP_S = 5e-4  # of the true trajectory: a slerp between its epochs is then exact to a micrometre
 FACETS = [{"index": 0, "tilt_deg": 0.03}, {"index": 1, "tilt_deg": -0.02}, {"index": 3, "tilt_deg": 0.01}]
 IBRC = {"intensity": [0.0, 500.0, 2000.0, 65535.0], "correction_m": [0.02, 0.01, -0.005, -0.03]}

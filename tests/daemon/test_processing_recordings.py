@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -22,6 +21,7 @@ from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, PacketParser
 from swath.drivers.scanner.hesai.heads import XT32
 from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, SpinningHead
+from swath.georef.arrays import FloatArray
 from swath.georef.records import StructArray
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import nominal
@@ -33,7 +33,6 @@ from tests.drivers.spinning import are_near, feed, payloads, read_pcd, returns_o
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 
 LAT_DEG, LON_DEG, HEIGHT_M = 47.5, 9.25, 812.5
 ROLL, PITCH, HEADING = 0.11, -0.07, 2.3

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.daemon.config import ScannerConfig
 from swath.daemon.processing.setup.models import make_motion
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import rot_e_from_l
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import PARAMETERS, read_calibration
@@ -28,7 +28,6 @@ from tests.sim.test_proof import EVERY_ERROR, TURNED, Flown, fly_and_decode
 
 pytestmark = pytest.mark.xdist_group("proof")
 
-FloatArray = NDArray[np.float64]
 DRAWS = 250  # a flight
 NOISE = Noise(range_m=0.015, angle_rad=2e-5, time_s=2e-5)
 POSITION_SIGMA_L = np.array([0.02, 0.02, 0.04])

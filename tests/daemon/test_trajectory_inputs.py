@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
@@ -36,6 +35,7 @@ from swath.daemon.processing.navigation.times import counted_arrivals, imu_times
 from swath.drivers.gnss.nmea.parser import NmeaParser
 from swath.drivers.gnss.nmea.sentences import encode_gga
 from swath.drivers.parser import DeviceSettings
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.antenna_positions import read_antenna_positions
 from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.diagnosis.data import Finding
@@ -60,7 +60,6 @@ from tests.drivers.harness import feed_pieces
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 S = 1_000_000_000
 PLAN = """
 [flight]

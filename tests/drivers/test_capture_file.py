@@ -27,8 +27,8 @@ from swath.drivers.captures.opening import (
     read_pcap,
     read_serial,
 )
+from swath.drivers.captures.pcap import IpPackets, ip_packet
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.ip_packets import IpPackets, ip_packet
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swath.drivers.captures.opening import CaptureTally, read_tagged
+from swath.drivers.captures.serial import TagWriter, read_tags
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.rtklib_tag import TagWriter, read_tags
 
 FIXTURES = Path(__file__).parents[2] / "fixtures" / "rtklib"
 HEAD = b"TIMETAG RTKLIB 2.4.3 b34".ljust(60, b"\0") + struct.pack("<I", 123_456)

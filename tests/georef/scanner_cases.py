@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swath.drivers.scanner.beams import BeamTable, beam_table
 from swath.drivers.scanner.beams import beam_points as velodyne_points
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, StructArray
 from swath.georef.scanner.beams import (
     FibreGeometry,
@@ -24,7 +24,6 @@ from swath.georef.scanner.beams import (
 from swath.georef.scanner.calibration import BeamCorrection, Calibration, RangeOffset, nominal
 from swath.georef.trajectory.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 PointsS = Callable[[Calibration, StructArray, FloatArray, FloatArray], FloatArray]  # rows, θ, ρ → (n, 3) in s
 
 TURNED = np.diag([-1.0, -1.0, 1.0])  # cables to the rear, FORMULAS 1.5

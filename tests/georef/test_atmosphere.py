@@ -7,28 +7,31 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from swath.georef.air.atmosphere import (
+    SPHERE_M,
     Air,
     AtmosphereError,
     _table,
+    ardc_k,
     group_refractivity_ppm,
+    layer_air,
+    layer_constant_ppm,
     saturated_hpa,
+    spherical_bending,
     standard_air,
 )
 from swath.georef.air.kernels import BLOCK, means
-from swath.georef.refraction import SPHERE_M, ardc_k, layer_air, layer_constant_ppm, spherical_bending
+from swath.georef.arrays import FloatArray
 from swath.sim.atmosphere import Air as SimulatedAir
 from swath.sim.plan.tables import AtmosphereTable
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TO_E = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 MEASURED: dict[str, Any] = {"model": "measured", "temperature_c": 24.0, "pressure_hpa": 955.0, "height_m": 480.0}

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import beam_points
 from swath.drivers.scanner.velodyne.heads import VLP16
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.beams import (
     FibreGeometry,
     Geometry,
@@ -28,7 +28,6 @@ from tests.georef.scanner_cases import rows_of, still_trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 NOMINAL = nominal("left", [0.0, 0.0, 0.0], np.eye(3))
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.interpolate import RegularGridInterpolator
 
+from swath.georef.arrays import FloatArray
 from swath.georef.coarse_terrain import CoarseTerrain, TerrainError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TO_E = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 FIRST_DEG, STEP_DEG = (8.9, 47.6), (0.001, -0.0008)  # west to east, north to south, as rasters come
 

@@ -7,17 +7,15 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from numpy.typing import NDArray
 from pyproj.datadir import get_user_data_dir
 from pyproj.network import is_network_enabled, set_network_enabled
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.mapping import datums
 from swath.georef.mapping.frame import Mapping, MappingError
 
 pytestmark = pytest.mark.xdist_group("kernels")
-
-FloatArray = NDArray[np.float64]
 
 
 def proj(source: str, target: str) -> pyproj.Transformer:

@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.scanner.encoder_motion import EncoderMotion
 from swath.sim.scanners.motions import polygon, sine, triangle, turning
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 START_NS = 1_400_000_000_000_000_123
 BITS_17 = 2 * np.pi / 2**17
 

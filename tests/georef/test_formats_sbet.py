@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
@@ -16,7 +16,6 @@ from tests.georef.flown import SECOND, START_NS, WEEK, flown
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 PDAL = (  # test/data/sbet/2-points.sbet of PDAL (BSD-3-Clause), field by field
     (
         151631.00283607095,

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.georef.formats.trajectory_csv import HEADER, csv_text
@@ -20,7 +19,6 @@ from tests.georef.flown import SECOND, START_NS, WEEK, flown
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 SPAN = (START_NS, START_NS + 20 * 10**9)
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 

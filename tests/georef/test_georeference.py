@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from swath.georef import georeference
 from swath.georef.air.atmosphere import Air
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.vectors import angle_of
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping, MappingError
@@ -25,7 +25,6 @@ from tests.georef.scanner_cases import rows_of
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 MS = 1_000_000
 COUNT = 500
 

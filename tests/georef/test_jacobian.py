@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.georef.points import Rays
 from swath.georef.records import StructArray
 from swath.georef.scanner.beams import LineGeometry
@@ -22,7 +22,6 @@ from tests.georef.scanner_cases import CASES, TURNED, Case, rows_of, still_traje
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 RELATIVE = 1e-7
 STEPS = {"range_offset_m": 1.0, "time_offset_s": 1e-3, "imu_latency_s": 1e-3, "encoder_latency_s": 1e-5}

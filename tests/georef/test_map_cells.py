@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.mapping import cells as map_cells
 from swath.georef.mapping.cells import APPROXIMATION_M, EXACT, LEVELS, TOLERANCE_M, MapCells, expand_cells
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 METRES = np.ones(3)
 HERE = np.array([4_260_000.0, 670_000.0, 4_680_000.0])
 

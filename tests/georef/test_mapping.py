@@ -17,13 +17,13 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, meridian_radius_m
 from swath.georef.mapping import frame as module
 from swath.georef.mapping.frame import Mapping, MappingError
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 WGS84 = "+inv +proj=cart +ellps=WGS84"
 GRS80 = "+inv +proj=cart +ellps=GRS80"
 BESSEL = "+inv +proj=cart +ellps=bessel"

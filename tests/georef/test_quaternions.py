@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector
-
-FloatArray = NDArray[np.float64]
 
 
 def some(seed: int, n: int = 500) -> FloatArray:

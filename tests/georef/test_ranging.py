@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.georef.records import RETURN_DTYPE, StructArray
 from swath.georef.scanner.ranging import PulseRates, RangingError, ZoneResolver
@@ -15,7 +14,6 @@ from tests.sim.srep_spoken import Spoken, joined, scanner, speak
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 C_MPS = 299_792_458.0
 
 

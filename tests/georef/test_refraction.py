@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from swath.georef.refraction import (
+from swath.georef.air.atmosphere import (
     SPHERE_M,
     ardc_k,
     layer_air,
@@ -16,7 +15,6 @@ from swath.georef.refraction import (
     spherical_bending,
 )
 
-FloatArray = NDArray[np.float64]
 VISIBLE, INFRARED = 78.83, 77.92557  # C of NGA Eq. 9, ppm K / hPa
 SENSOR_M, GROUND_M = 3000.0, 200.0
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import boresight, rot_x
 from swath.georef.points import Fate, Rays
 from swath.georef.records import StructArray
@@ -24,7 +25,6 @@ from tests.georef.scanner_cases import CASES, IBRC, TURNED, Case, rows_of, still
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 GEOMETRIES = 1200
 STEP_NS = 20_000_000  # between the two epochs of each geometry

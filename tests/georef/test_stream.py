@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swath.georef.points import ByteArray, Fate, Points
+from swath.georef.arrays import ByteArray
+from swath.georef.points import Fate, Points
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation, Slerp
 
+from swath.georef.arrays import FloatArray
 from swath.georef.points import Fate
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, TrajectoryGapError, locate_epoch
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 START_NS = 2445 * 604_800_000_000_000 + 561_618_000_000_000
 MS = 1_000_000

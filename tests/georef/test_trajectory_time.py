@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from swath.georef.trajectory.turn_rates import TimeShift, correlate_turn_rates
 from swath.sim.imu.sensors import true_increments
@@ -21,7 +22,6 @@ from tests.sim.inertial_motion import rough_flight
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 DAY_S = 86_400
 FIRST_S, LAST_S, RATE_HZ = 60.0, 240.0, 100
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 LAT_DEG, LON_DEG, HEIGHT_M = 47.5, 8.9, 900.0
 RADIUS_M, RATE_RAD_S = 600.0, 0.1  # 60 m/s

@@ -19,7 +19,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
+
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 Bending = Callable[[FloatArray, FloatArray], FloatArray]  # heights of sensor and ground, m → Δd / tan α

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.trajectory import Motion, fly
 from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.site import Site, e_from_geodetic, rot_e_from_ned
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from swath.sim.flight.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 
 # Ten minutes and more: lines with turns to either side between them, and climbs, in rough air.
 ROUGH_PLAN = """

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.shots import Echoes
 from swath.sim.site import Site
-
-FloatArray = NDArray[np.float64]
 
 HEAD = """
 [flight]

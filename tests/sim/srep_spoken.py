@@ -21,7 +21,6 @@ from swath.sim.scanners.srep_wire import SrepWire, config_table
 from swath.sim.shots import Measured, Pulses, WireUnit
 from swath.sim.truth import RETURN_TRUTH_DTYPE, StructArray
 
-FloatArray = NDArray[np.float64]
 C_MPS = 299_792_458.0
 OSCILLATOR = {"offset_ppm": 5.0, "drift_ppm_per_h": 10.0}
 TRANSPORT = "udp:127.0.0.1:2368"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 
+from swath.georef.arrays import FloatArray
 from swath.sim.atmosphere import (
     Air,
     bending_by_layers,
@@ -18,7 +18,6 @@ from swath.sim.atmosphere import (
 )
 from swath.sim.plan.tables import AtmosphereTable
 
-FloatArray = NDArray[np.float64]
 DOWN = np.array([0.0, 0.0, -1.0])
 
 

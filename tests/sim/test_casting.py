@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from swath.georef.arrays import FloatArray
 from swath.sim.scene.scene import Scene
 from swath.sim.shots import CAR, GROUND, LEAVES, MARKING, NO_SURFACE, ROAD, ROOF, WALL, WATER, WIRE
 from swath.sim.site import geodetic_from_e
@@ -14,7 +14,6 @@ from tests.sim.scenes import cast, plan_of, scene_of, towards
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 
-FloatArray = NDArray[np.float64]
 FAR_M = (3000.0, -2000.0)  # where the ellipsoid's normal leans 0.6 mrad against the site's z
 
 

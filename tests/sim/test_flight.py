@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Geod, Transformer
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.smoothing import PEAK, kernel, smoothed, spline_through
 from swath.sim.flight.trajectory import Trajectory, fly
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan, load_plan, parse_plan
 from swath.sim.site import Site
-
-FloatArray = NDArray[np.float64]
 
 GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.trajectory import Poses
 from swath.sim.plan.tables import ParameterTable, ScannerTable
 from swath.sim.scanners.mirrors import swung_mirror
@@ -23,7 +23,6 @@ from swath.sim.site import Site, e_from_geodetic, geodetic_from_e, rot_e_from_ne
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 
-FloatArray = NDArray[np.float64]
 
 LAT_DEG, LON_DEG, HEIGHT_M = 47.1234567, 8.7, 1512.3
 LEVER_ARM_B = (0.15, -0.08, 0.42)

@@ -19,6 +19,7 @@ from pyubx2 import UBXReader
 from swath.daemon.config.tables import GnssConfig
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
+from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     Chunk,
     FixType,
@@ -37,7 +38,7 @@ from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.plan.tables import PpsTable
 from swath.sim.shots import WireUnit
-from tests.sim.circling import Circling, FloatArray, geodetic
+from tests.sim.circling import Circling, geodetic
 
 PLAN = """
 [flight]

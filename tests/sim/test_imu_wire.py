@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ImuConfig
 from swath.drivers.can_frames import CAN_FRAME_DTYPE
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
+from swath.georef.arrays import FloatArray
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, StructArray
 from swath.sim.clocks import PulsePerSecond
 from swath.sim.imu.sensors import InertialUnit
@@ -24,7 +24,6 @@ from swath.sim.plan.toml_text import toml_text
 from swath.sim.shots import WireUnit
 from tests.sim.inertial_motion import circling_the_pole, standing
 
-FloatArray = NDArray[np.float64]
 SECONDS = 6.0
 OSCILLATOR = OscillatorTable(offset_ppm=40.0, drift_ppm_per_h=20.0, wander_ppm=0.2, ticks_at_start=2**32 - 2_000_000)
 SYNC = 260

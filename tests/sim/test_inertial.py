@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import simpson
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.gravity import EARTH_RATE_RADPS, gravity_at, gravity_e, normal_gravity
 from swath.sim.imu.grades import GRADES, noise_of, sensor_grades
 from swath.sim.imu.sensors import (
@@ -28,7 +28,6 @@ from swath.sim.plan.tables import ImuNoiseTable, ImuTable, OscillatorTable
 from swath.sim.site import e_from_geodetic, geodetic_from_e
 from tests.sim.inertial_motion import ROUGH_PLAN, circling_the_pole, rough_flight, standing
 
-FloatArray = NDArray[np.float64]
 OMEGA = 7.292115e-5
 STANDARD_GRAVITY = 9.80665
 

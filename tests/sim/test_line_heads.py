@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from swath.daemon.config.tables import GeometryConfig
+from swath.georef.arrays import FloatArray
 from swath.sim.clocks import Oscillator
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
@@ -18,7 +18,6 @@ from swath.sim.scanners import mirrors, motions
 from swath.sim.scanners.line_heads import LineHead, config_geometry
 from swath.sim.shots import Pulses
 
-FloatArray = NDArray[np.float64]
 KINDS = ("oscillating", "triangle", "polygon", "monogon", "nutating", "risley")
 ERRORS: dict[str, float] = {
     "scan_angle_offset_deg": 0.05,

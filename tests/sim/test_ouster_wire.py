@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.ouster.head import beam_points, read_head
 from swath.drivers.scanner.ouster.parser import OusterParser
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, DeviceClockSamples, ScannerReturns
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
@@ -22,7 +22,6 @@ from swath.sim.shots import WireUnit
 from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, feed, measured_of, plan_of, pulse, rows_of
 
-FloatArray = NDArray[np.float64]
 PER_PACKET = 16 * 64
 
 

@@ -11,20 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan, parse_plan
 from swath.sim.plan.tables import ScannerTable
-from swath.sim.preview.coverage import (
-    FloatArray,
-    Strip,
-    Survey,
-    corners,
-    fan_of,
-    grid_of,
-    plan_summary,
-    pulse_rate_hz,
-    strip_of,
-)
+from swath.sim.preview.coverage import Strip, Survey, corners, fan_of, grid_of, plan_summary, pulse_rate_hz, strip_of
 from swath.sim.preview.picture import _framed, draw_plan
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head

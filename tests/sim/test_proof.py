@@ -24,6 +24,7 @@ from swath.drivers.scanner.beams import beam_points as velodyne_points
 from swath.drivers.scanner.ouster.head import beam_points as ouster_points
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import VLP16
+from swath.georef.arrays import FloatArray
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ScannerReturns
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight, open_truth
@@ -44,7 +45,6 @@ from tests.sim.direct import (
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 
-FloatArray = NDArray[np.float64]
 
 PLAN = """
 [flight]

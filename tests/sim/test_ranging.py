@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from swath.georef.arrays import FloatArray
 from swath.sim.atmosphere import Air
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import AtmosphereTable, ScannerTable
@@ -16,7 +17,6 @@ from swath.sim.scanners.ranging import IntensityScale, Ranging, packed
 from swath.sim.shots import Echoes, Measured, Pulses
 from swath.sim.truth import RETURN_TRUTH_DTYPE
 
-FloatArray = NDArray[np.float64]
 CLEAR = AtmosphereTable(visibility_km=1e9)
 IBRC = {"intensity": [0.0, 500.0, 2000.0], "correction_m": [0.04, -0.01, -0.05]}
 SHOTS_M = np.array([[300.0, 420.5, np.nan], [1000.0, np.nan, np.nan], [2400.0, 2401.0, 2403.0]])

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
-from numpy.typing import NDArray
 from pyproj import Transformer
 from rasterio.transform import Affine
 
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.errors import PlanError
 from swath.sim.scene.scene import Scene, build_scene
 from swath.sim.site import Site, geodetic_from_e
 from tests.sim.scenes import plan_of
 
-FloatArray = NDArray[np.float64]
 CRS = "EPSG:32632"
 CENTER = Transformer.from_crs("EPSG:4326", CRS, always_xy=True).transform(8.9, 47.5)
 SQUARE = 200.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])

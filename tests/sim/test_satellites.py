@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from swath.georef.arrays import FloatArray
 from swath.georef.records import FixType
 from swath.sim.gnss.noise import Noise
 from swath.sim.gnss.receiver import Epochs, InsEpochs, Receiver
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import GnssTable
-from tests.sim.circling import TO_E, Circling, FloatArray, Standing, geodetic, ned_from_e
+from tests.sim.circling import TO_E, Circling, Standing, geodetic, ned_from_e
 
 LEVER_ARM = [0.8, -0.6, -1.9]
 # North, east, down; white part, then (correlated part, correlation time)

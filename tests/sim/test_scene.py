@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from swath.georef.arrays import FloatArray
 from swath.sim.plan.errors import PlanError
 from swath.sim.scene.objects import build_solids
 from swath.sim.scene.scene import build_scene
@@ -20,7 +20,6 @@ from tests.sim.scenes import cast, plan_of, scene_of
 
 pytestmark = pytest.mark.xdist_group("kernels")  # the loops that cast rays are compiled once, by one worker
 
-FloatArray = NDArray[np.float64]
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.drivers.scanner.beams import beam_points as velodyne_points
 from swath.drivers.scanner.ouster.head import beam_points as ouster_points
 from swath.drivers.scanner.ouster.head import read_head
 from swath.drivers.scanner.velodyne.heads import VLP16
+from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import ScannerTable
@@ -20,8 +20,6 @@ from swath.sim.scanners.ouster_wire import os1_metadata
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 from swath.sim.shots import Pulses
 from tests.sim.heads import joined, plan_of
-
-FloatArray = NDArray[np.float64]
 
 
 def table_of(kind: str, **keys: Any) -> ScannerTable:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.scanner.srep.layout import HEADER_DTYPE, SrepHeader, encode_datagram, encode_datagrams, pulse_dtype
+from swath.georef.arrays import FloatArray
 from swath.sim.clocks import Oscillator, PulsePerSecond
 from swath.sim.plan.errors import PlanError
 from swath.sim.plan.tables import HostTable, PpsTable, ScannerTable
@@ -21,7 +22,6 @@ from swath.sim.truth import RETURN_TRUTH_DTYPE
 from tests.sim.srep_spoken import (
     C_MPS,
     TRANSPORT,
-    FloatArray,
     Spoken,
     joined,
     measured_count,

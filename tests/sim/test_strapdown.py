@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.gravity import EARTH_RATE_RADPS
 from swath.sim.imu.sensors import Increments, true_increments
 from swath.sim.imu.strapdown import States, navigate
 from tests.sim.inertial_motion import rough_flight
 
-FloatArray = NDArray[np.float64]
 RATE_HZ = 400
 MINUTES = 10
 LIMIT_M = 0.01

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.daemon.config.tables import ScannerConfig
 from swath.drivers.parser import DeviceSettings
 from swath.drivers.scanner.beams import beam_points
 from swath.drivers.scanner.velodyne.heads import VLP16
 from swath.drivers.scanner.velodyne.parser import VelodyneParser
+from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     RETURN_FLAG_LAST,
     RETURN_FLAG_PPS_LOCKED,
@@ -33,7 +33,6 @@ from swath.sim.shots import WireUnit
 from swath.sim.truth import StructArray
 from tests.sim.heads import Shots, Still, feed, measured_of, plan_of, pulse, rows_of
 
-FloatArray = NDArray[np.float64]
 START_PAST_HOUR_S = 3598.0  # of the plans of tests.sim.heads
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.calib.control.doubts import doubts
 from swath.calib.control.points import in_t, read_control
@@ -24,8 +23,7 @@ from swath.calib.ties.picked import picked_ties, read_picked
 from swath.daemon.errors import UserError
 from swath.daemon.processing.calibration.returns import KeptFlight
 from swath.daemon.text_files import text_of
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 COLUMNS = ("WKT", "name")
 FARTHEST = 1e9  # in any unit of a map

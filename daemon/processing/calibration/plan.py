@@ -22,6 +22,7 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import of_parameters, tables_in_words
 from swath.daemon.processing.calibration.plan_navigation import navigated
 from swath.daemon.processing.calibration.run import EVERY, PLANES
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.navigation.inputs import NavigationError
 from swath.georef.scanner.beams import LineGeometry
@@ -33,8 +34,6 @@ from swath.sim.plan.plan import Plan
 from swath.sim.preview.coverage import Survey, control_points, fan_of
 from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.shots import GROUND, MARKING, ROAD, ROOF
-
-FloatArray = NDArray[np.float64]
 
 BEGIN_NS = 1_400_000_000 * SECOND_NS  # a plan's own date does not matter
 STEP_S = 0.02

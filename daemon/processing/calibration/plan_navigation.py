@@ -18,6 +18,7 @@ from swath.calib.flight import Flight
 from swath.daemon.config.tables import NoiseConfig
 from swath.daemon.processing.navigation.observations import heading_observations
 from swath.daemon.processing.navigation.sources import filter_setup, noise_of
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.cross_covariance import error_chain
 from swath.georef.navigation.filter.filter import FilterRun
@@ -39,8 +40,6 @@ from swath.sim.imu.sensors import true_increments
 from swath.sim.imu.wire import config_table
 from swath.sim.plan.tables import GnssTable, ImuTable
 from swath.sim.preview.coverage import Survey
-
-FloatArray = NDArray[np.float64]
 
 KNOT_S = 1.0  # half as far apart sigmas become larger by a few per cent
 BEGIN_S = 1.0

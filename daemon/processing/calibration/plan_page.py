@@ -13,13 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.plan import PlannedCalibration
 from swath.sim.preview.map import INK, MUTED, draw_map
-
-FloatArray = NDArray[np.float64]
 
 FORMATS = (".pdf", ".png", ".svg")
 DPI = 150

@@ -27,8 +27,9 @@ from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.models import motion_of
+from swath.georef.arrays import ByteArray
 from swath.georef.georeference import Georeferencer
-from swath.georef.points import ByteArray, Fate, Points
+from swath.georef.points import Fate, Points
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.uncertainty import Noise

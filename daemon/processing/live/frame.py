@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.points import Points
-
-FloatArray = NDArray[np.float64]
 
 ORIGIN_STEP = 100.0  # the origin's coordinates are whole hundreds, so that people can add them in their heads
 STEP_M = 10.0  # along the body's axes, to see where they point on the map

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session
@@ -17,6 +16,7 @@ from swath.daemon.processing.mapped_storage import MappedStorage
 from swath.daemon.processing.navigation.inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
 from swath.daemon.processing.navigation.sources import noise_of
 from swath.daemon.processing.navigation.times import Stretch
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import (
     GRADES,
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from swath.georef.navigation.inputs import Setup, Start
     from swath.georef.navigation.solve import Solved
 
-FloatArray = NDArray[np.float64]
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is that of a receiver's rate
 NAVIGATED = "navigation of the log's IMU and GNSS"

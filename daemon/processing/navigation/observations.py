@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.alignment.noise import white_factor
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations
 from swath.georef.records import FixType, GnssFix, GnssHeading, StructArray, TimeScale, TimeTag
 from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import complete_time
-
-FloatArray = NDArray[np.float64]
 
 # One standard deviation where a receiver says none: horizontal and vertical, of positions in m, of velocities in m/s.
 # Usual figures of an antenna in flight; a fix type that is not here is not navigated with.

@@ -20,13 +20,13 @@ from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.setup.setup import Setup as PointSetup
 from swath.drivers.driver import UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
 from swath.georef.stream.clocks import ClockPlan, DevicePlan
 
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
 
-FloatArray = NDArray[np.float64]
 
 # Receivers' sigmas of positions are taken for those of all their error. Half of its variance lasts for a minute or so:
 # multipath, the atmosphere, the orbits. A whole flight's innovations correct both (`swath.georef.navigation.noise`).

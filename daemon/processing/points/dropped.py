@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import BoolArray, ByteArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import MappingError
-from swath.georef.points import FATE_NAMES, ByteArray, Fate, Points
+from swath.georef.points import FATE_NAMES, Fate, Points
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.stream.stream import Stream
 from swath.georef.trajectory.trajectory import Trajectory
 
-BoolArray = NDArray[np.bool_]
 LIFTED_GATE_M = (0.0, 100_000.0)  # the least and the greatest that range_min_m and range_max_m can be
 BLOCK_ROWS = 1 << 15  # that are made text of at once
 COLUMNS = ("device_time_ns", "host_time_ns", "pulse_id", "return_number", "number_of_returns", "channel", "mta_zone")

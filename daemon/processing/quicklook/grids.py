@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook.read import Block
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 MOST_CELLS = 2_000_000
 STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # times a power of ten

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -22,8 +22,7 @@ from swath.daemon.processing.quicklook.grids import COUNT, HEIGHT, INTENSITY, SI
 from swath.daemon.processing.quicklook.profile import axis_of
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
-
-FloatArray: TypeAlias = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 DPI = 140
 INK, MUTED, EMPTY = "#1d242b", "#5d6770", "#f3f4f2"

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook.read import Source, StripBook, Units, read_blocks
 from swath.daemon.processing.quicklook.strips import ROUGHEST_M, Overlap, Pair, StripCells
-
-FloatArray: TypeAlias = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 MOST_POINTS = 2_000_000  # kept of the corridor
 MOST_BLOCKS = 15  # read again for a line that was chosen

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import laspy
 import numpy as np
@@ -19,9 +19,8 @@ from pyproj.exceptions import CRSError
 from swath.daemon.processing.point_times import PointTimes, point_times_of
 from swath.daemon.processing.quicklook.product_facts import height_unit_in, sessions_in, sidecar_of
 from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Points, Selection, open_points, sample_of
+from swath.georef.arrays import FloatArray
 from swath.georef.map_fit import misfit_of, scales_at
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 SUFFIXES = (".las", ".laz")
 BLOCK_POINTS = 200_000

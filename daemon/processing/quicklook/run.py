@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,7 @@ from swath.daemon.processing.quicklook.strips import (
     strip_frame,
 )
 from swath.daemon.processing.strip_agreement import Agreement
-
-FloatArray: TypeAlias = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 RETURNS_A_CELL = 4  # of the pictures: two point spacings a side
 SAMPLED_FILES = 5

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.processing.quicklook.grids import Frame, inner
 from swath.daemon.processing.quicklook.read import Block
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 TILE = 16  # cells along a side; memory is taken by tiles
 TILE_CELLS = TILE * TILE

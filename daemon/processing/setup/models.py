@@ -16,6 +16,7 @@ from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.ouster.head import OusterHead
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.air.atmosphere import Air
+from swath.georef.arrays import FloatArray
 from swath.georef.coarse_terrain import CoarseTerrain
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping
@@ -26,7 +27,7 @@ from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.encoder_motion import EncoderMotion
 from swath.georef.scanner.mount import AngleSeries, Mount, Stage
 from swath.georef.scanner.ranging import PulseRates, ZoneResolver
-from swath.georef.scanner.sensor_model import FloatArray, SensorModel
+from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.scanner.uncertainty import Noise, Uncertainty
 from swath.georef.stream.stream import GivenMotion, ScannerChain
 from swath.georef.text_encoding import decoded

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from swath.daemon.config.config import Config
 from swath.daemon.errors import ConfigError
 from swath.drivers.extras import how_to_install
+from swath.georef.arrays import FloatArray
 from swath.georef.coarse_terrain import CoarseTerrain
 
-FloatArray = NDArray[np.float64]
 MAX_NODES = 25_000_000  # 200 MB of heights; a coarse model of a whole country has fewer
 FARTHEST = 1e9  # units of the coordinates, of any map there is
 FARTHEST_HEIGHT_M = 100_000.0

@@ -24,9 +24,8 @@ from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, files_of
 from swath.daemon.processing.trajectory.files import gone_on_failure, put_in_place, write_aside, write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
+from swath.georef.arrays import FloatArray
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 WHAT = (
     "Correction of the trajectory by strips (ISO/TS 19159-2, 6.3.3). No calibration: the scanners' parameters were "

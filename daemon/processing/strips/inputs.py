@@ -36,6 +36,7 @@ from swath.daemon.processing.quicklook.run import Look, StripFacts, look_at
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, TILE
 from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
 from swath.daemon.processing.strip_agreement import compare_flight, corners_of
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.trajectory_columns import LATEST_NS
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.mapping.frame import Mapping, MappingError
@@ -43,7 +44,6 @@ from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import WEEK_NS
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
-FloatArray = NDArray[np.float64]
 Told = Callable[[str, int, int], None]
 
 BLOCK_POINTS = 500_000

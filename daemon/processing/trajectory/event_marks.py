@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.processing.navigation.inputs import Mark
+from swath.georef.arrays import FloatArray
 from swath.georef.points import Fate
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 HEADER = (
     "source,channel,edge,count,gps_ns,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg,sigma_n_m,sigma_e_m,"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.processing.trajectory.series import (
     GAP_INTERVALS,
@@ -16,11 +15,11 @@ from swath.daemon.processing.trajectory.series import (
     outages_of,
     used_positions,
 )
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, Fate, Kind, Setup, Solution
 from swath.georef.records import FixType, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
-FloatArray = NDArray[np.float64]
 Figures = dict[str, Any]
 
 AXES_L, AXES_B, PAIRS_B = ("north", "east", "down"), ("x", "y", "z"), ("yz", "zx", "xy")

@@ -14,16 +14,14 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import try_sync_directory
+from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 BLOCK = 1 << 16  # epochs written at once
 SBETS = (".sbet", ".out")

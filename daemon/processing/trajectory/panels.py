@@ -19,11 +19,10 @@ from PIL import Image
 
 from swath.daemon.processing.quicklook.maps import INK, MUTED
 from swath.daemon.processing.trajectory.series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Solution
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 COLOURS_OF_PICTURE = 128
 OUTAGE, BRIDGED = "#d9dcd7", "#f3b8a8"

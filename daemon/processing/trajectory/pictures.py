@@ -12,18 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from swath.daemon.processing.quicklook.maps import INK, MUTED, round_down
 from swath.daemon.processing.trajectory.figures import AXES_B, AXES_L
 from swath.daemon.processing.trajectory.panels import NARROW, Drawn, Format, Sheet, dress, picture_of
 from swath.daemon.processing.trajectory.series import COLUMNS, Pixels, fix_types_at
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Fate, Kind
 from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 TRIPLE = ("#0072b2", "#d55e00", "#009e73")  # north, east, down; x, y, z; roll, pitch, heading
 FILTER, SMOOTHER = "#d55e00", "#0072b2"

@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated
 from swath.georef.navigation.inputs import Fate, Kind, Setup, Solution
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = 1000  # of pixels that a time axis spans
 BLOCK = 1 << 15  # epochs converted at once

@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from swath.drivers.can_frames import CAN_FRAME_BYTES, CAN_FRAME_DTYPE
 from swath.drivers.imu.dbc.settings import MappedSignal, SignalMap
 from swath.drivers.imu.dbc.signals import FLOAT_TYPES, SignalLayout
+from swath.georef.arrays import FloatArray
 from swath.georef.records import ByteRows, Int64Array
 
-Float64Array = NDArray[np.float64]
 CLASSIC_BYTES = 8
 
 
 def encode_samples(
     signals: SignalMap,
     ticks: Int64Array,
-    specific_force: Float64Array,
-    angular_rate: Float64Array,
+    specific_force: FloatArray,
+    angular_rate: FloatArray,
     *,
-    temperature_c: Float64Array | None = None,
+    temperature_c: FloatArray | None = None,
     status: Int64Array | None = None,
     packet_counter: Int64Array | None = None,
 ) -> ByteRows:
@@ -86,14 +86,14 @@ def _order(signals: SignalMap, sent: set[int]) -> Iterator[int]:
     yield from [*others, key] if signals.rule == "last" else [key, *others]
 
 
-def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | Float64Array) -> NDArray[np.uint64]:
+def _raw_of_scalar(signals: SignalMap, signal: MappedSignal, column: Int64Array | FloatArray) -> NDArray[np.uint64]:
     """Counters and status words go out as they are, a temperature by its scale."""
     if signal is signals.temperature:
         return _raw_of_values(signal.layout, np.asarray(column, np.float64))
     return np.asarray(column, np.int64).astype(np.uint64)
 
 
-def _raw_of_values(layout: SignalLayout, values: Float64Array) -> NDArray[np.uint64]:
+def _raw_of_values(layout: SignalLayout, values: FloatArray) -> NDArray[np.uint64]:
     """Bits of physical values, rounded to the signal's resolution."""
     scaled = (values - layout.offset) / layout.scale
     if layout.is_float:

@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.drivers.can_frames import frame_id
 from swath.drivers.parser import DriverSettingsError
+from swath.georef.arrays import FloatArray, UInt64Array
 from swath.georef.records import ByteRows
 from swath.georef.text_encoding import decoded
 
-UInt64Array = NDArray[np.uint64]
-Float64Array = NDArray[np.float64]
 WORD_BITS = 64
 FLOAT_TYPES: dict[int, tuple[type[np.unsignedinteger[Any]], str]] = {
     16: (np.uint16, "<f2"),
@@ -78,7 +76,7 @@ class SignalLayout:
         return (word >> np.uint64(low)) | (ninth << np.uint64(WORD_BITS - low))
 
     @np.errstate(invalid="ignore", over="ignore")
-    def values(self, bits: UInt64Array) -> Float64Array:
+    def values(self, bits: UInt64Array) -> FloatArray:
         """Physical values of right-aligned bits, whatever float the wire holds: NaN and overflow included."""
         if self.is_float:
             unsigned, floating = FLOAT_TYPES[self.length]

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.drivers.parser import DriverSettingsError
+from swath.georef.arrays import FloatArray
 from swath.georef.records import StructArray
-
-FloatArray = NDArray[np.float64]
 
 FILE = "geometry.file"
 LARGEST_PACKET_BYTES = 65_507  # of a UDP datagram

@@ -13,8 +13,9 @@ from math import radians
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.scanner.ouster.head import FloatArray, OusterHead
+from swath.drivers.scanner.ouster.head import OusterHead
 from swath.drivers.scanner.ouster.layout import FOOTER_BYTES, HEADER_BYTES, IMU_PACKET, with_crc
+from swath.georef.arrays import FloatArray
 from swath.georef.records import IMU_DTYPE, ByteRows, Int64Array, StructArray
 
 STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901

@@ -23,6 +23,9 @@ from swath.drivers.scanner.ouster.head import FILE, SYNC_PULSE, read_head
 from swath.drivers.scanner.ouster.imu import imu_packet_bytes, imu_samples
 from swath.drivers.scanner.ouster.layout import (
     ENCODER_COUNTS,
+    FOOTER_BYTES,
+    HEADER_BYTES,
+    HEALTH,
     IMU_PACKET,
     LIDAR_PACKET,
     RANGE_MM,
@@ -31,11 +34,10 @@ from swath.drivers.scanner.ouster.layout import (
     LidarLayout,
     crc_holds,
 )
-from swath.drivers.scanner.ouster.probe import OusterProbe
-from swath.drivers.scanner.ouster_health import HealthReader
 from swath.drivers.scanner.row_writer import filler
-from swath.drivers.scanner.sequence import BoolArray, SampleThinner, SequenceTracker
+from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
 from swath.drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
+from swath.georef.arrays import BoolArray
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     RETURN_FLAG_LAST,
@@ -49,6 +51,54 @@ from swath.georef.records import (
     ScannerReturns,
     StructArray,
 )
+
+COLUMNS_PER_PACKET = 16  # "not user configurable", Firmware User Manual, Get the lidar data format
+
+LEAST_BEAMS = 16
+
+_ID_AT = 8  # in a column, all profiles
+
+
+class OusterProbe(PacketParser):
+    """Counts what looks like lidar packets; decodes nothing."""
+
+    def __init__(self, settings: DeviceSettings) -> None:
+        super().__init__()
+
+    def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
+        """Count packets of equal length; see `PacketParser.parse_units`."""
+        found = int(looks_like_lidar(units).sum())
+        self.counters.bytes += units.size
+        self.counters.bytes_framed += found * units.shape[1]
+        self.counters.bytes_skipped += (len(units) - found) * units.shape[1]
+        if found:
+            self.counters.messages["lidar"] += found
+        return []
+
+
+def looks_like_lidar(units: ByteRows) -> BoolArray:
+    """(n,) whether packets of one length are of sixteen columns, one behind the other.
+
+    Args:
+        units: (n, length).
+    """
+    length = units.shape[1]
+    modern, legacy = length - HEADER_BYTES - FOOTER_BYTES, length
+    found = np.zeros(len(units), dtype=np.bool_)
+    if modern % COLUMNS_PER_PACKET == 0 and modern // COLUMNS_PER_PACKET >= 12 + 4 * LEAST_BEAMS:
+        found |= (units[:, 0] == LIDAR_PACKET) & _counts_on(units, HEADER_BYTES, modern // COLUMNS_PER_PACKET)
+    if legacy % COLUMNS_PER_PACKET == 0 and legacy // COLUMNS_PER_PACKET >= 20 + 12 * LEAST_BEAMS:
+        found |= _counts_on(units, 0, legacy // COLUMNS_PER_PACKET)
+    return found
+
+
+def _counts_on(units: ByteRows, start: int, column_bytes: int) -> BoolArray:
+    """(n,) whether the measurement ids of columns that begin at ``start`` are consecutive, from a multiple of 16 on."""
+    at = start + _ID_AT + column_bytes * np.arange(COLUMNS_PER_PACKET)
+    ids = units[:, at].astype(np.int64) + 256 * units[:, at + 1].astype(np.int64)
+    steady: BoolArray = (np.diff(ids, axis=1) == 1).all(axis=1) & (ids[:, 0] % COLUMNS_PER_PACKET == 0)
+    return steady
+
 
 SECOND_NS = 1_000_000_000
 LARGEST_GAP_FRAMES = 600  # half a minute to a minute; more is a head that began anew
@@ -330,3 +380,43 @@ DRIVERS = (
         wavelength_nm=865.0,
     ),
 )
+
+
+class HealthReader:
+    """Tells a head's start, alerts and countdowns when they change, and what its metadata says beside them."""
+
+    def __init__(self, layout: LidarLayout) -> None:
+        self._layout = layout
+        self._last: tuple[int, ...] | None = None
+
+    def read(self, host_time_ns: Int64Array, packets: StructArray) -> list[DeviceStatus]:
+        """One record a change in packets (n,), n at least 1, in order."""
+        said = np.zeros((len(packets), 1 + len(HEALTH)), dtype=np.int64)
+        said[:, 0] = self._layout.init_id(packets)
+        if not self._layout.legacy:
+            for place, name in enumerate(HEALTH, start=1):
+                said[:, place] = packets[name]
+        changes = np.flatnonzero((said[1:] != said[:-1]).any(axis=1)) + 1
+        statuses = []
+        for at in (0, *changes.tolist()):
+            now = tuple(said[at].tolist())
+            if now != self._last:
+                self._last = now
+                statuses.append(self._describe(int(host_time_ns[at]), now))
+        return statuses
+
+    def _describe(self, host_ns: int, said: tuple[int, ...]) -> DeviceStatus:
+        head = self._layout.head
+        values: dict[str, float | int | str | bool] = {
+            "model": head.model,
+            "profile": head.profile,
+            "timestamp_mode": head.timestamp_mode or "unsaid",
+        }
+        if head.timestamp_mode == SYNC_PULSE:
+            values["nmea_input"] = head.nmea_input
+        if not self._layout.legacy:
+            values["init_id"] = said[0]
+            if head.init_id is not None:
+                values["metadata_of_this_start"] = said[0] == head.init_id
+            values |= dict(zip(HEALTH, said[1:], strict=True))
+        return DeviceStatus(host_ns, values, message="lidar")

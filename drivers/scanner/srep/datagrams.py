@@ -10,8 +10,8 @@ import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import NDArray
 
-from swath.drivers.scanner.sequence import BoolArray
 from swath.drivers.scanner.srep.layout import CRC, FLAG_PPS_LOCKED, HEADER_BYTES, HEADER_DTYPE, body_words, nanoseconds
+from swath.georef.arrays import BoolArray
 from swath.georef.records import DEVICE_CLOCK_DTYPE, ByteRows, Int64Array, StructArray
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from fastcrc.crc32 import iso_hdlc as crc32
 from numpy.typing import ArrayLike, NDArray
 
-from swath.drivers.scanner.sequence import BoolArray
+from swath.georef.arrays import BoolArray
 from swath.georef.records import Int64Array, StructArray
 
 MAGIC = 0x50455253  # "SREP" in memory order

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
 from swath.drivers.scanner.row_writer import filler
-from swath.drivers.scanner.sequence import LATE_DATAGRAMS, BoolArray, SampleThinner, SequenceTracker
+from swath.drivers.scanner.sequence import LATE_DATAGRAMS, SampleThinner, SequenceTracker
 from swath.drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, returns_table
 from swath.drivers.scanner.srep.datagrams import Datagrams, clock_samples
 from swath.drivers.scanner.srep.layout import (
@@ -40,6 +40,7 @@ from swath.drivers.scanner.srep.layout import (
     pulse_dtype,
     pulse_times,
 )
+from swath.georef.arrays import BoolArray
 from swath.georef.records import (
     RETURN_FLAG_PPS_LOCKED,
     ByteRows,

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.geodesy.rotations import attitude_of, rot_z
@@ -32,8 +33,6 @@ from swath.georef.navigation.inputs import (
 )
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 WINDOW_NS = 60 * SECOND_NS
 THINNED_NS = 9 * SECOND_NS // 10  # between observations of a kind that are used: noise of neighbours is alike

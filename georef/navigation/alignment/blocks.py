@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy import quaternions
 from swath.georef.geodesy.rotations import rot_from_quaternion, skew
 from swath.georef.navigation.inputs import Inertial
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 BLOCK_NS = 50_000_000  # within it rate and force are taken as steady
 _APART_NS = 0.5 * SECOND_NS  # times the interval: samples farther apart do not join

@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import product
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b, rot_z
@@ -20,7 +20,6 @@ from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
 from swath.georef.trajectory.trajectory import EARTH_RATE_RADPS
 
-FloatArray = NDArray[np.float64]
 StartT = TypeVar("StartT", bound=Start)
 
 MOST_DRIFT_RAD = float(np.radians(2.0))  # of the attitude on its way back

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotation_vector
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b, rot_z, skew
@@ -29,8 +30,6 @@ from swath.georef.navigation.alignment.noise import covariances as noise_covaria
 from swath.georef.navigation.alignment.noise import spaced_headings
 from swath.georef.navigation.inputs import Kind, Setup
 from swath.georef.records import Int64Array, StructArray
-
-FloatArray = NDArray[np.float64]
 
 TILT, VELOCITY, PLACE, GYRO, ACCEL, ARM = (
     slice(0, 3),

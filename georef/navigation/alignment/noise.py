@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.alignment.blocks import FeltAt
 from swath.georef.navigation.inputs import Setup
 from swath.georef.records import StructArray
-
-FloatArray = NDArray[np.float64]
 
 G_MPS2 = 9.80665
 STILL_MPS = 0.003  # what a vehicle that stands still moves

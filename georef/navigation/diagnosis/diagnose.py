@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.diagnosis.data import MOSTLY, force, gaps, receiver, times
 from swath.georef.navigation.diagnosis.data import Finding as Finding
 from swath.georef.navigation.diagnosis.motion import (
@@ -33,8 +33,6 @@ from swath.georef.navigation.diagnosis.time import SIGMAS, TimeOffset, time_offs
 from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Solution
 from swath.georef.records import StructArray
 from swath.georef.timescales.gps_time import GPS_EPOCH, SECOND_NS, table_leap_seconds
-
-FloatArray = NDArray[np.float64]
 
 G_MPS2 = 9.80665
 SWAPPED_RAD, TURNED_RAD = np.radians([135.0, 10.0])

@@ -14,6 +14,7 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import rot_z
 from swath.georef.navigation.alignment.blocks import Blocks, Felt
 from swath.georef.navigation.alignment.fit import ARM, GYRO, TILT, Fitted, Problem
@@ -22,7 +23,6 @@ from swath.georef.navigation.inputs import Inertial, Kind, Setup
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
-FloatArray = NDArray[np.float64]
 WINDOW_NS = 40 * SECOND_NS
 MOST_WINDOWS = 6
 THINNED_NS = 9 * SECOND_NS // 10

@@ -16,14 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.navigation.inputs import Inertial, Kind
 from swath.georef.records import Int64Array, StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 G_MPS2 = 9.80665
 REACH_S = 20.0  # more than all leap seconds

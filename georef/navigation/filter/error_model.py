@@ -19,8 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gradient_of
 from swath.georef.geodesy.vectors import cross
@@ -49,8 +49,6 @@ from swath.georef.navigation.filter.strapdown import (
 )
 from swath.georef.navigation.inputs import Setup
 from swath.georef.scanner.kernels.types import Three
-
-FloatArray = NDArray[np.float64]
 
 E_POSITION, E_VELOCITY, E_ATTITUDE, E_SENSORS = 0, 3, 6, 9
 E_GYRO_BIAS, E_ACCEL_BIAS, E_GYRO_SCALE, E_ACCEL_SCALE = 9, 12, 15, 18

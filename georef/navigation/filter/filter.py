@@ -6,8 +6,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.bridging import Bridges, made_up_variance, new_bridges, primed_bridges
@@ -47,9 +47,6 @@ from swath.georef.navigation.filter.types import (
 from swath.georef.navigation.inputs import Fate, Inertial, Kind, Setup, Start
 from swath.georef.records import StructArray
 from swath.georef.timescales import SECOND_NS
-
-FloatArray = NDArray[np.float64]
-
 
 PIECE = 1 << 17  # samples, and rows of a path, between rests
 

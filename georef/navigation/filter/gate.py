@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kernel
 from swath.georef.navigation.filter.error_model import E_ATTITUDE, E_POSITION, E_VELOCITY, Layout
 from swath.georef.navigation.filter.types import (
@@ -30,8 +28,6 @@ from swath.georef.navigation.filter.types import (
     Running,
 )
 from swath.georef.navigation.inputs import Fate, Kind
-
-FloatArray = NDArray[np.float64]
 
 _TAKEN, _INFLATED, _REJECTED, _REACQUIRED = (
     int(Fate.TAKEN),

@@ -9,12 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
-
-FloatArray = NDArray[np.float64]
 
 
 @kernel

@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kernel
 from swath.georef.geodesy.gravity import normal_of
 from swath.georef.geodesy.vectors import cross, dot, plus
 from swath.georef.navigation.filter.strapdown import POSITION
 from swath.georef.scanner.kernels.types import Matrix, Three
-
-FloatArray = NDArray[np.float64]
 
 
 class Axes(NamedTuple):

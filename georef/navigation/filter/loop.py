@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.navigation.bridging import UNKNOWN_FORCE_MPS2, UNKNOWN_RATE_RADPS
@@ -68,8 +68,6 @@ from swath.georef.navigation.filter.types import (
 )
 from swath.georef.navigation.inputs import Fate
 from swath.georef.scanner.kernels.types import Three
-
-FloatArray = NDArray[np.float64]
 
 _INFLATED, _REJECTED, _UNUSABLE = int(Fate.INFLATED), int(Fate.REJECTED), int(Fate.UNUSABLE)
 GAP_FACTOR = 1.5  # an interval that begins so much later than the one before has ended is a gap

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of, normal_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_of, times, transposed_times
@@ -57,8 +58,6 @@ from swath.georef.navigation.filter.strapdown import (
 from swath.georef.navigation.inputs import Kind, Setup
 from swath.georef.records import FixType
 from swath.georef.scanner.kernels.types import Matrix, Three
-
-FloatArray = NDArray[np.float64]
 
 _POSITION, _VELOCITY, _HEADING, _ZERO = int(Kind.POSITION), int(Kind.VELOCITY), int(Kind.HEADING), 3
 _NON_HOLONOMIC, _HEIGHT, _ATTITUDE = int(Kind.NON_HOLONOMIC), int(Kind.HEIGHT), int(Kind.ATTITUDE)

@@ -24,8 +24,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.vectors import dot, rot_of
 from swath.georef.navigation.filter.error_model import (
@@ -61,8 +61,6 @@ from swath.georef.navigation.filter.strapdown import (
 from swath.georef.navigation.filter.types import Nodes, Path
 from swath.georef.navigation.inputs import Solution
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 SECOND = 1e-9  # of nanoseconds
 

@@ -16,14 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of
 from swath.georef.geodesy.vectors import cross, plus, rot_of, times
 from swath.georef.navigation.inputs import Inertial
 from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.types import Matrix, Three
-
-FloatArray = NDArray[np.float64]
 
 POSITION, VELOCITY, ATTITUDE = 0, 3, 6  # m, m/s relative to the earth in e; q_e_from_b, scalar first
 GYRO_BIAS, ACCEL_BIAS, GYRO_SCALE, ACCEL_SCALE = 10, 13, 16, 19

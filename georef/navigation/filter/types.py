@@ -7,13 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray
 from swath.georef.navigation.filter.error_model import Drive, Layout
 from swath.georef.navigation.filter.measurements import Rules
 from swath.georef.navigation.inputs import Kind
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
-ByteArray = NDArray[np.uint8]
 
 KINDS = len(Kind)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kernel
 from swath.georef.geodesy.vectors import (
     cross,
@@ -50,7 +51,7 @@ from swath.georef.scanner.kernels.covariance import (
     spread,
     take_axes,
 )
-from swath.georef.scanner.kernels.types import Axes, FloatArray, Mounted, Scanning, Three, Track
+from swath.georef.scanner.kernels.types import Axes, Mounted, Scanning, Three, Track
 
 NOWHERE = (0.0, 0.0, 0.0)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kernel, whole
 from swath.georef.geodesy.vectors import (
     LARGE_ANGLE,
@@ -40,7 +41,7 @@ from swath.georef.scanner.kernels.beam import (
     spinning_beam,
     spinning_turn,
 )
-from swath.georef.scanner.kernels.types import Eight, FloatArray, Matrix, Three
+from swath.georef.scanner.kernels.types import Eight, Matrix, Three
 
 BLOCK = 64
 

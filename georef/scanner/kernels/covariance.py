@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple, TypeAlias
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel
 from swath.georef.geodesy.earth import down_of, geodetic_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_at, transposed_times, vector_at
@@ -44,7 +45,7 @@ from swath.georef.scanner.kernels.block import (
     put,
     three,
 )
-from swath.georef.scanner.kernels.types import FloatArray, Matrix, Six, Three
+from swath.georef.scanner.kernels.types import Matrix, Six, Three
 
 # Columns of `Known.errors`: what one independent error does.
 TURN, TURN_BY_ANGLE, SHIFT = 0, 3, 6  # rotation vectors of the beam in b, the second times θ; metres in b

@@ -10,12 +10,10 @@ import math
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.compiled import kept, kernel
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Tile: TypeAlias = tuple[FloatArray, FloatArray]
 
 PIECE_NS = 50_000  # pieces begin at whole multiples of it, whatever the batches

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from swath.georef.arrays import FloatArray
 from swath.georef.compiled import kept, kernel, whole
 from swath.georef.geodesy.earth import E2
 from swath.georef.geodesy.vectors import (
@@ -60,7 +61,7 @@ from swath.georef.scanner.kernels.covariance import (
     Doubt,
     interval_at,
 )
-from swath.georef.scanner.kernels.types import Axes, FloatArray, Matrix, Model, Out, Ranging, Scanning, Three, Track
+from swath.georef.scanner.kernels.types import Axes, Matrix, Model, Out, Ranging, Scanning, Three, Track
 from swath.georef.trajectory.trajectory import locate_epoch
 
 DONE, NO_TIME, OUTSIDE, GAP = (

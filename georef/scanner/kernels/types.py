@@ -7,11 +7,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.georef.arrays import ByteArray, FloatArray, SingleArray
 from swath.georef.records import Int64Array
 
-FloatArray = NDArray[np.float64]
-ByteArray = NDArray[np.uint8]
-SingleArray = NDArray[np.float32]
 Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float]

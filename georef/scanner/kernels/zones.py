@@ -6,12 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.compiled import kept, kernel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LIGHT_MPS = 299_792_458.0
 GAP, AMBIGUOUS, NO_RETURN = -1, -2, -3  # in the place of a zone

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion, rot_l_from_b
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Setup, Start
@@ -18,7 +18,6 @@ from swath.sim.flight.trajectory import Trajectory
 from swath.sim.imu.sensors import error_matrix, true_increments
 from tests.georef.navigation.vehicles import Motion, ns, observed
 
-FloatArray = NDArray[np.float64]
 PLACE = (np.radians(47.0), np.radians(8.0), 900.0)
 BASELINE_B = np.array([2.0, 0.0, 0.0])
 

@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Solution
 from tests.georef.navigation.flights import Truth, errors
 from tests.georef.navigation.vehicles import BEGIN_NS
 
-FloatArray = NDArray[np.float64]
 PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import smooth
 from swath.georef.navigation.inputs import GRADES, Kind, Setup, Solution
@@ -17,7 +17,6 @@ from swath.georef.records import StructArray
 from tests.georef.navigation.flights import BASELINE_B, Fixes, Truth, drawn_start, errors, noised
 from tests.georef.navigation.vehicles import ns
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 SHARE, TAU_S = 0.5, 60.0  # of the positions' variance that lasts
 HEADING_SHARE = 0.36  # of the headings', as `swath trajectory` assumes

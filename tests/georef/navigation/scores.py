@@ -6,8 +6,8 @@ import json
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotated
 from swath.georef.geodesy.rotations import rot_l_from_b
@@ -15,7 +15,6 @@ from swath.georef.navigation.inputs import Solution, Start
 from swath.georef.records import StructArray
 from tests.georef.navigation.vehicles import BEGIN_NS, collected, ns
 
-FloatArray = NDArray[np.float64]
 LINES_S = (100_600.0, 101_550.0)
 
 # north, east, down m, roll, pitch, heading degrees

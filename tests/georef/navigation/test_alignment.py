@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.geodesy.quaternions import rotation_vector
@@ -33,7 +33,6 @@ from tests.georef.navigation.vehicles import (
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.8, -0.4, -1.2])
 
 

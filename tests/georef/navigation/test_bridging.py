@@ -20,7 +20,6 @@ from tests.georef.navigation.vehicles import ns
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 RATE_HZ = 100.0
 SECONDS = 120.0

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.navigation.diagnosis.diagnose import Finding, diagnose
 from swath.georef.navigation.diagnosis.time import TimeOffset, time_offset
@@ -22,7 +22,6 @@ from tests.georef.navigation.vehicles import BEGIN_NS, Recording, car, observed,
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 Parts = tuple[Inertial, StructArray, Setup]
 WEEK_NS = 604_800 * 10**9
 FLIGHT = "tactical"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.filter.error_model import (
@@ -40,7 +40,6 @@ from swath.georef.records import FixType
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 SETUP = Setup(
     GRADES["mems"],
     np.array([[0.4, -0.2, -1.1], [1.0, 0.3, -0.9]]),

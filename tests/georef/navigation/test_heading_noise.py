@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.navigation.alignment.noise import HEADING_STEP_NS, spaced_headings
@@ -27,8 +26,6 @@ from tests.georef.navigation.receivers import ARM, DUAL_ANTENNAS, HEADING_SHARE,
 from tests.georef.navigation.vehicles import ns, observed
 
 pytestmark = pytest.mark.xdist_group("kernels")
-
-FloatArray = NDArray[np.float64]
 
 
 @cache

@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.filter.filter import run_filter
 from swath.georef.navigation.filter.smoother import forward, smooth
 from swath.georef.navigation.inputs import GRADES, Fate
@@ -17,7 +17,6 @@ from tests.georef.navigation.honesty import judge, squares
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 
 

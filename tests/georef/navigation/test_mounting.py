@@ -9,8 +9,8 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.diagnosis.diagnose import diagnose
 from swath.georef.navigation.inputs import GRADES, Inertial, Setup, sort_observations
 from swath.georef.records import StructArray
@@ -19,7 +19,6 @@ from tests.georef.navigation.vehicles import car, uav
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM_B = np.array([0.3, -0.1, -1.1])
 SENSORS = ("gyro", "accel", "both")
 

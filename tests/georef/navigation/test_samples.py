@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Inertial, NavigationError
 from swath.georef.navigation.samples import Sampler, SampleRule, StampRule
 from swath.georef.records import IMU_DTYPE
-
-FloatArray = NDArray[np.float64]
 
 EPOCH_NS = 1_447_000_000_000_000_000
 RATE_HZ = 200.0

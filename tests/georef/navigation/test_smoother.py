@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.navigation.filter.error_model import MOVED
 from swath.georef.navigation.filter.filter import FilterRun, run_filter, start_state
@@ -30,7 +30,6 @@ from tests.georef.navigation.vehicles import reference
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.quaternions import conjugate, product, rotation_vector
 from swath.georef.geodesy.rotations import attitude_of
 from swath.georef.navigation.filter.filter import run_filter
@@ -21,7 +21,6 @@ from tests.georef.navigation.vehicles import car, collected, ns, reference
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 ARM = np.array([0.35, -0.12, -1.1])
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 from pyins import strapdown as of_pyins
 from pyins.transform import lla_to_ecef
 from pyins.util import DV_COLS, LLA_COLS, RPH_COLS, THETA_COLS, VEL_COLS
 from scipy.linalg import expm
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
@@ -25,7 +25,6 @@ from tests.sim.inertial_motion import circling_the_pole
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-FloatArray = NDArray[np.float64]
 RADIUS_M = 6_378_137.0
 PERFECT = ImuNoise(0.0, 0.0, 0.0, 0.0)
 

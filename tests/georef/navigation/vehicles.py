@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.quaternions import rotation_vector
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
@@ -30,8 +31,6 @@ from swath.georef.navigation.inputs import (
 from swath.georef.records import FixType, StructArray
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.imu.sensors import error_matrix, true_increments
-
-FloatArray = NDArray[np.float64]
 
 NAVIGATION = Path(__file__).parents[4] / "shared" / "fixtures" / "navigation"
 BEGIN_NS = 2300 * 604_800 * 10**9

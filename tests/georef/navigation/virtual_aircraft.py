@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import ImuNoise, Inertial, Kind, Solution, imu_noise
 from swath.georef.records import FixType, StructArray
 from swath.georef.timescales import SECOND_NS
@@ -24,8 +25,6 @@ from swath.sim.plan.tables import GnssTable, ImuNoiseTable, ImuTable
 from swath.sim.site import Site, e_from_geodetic, rot_e_from_ned
 from tests.georef.navigation.flights import Truth, errors
 from tests.georef.navigation.vehicles import BEGIN_NS, ns, observed
-
-FloatArray = NDArray[np.float64]
 
 ARM = (0.35, -0.12, -1.1)
 WHITE_M = np.array([0.01, 0.01, 0.02])

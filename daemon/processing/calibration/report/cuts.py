@@ -9,16 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from swath.calib.features import Plane
 from swath.calib.flight import Flight
 from swath.calib.summary import ReportInput
 from swath.daemon.processing.pages.canvas import INK, MUTED, Canvas, Format, Panels, Picture, colour_of
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
-
-FloatArray = NDArray[np.float64]
 
 MOST_CUTS = 3
 HALF_LENGTH_M, HALF_WIDTH_M, MARGIN_M = 11.0, 0.6, 6.0

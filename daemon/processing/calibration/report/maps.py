@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from swath.calib.features import ControlPoint
@@ -28,8 +27,7 @@ from swath.daemon.processing.pages.canvas import (
     class_words,
     colour_of,
 )
-
-FloatArray = NDArray[np.float64]
+from swath.georef.arrays import FloatArray
 
 MOST_OUTLINE_POINTS = 4000
 MARKERS = {"roof": "^", "ground": "o", "wall": "s", "control": "*", "user": "D"}

@@ -30,9 +30,8 @@ from swath.daemon.processing.pages.canvas import (
     Picture,
     colour_of,
 )
+from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
-
-FloatArray = NDArray[np.float64]
 
 MOST_CELLS = 60  # unknowns in the correlation matrix
 MOST_PAIRS = 30

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from swath.calib.outcome import Residuals
 from swath.calib.summary import ReportInput
 from swath.daemon.processing.pages.canvas import BAD, INK, MUTED, SERIES, Canvas, Format, Panels, Picture
+from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
-
-FloatArray = NDArray[np.float64]
 
 PANEL_IN, NORMAL_IN = 1.7, 2.0
 MOST_COLUMNS, MOST_ROWS, EACH = 40, 41, 400  # of the shaded panels; observations a column at least, about
