@@ -3,6 +3,9 @@
 Positions are compared as medians over blocks of time, whose sigma holds what a kind of fix is wrong by for a whole
 flight: a receiver's own sigma is that of its noise from epoch to epoch. Turn rates are compared with what the attitude
 would give if its angles had other signs, so that a wrong convention is named and not only seen.
+
+Gusts are turn rates above 0.5 Hz, which no two flights over the same lines share. Slower ones are those of the lines
+flown and the turns between them: another flight of the same plan has them too.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 LATEST_NS = 1 << 62  # of GPS time, in 2126: differences and sums of two stay within 64 bits
 MAX_STRIPS = 65_535  # a point source id has 16 bits
 CSV_COLUMNS = ("start_gps_ns", "end_gps_ns")

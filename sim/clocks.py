@@ -12,11 +12,11 @@ import numpy as np
 
 from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.timescales import unix_ns_from_gps
+from swath.georef.timescales.gps_time import SECOND_NS
 from swath.sim.plan.plan import Plan
 from swath.sim.plan.tables import OscillatorTable, PpsTable
 
 UPTIME_AT_START_NS = 600 * 1_000_000_000  # what CLOCK_MONOTONIC says at the plan's start
-_NS = 1_000_000_000
 
 
 WANDER_PERIOD_S = 600.0
@@ -93,13 +93,13 @@ class HostClock:
     def __init__(self, plan: Plan) -> None:
         self._rate = 1.0 + 1e-6 * plan.tables.host.clock_ppm
         utc_ns = unix_ns_from_gps(plan.start_gps_ns, plan.leap_seconds)
-        self.start_ns = utc_ns + round(plan.tables.host.utc_offset_s * _NS)
+        self.start_ns = utc_ns + round(plan.tables.host.utc_offset_s * SECOND_NS)
         faults = [fault for fault in plan.tables.fault if fault.kind == "clock_step"]
         self.wall_steps = sorted((fault.at_s, fault.step_s) for fault in faults)
 
     def host_ns(self, time_s: float) -> int:
         """Host time (log_time) at a true time."""
-        return self.start_ns + round(time_s * self._rate * _NS)
+        return self.start_ns + round(time_s * self._rate * SECOND_NS)
 
     def monotonic_ns(self, time_s: float) -> int:
         """CLOCK_MONOTONIC."""
@@ -107,4 +107,6 @@ class HostClock:
 
     def realtime_ns(self, time_s: float) -> int:
         """CLOCK_REALTIME, with the steps so far."""
-        return self.host_ns(time_s) + sum(round(step_s * _NS) for at_s, step_s in self.wall_steps if at_s <= time_s)
+        return self.host_ns(time_s) + sum(
+            round(step_s * SECOND_NS) for at_s, step_s in self.wall_steps if at_s <= time_s
+        )

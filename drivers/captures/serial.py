@@ -1,4 +1,19 @@
-"""Bytes of a serial line as others kept them: with a table of arrivals, with RTKLIB's time tags, or bare."""
+"""Bytes of a serial line as others kept them: with a table of arrivals, with RTKLIB's time tags, or bare.
+
+Time tags as RTKLIB's str2str writes them beside a stream (``FILE.tag``): read and written.
+
+Source: src/stream.c, `openfile_`, `readfile` and `writefile`, of github.com/rtklibexplorer/RTKLIB @ 01225392d7ce. All
+little-endian:
+
+    60 bytes   text that begins with "TIMETAG RTKLIB"
+     4 bytes   the computer's tick when the file was opened, ms; RTKLIB plays several files in step by it
+    12 bytes   GPS time of the opening: seconds since 1970-01-01 (u32), fraction of a second (f64)
+     8 bytes   a write: milliseconds since the opening (u32), size of the stream after it (u32); repeated
+
+Older versions (github.com/tomojitakasu/RTKLIB @ 02a5688c2bf5) write time and sizes as the computer lays them out in
+memory: seconds and sizes have 8 bytes on one of 64 bits. With the option ``::P=8`` sizes have 8 bytes anywhere. Which
+layout a file has shows in whether its numbers make sense.
+"""
 
 from __future__ import annotations
 

@@ -34,6 +34,7 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.timescales.gps_time import MILLISECOND_NS
 
 DBC_PATH = Path(__file__).with_name("canmod-gps.dbc")
 IMU_SIGNALS = {
@@ -86,7 +87,6 @@ FIX_TYPES = {  # VAL_ 1 FixType of the DBC
 UNIX_EPOCH = dt.date(1970, 1, 1)
 MS_PER_S = 1000
 MS_PER_DAY = 86_400_000
-NS_PER_MS = 1_000_000
 
 
 class GnssMessage(NamedTuple):
@@ -209,7 +209,7 @@ def utc_tag(unix_s: float) -> TimeTag:
     if unix_ms % MS_PER_S == MS_PER_S - 1:
         unix_ms += 1
     days, ms_of_day = divmod(unix_ms, MS_PER_DAY)
-    return TimeTag(TimeScale.UTC, ms_of_day * NS_PER_MS, date=UNIX_EPOCH + dt.timedelta(days=days))
+    return TimeTag(TimeScale.UTC, ms_of_day * MILLISECOND_NS, date=UNIX_EPOCH + dt.timedelta(days=days))
 
 
 def _status_values(name: str, values: dict[str, float]) -> dict[str, float | int | str | bool]:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.records import Int64Array
+from swath.georef.timescales.gps_time import SECOND_NS
 
 RESTART_TOLERANCE_S = 2.0  # host stamps may be late by stalls of this size
 RESTART_TOLERANCE_RATE = 0.01  # and both clocks together off by this
-NS_PER_S = 1_000_000_000
 LATE_LATCH_PART = 8  # a latched value may be ahead of its reference by this part of the wrap
 
 
@@ -50,7 +50,7 @@ class CounterUnwrapper:
 
     def _steps(self, raw: NDArray[np.uint64], host_step_ns: Int64Array) -> tuple[Int64Array, NDArray[np.bool_]]:
         """Steps between neighbours in ticks, whole wraps added by host time, and where the device restarted."""
-        span_s = host_step_ns / NS_PER_S
+        span_s = host_step_ns / SECOND_NS
         expected = span_s * self._tick_hz
         steps: Int64Array = (raw[1:] - raw[:-1]).view(np.int64)
         unsure = np.zeros(len(steps), np.bool_)
@@ -142,5 +142,5 @@ def nanoseconds(counts: Int64Array, tick_hz: Fraction) -> Int64Array:
     """Counts in nanoseconds, exact below the nanosecond for whole and fractional rates."""
     scaled = counts * tick_hz.denominator
     whole, rest = np.divmod(scaled, tick_hz.numerator)
-    result: Int64Array = whole * NS_PER_S + rest * NS_PER_S // tick_hz.numerator
+    result: Int64Array = whole * SECOND_NS + rest * SECOND_NS // tick_hz.numerator
     return result

@@ -6,6 +6,11 @@ devices send the same PGN: one source is used for each, `source_address` or else
 
 Rates and angles come at 10 to 20 Hz and without a device time: they are status, no inertial samples. Positions of
 129025 and 129026 name no time and are status too; a `GnssFix` is made of 129029, which names its own.
+
+Fast packets: messages of up to 223 bytes in up to 32 frames of one identifier. The first data byte of each frame is
+``sequence << 5 | frame``: the sequence number (0 … 7) is that of the message, by source and PGN, so that messages of
+many sources may be interleaved. Frame 0 goes on with the length in bytes and six bytes of the message, each other
+frame with seven; the last is filled up (canboat, docs: "fast packet").
 """
 
 from __future__ import annotations

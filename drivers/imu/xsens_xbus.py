@@ -38,6 +38,7 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.timescales.gps_time import SECOND_NS
 
 PREAMBLE = b"\xfa\xff"  # a device alone on its line is bus identifier FF
 ITEM_HEADER = struct.Struct(">HB")  # identifier, length (MT0605P 5.3)
@@ -46,7 +47,6 @@ FORMAT_BITS = 0x0003  # number format; bits 2 and 3 are for orientations only (M
 TICK_HZ = 10_000
 COUNTER_BITS = 16
 TICK_BITS = 32
-NS_PER_S = 1_000_000_000
 UTC_VALID = 0x07  # time of week, week number and UTC (MT0605P 4.12.2)
 
 TEMPERATURE = 0x0810
@@ -268,11 +268,11 @@ class XbusParser(StreamParser):
             date = dt.date(year, month, day)
         except ValueError:
             date = None
-        if date is None or hour > 23 or minute > 59 or second > 60 or nanosecond > NS_PER_S:
+        if date is None or hour > 23 or minute > 59 or second > 60 or nanosecond > SECOND_NS:
             self.counters.errors["bad_value"] += 1
             return []
         self._last_second = named
-        tag = TimeTag(TimeScale.UTC, ((hour * 60 + minute) * 60 + second) * NS_PER_S + nanosecond, date=date)
+        tag = TimeTag(TimeScale.UTC, ((hour * 60 + minute) * 60 + second) * SECOND_NS + nanosecond, date=date)
         valid = flags & UTC_VALID == UTC_VALID
         return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="UtcTime")]
 

@@ -4,6 +4,9 @@ python-can gives messages, one Python object each; they become SocketCAN frames 
 whatever adapter was used. Where the interface is a datagram socket (udp_multicast) the kernel's stamps and its count of
 drops are used as for UDP; other adapters' stamps are of their own clocks or of the host's read, and are not handed
 over.
+
+Units are frames of Linux: `struct can_frame` (16 bytes) and `struct canfd_frame` (72). <linux/can.h>: can_id u32 with
+its flags, len u8, flags u8 (FD only), two reserved bytes, 8 or 64 bytes of data; little-endian.
 """
 
 from __future__ import annotations

@@ -21,13 +21,13 @@ from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
 from swath.georef.return_rows import Held, any_has, beyond, compact, joined, split, taken
 from swath.georef.stream.clocks import StreamClocks
 from swath.georef.stream.path import CompletePath, GrowingPath, Path
+from swath.georef.timescales.gps_time import SECOND_NS
 
 if TYPE_CHECKING:
     from swath.georef.trajectory.trajectory import Trajectory
 
 __all__ = ["CompletePath", "GrowingPath", "Path", "ScannerChain", "Stream", "StreamSettings"]
 
-SECOND_NS = 1_000_000_000
 CONTEXT_FLAG = 128  # of a return's flags: it is there for its neighbours only and gives no point itself
 FATES_BY_NAME = {name: fate for fate, name in FATE_NAMES.items()}
 NO_ROWS, NO_TIMES = np.empty(0, RETURN_DTYPE), np.empty(0, np.int64)

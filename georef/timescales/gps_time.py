@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from swath.georef.records import Int64Array, TimeScale, TimeTag
 
 SECOND_NS = 1_000_000_000
+MILLISECOND_NS = 1_000_000
 HOUR_NS = 3600 * SECOND_NS
 DAY_NS = 86_400 * SECOND_NS
 WEEK_S = 604_800

@@ -6,9 +6,7 @@ import datetime as dt
 from dataclasses import dataclass
 
 from swath.georef.timescales import utc_from_gps, week_from_gps
-
-NS_PER_S = 1_000_000_000
-NS_PER_MS = 1_000_000
+from swath.georef.timescales.gps_time import MILLISECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +28,7 @@ class Stamp:
     @property
     def clock(self) -> tuple[int, int, int]:
         """Hour, minute, and milliseconds of the minute, UTC."""
-        minutes, ms = divmod(self.day_ns // NS_PER_MS, 60_000)
+        minutes, ms = divmod(self.day_ns // MILLISECOND_NS, 60_000)
         return minutes // 60, minutes % 60, ms
 
 
@@ -44,8 +42,8 @@ class Calendar:
     def at(self, time_s: float) -> Stamp:
         """The nearest millisecond."""
         since_ms = round(time_s * 1000.0)
-        gps_ns = self.start_gps_ns + since_ms * NS_PER_MS
+        gps_ns = self.start_gps_ns + since_ms * MILLISECOND_NS
         week, tow_ns = week_from_gps(gps_ns)
         date, day_ns = utc_from_gps(gps_ns, self.leap_seconds)
         second = None if since_ms % 1000 else since_ms // 1000
-        return Stamp(second, week, tow_ns // NS_PER_MS, date, day_ns)
+        return Stamp(second, week, tow_ns // MILLISECOND_NS, date, day_ns)

@@ -7,7 +7,8 @@ import math
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.georef.records import FixType
 from swath.georef.timescales import week_from_gps
-from swath.sim.gnss.calendar import NS_PER_MS, NS_PER_S, Calendar, Stamp
+from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
+from swath.sim.gnss.calendar import Calendar, Stamp
 from swath.sim.gnss.pulse import Pulse
 from swath.sim.gnss.receiver import Epochs, InsEpochs
 from swath.sim.plan.tables import GnssTable
@@ -62,9 +63,9 @@ class UbxMessages:
 
     def _tim_tp(self, second: int) -> ubx.TimTp:
         """edge = true second − quantisation error."""
-        week, tow_ns = week_from_gps(self._calendar.start_gps_ns + second * NS_PER_S)
+        week, tow_ns = week_from_gps(self._calendar.start_gps_ns + second * SECOND_NS)
         quantisation_ps = round(-1e12 * self._pulse.late_s(second))
-        return ubx.TimTp(tow_ns // NS_PER_MS, 0, quantisation_ps, week, ubx.TP_UTC_AVAILABLE, ubx.TP_REFERENCE_GPS)
+        return ubx.TimTp(tow_ns // MILLISECOND_NS, 0, quantisation_ps, week, ubx.TP_UTC_AVAILABLE, ubx.TP_REFERENCE_GPS)
 
     def _pvt(self, epochs: Epochs, row: int, stamp: Stamp) -> ubx.NavPvt:
         empty = _empty_pvt(stamp)
@@ -151,7 +152,7 @@ def _empty_pvt(stamp: Stamp) -> ubx.NavPvt:
         second=ms // 1000,
         valid=ubx.PVT_VALID_DATE | ubx.PVT_VALID_TIME | ubx.PVT_FULLY_RESOLVED,
         time_accuracy_ns=TIME_ACCURACY_NS,
-        nano_ns=ms % 1000 * NS_PER_MS,
+        nano_ns=ms % 1000 * MILLISECOND_NS,
         fix_type=0,
         flags=0,
         flags2=0,

@@ -17,9 +17,9 @@ from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.parts import RECORDING_SIGN
 from swath.daemon.processing.live import follow as live_follow
 from swath.daemon.processing.live.follow import LiveFollower, Skipped, cached_from, is_cached
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.test_log import INFO, ROVER, SCANNER, START_NS
 
-SECOND_NS = 1_000_000_000
 STEP_NS = 250_000_000  # a chunk of each class
 Unit = tuple[str, int]
 

@@ -15,7 +15,8 @@ from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.mcap import NAME
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
-from tests.daemon.test_live_products import SECOND_NS, Utm, flight, points_at, read_back
+from swath.georef.timescales.gps_time import SECOND_NS
+from tests.daemon.test_live_products import Utm, flight, points_at, read_back
 
 pytestmark = pytest.mark.xdist_group("kernels")
 

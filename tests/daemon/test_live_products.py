@@ -22,11 +22,11 @@ from swath.daemon.processing.live.grid import TILE, CountGrid
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
 from swath.daemon.processing.live.products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
 from swath.georef.points import Points
+from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-SECOND_NS = 1_000_000_000
 GPS_NS = 1_465_549_200 * SECOND_NS
 LAT_DEG, LON_DEG, HEIGHT_M = 47.5, 8.9, 800.0
 

@@ -15,9 +15,9 @@ import pytest
 
 from swath.drivers.transports.base import RawEdge, TransportError
 from swath.drivers.transports.pps.kernel import KernelPps
+from swath.georef.timescales.gps_time import SECOND_NS
 
 PARAMETERS = Path("/sys/module/pps_sim/parameters")
-SECOND_NS = 1_000_000_000
 
 
 @pytest.fixture

@@ -7,9 +7,10 @@ import gzip
 from dataclasses import dataclass
 from pathlib import Path
 
+from swath.georef.timescales.gps_time import SECOND_NS
+
 FIXTURES = Path(__file__).parents[2] / "fixtures/novatel"
-NS_PER_S = 1_000_000_000
-WEEK_NS = 604_800 * NS_PER_S
+WEEK_NS = 604_800 * SECOND_NS
 
 
 def recording(name: str) -> bytes:

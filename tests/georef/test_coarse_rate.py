@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from swath.georef.timescales.coarse import CoarseClock
-
-SECOND_NS = 1_000_000_000
+from swath.georef.timescales.gps_time import SECOND_NS
 
 
 @pytest.mark.parametrize("rate", [0.5, 2.0, 4.0])

@@ -5,12 +5,11 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.log_check import read_log
 from tests.vm.crew import aboard, facts
 from tests.vm.machine import MODULES
 from tests.vm.seconds import labelled, wrong_seconds
-
-SECOND_NS = 1_000_000_000
 
 
 def test_clock_stepped_slewed_and_with_a_leap_second_no_wrong_second_and_no_gap(tmp_path: Path) -> None:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from swath.georef.timescales.gps_time import SECOND_NS
 from tests.daemon.log_check import LogContent, read_log
 from tests.vm.aboard_time import second_told
 from tests.vm.crew import GnssReceiver, aboard, embark, facts
 from tests.vm.machine import DCD_SHIM, MODULES
 from tests.vm.seconds import labelled, states_between, wrong_seconds
-
-SECOND_NS = 1_000_000_000
 
 
 def test_pps_seconds_are_never_wrong_whatever_befalls_the_edges(tmp_path: Path) -> None:

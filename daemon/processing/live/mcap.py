@@ -17,13 +17,14 @@ from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from swath.georef.timescales.gps_time import SECOND_NS
+
 FRAME, BODY = "local", "body"
 NAME, PREVIOUS = "live.mcap", "live.previous.mcap"
 CLOUD_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 CHUNK_BYTES = 256 << 10
 END_BYTES = 64 << 10  # of the file's index and schemas, and for each chunk some more
 END_BYTES_PER_CHUNK = 512
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +160,7 @@ class LiveMcap:
 
 
 def _stamp(time_ns: int) -> Any:
-    return fox.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS)
+    return fox.Timestamp(sec=time_ns // SECOND_NS, nsec=time_ns % SECOND_NS)
 
 
 def _size_of(path: Path) -> int:

@@ -42,10 +42,10 @@ from swath.georef.stream.clocks import ClockPlan, DevicePlan, FrozenClocks, Gnss
 from swath.georef.stream.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
 from swath.georef.text_encoding import decoded
 from swath.georef.timescales import StampScale
+from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory
 
-SECOND_NS = 1_000_000_000
 ARCSEC = math.pi / 648_000
 REACH_NS = 1_000_000  # beyond its own stamp, of a return whose calibration shifts no times
 OFFICE = StreamSettings(settle_s=2.0)  # so that a latched edge on either side of a return is known

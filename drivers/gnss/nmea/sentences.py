@@ -14,8 +14,8 @@ from typing import Any
 import pynmea2
 
 from swath.drivers.framing.checksums import nmea_xor
+from swath.georef.timescales.gps_time import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
 MPS_PER_KNOT = 1852.0 / 3600.0
 MPS_PER_KMPH = 1.0 / 3.6

@@ -29,10 +29,9 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 
-NS_PER_S = 1_000_000_000
-NS_PER_MS = 1_000_000
-WEEK_NS = 604_800 * NS_PER_S
+WEEK_NS = 604_800 * SECOND_NS
 GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_PPS_ERROR_S = 1e-3  # a clock offset beyond this is not the offset of a steered PPS
 GREATEST_LEAP_S = 255  # 8 bits in the navigation message
@@ -63,7 +62,7 @@ class Header(NamedTuple):
 
     def tag(self, earlier_ns: int = 0) -> TimeTag:
         """The header's GPS time less ``earlier_ns``."""
-        return gps_tag(self.week, self.milliseconds * NS_PER_MS - earlier_ns, self.floor_week)
+        return gps_tag(self.week, self.milliseconds * MILLISECOND_NS - earlier_ns, self.floor_week)
 
 
 @dataclass(slots=True)
@@ -119,7 +118,7 @@ def time_message(state: State, header: Header, time: nov.Time) -> list[Record | 
             names_edge=NamesEdge.PREVIOUS,
             bound=True,
             valid=header.time_valid and time.clock_status == tables.CLOCK_VALID,
-            quantisation_ns=-time.clock_offset_s * NS_PER_S if steered else 0.0,
+            quantisation_ns=-time.clock_offset_s * SECOND_NS if steered else 0.0,
             message=header.name,
         )
     ]
@@ -190,7 +189,7 @@ def ins_pvax(state: State, header: Header, pva: nov.InsPvax) -> list[Record | Ro
     """Height and undulation make the ellipsoidal height."""
     if not state.has_week(header.week):
         return []
-    time_ns = header.week * WEEK_NS + header.milliseconds * NS_PER_MS
+    time_ns = header.week * WEEK_NS + header.milliseconds * MILLISECOND_NS
     attitude = (radians(pva.roll_sigma_deg), radians(pva.pitch_sigma_deg), radians(pva.azimuth_sigma_deg))
     return _ins_row(header, time_ns, pva, pva.height_m + pva.undulation_m, (*pva[12:18], *attitude))
 
@@ -224,7 +223,7 @@ def ins_attitude(state: State, header: Header, attitude: nov.InsAtt | nov.InsAtt
         time_ns = attitude.week * WEEK_NS + _nanoseconds(attitude.seconds)
         sigmas = (nan, nan, nan)
     else:
-        time_ns = header.week * WEEK_NS + header.milliseconds * NS_PER_MS
+        time_ns = header.week * WEEK_NS + header.milliseconds * MILLISECOND_NS
         degrees = (attitude.roll_sigma_deg, attitude.pitch_sigma_deg, attitude.azimuth_sigma_deg)
         sigmas = (radians(degrees[0]), radians(degrees[1]), radians(degrees[2]))
     none = (nan, nan, nan)
@@ -335,7 +334,7 @@ def gps_tag(week: int, time_ns: int, floor_week: int) -> TimeTag:
 
 def _nanoseconds(seconds: float) -> int:
     """Nearest nanosecond; 0 for what is no number."""
-    return round(seconds * NS_PER_S) if abs(seconds) < 1e9 else 0
+    return round(seconds * SECOND_NS) if abs(seconds) < 1e9 else 0
 
 
 def _attitude(row: nov.InsPva | nov.InsPvax | nov.InsAtt | nov.InsAttx) -> tuple[float, float, float]:

@@ -27,11 +27,10 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 
-NS_PER_MS = 1_000_000
-NS_PER_S = 1_000_000_000
 WEEK_MS = 604_800_000
-WEEK_NS = WEEK_MS * NS_PER_MS
+WEEK_NS = WEEK_MS * MILLISECOND_NS
 CLOCK_MODEL_MS = 600_000  # as long as the receiver itself relies on a bias (ExtEvent)
 GREATEST_BIAS_MS = 1000.0  # beyond these the receiver would have set its clock
 GREATEST_DRIFT_PPM = 1000.0
@@ -73,7 +72,7 @@ class Stamp(NamedTuple):
         """GPS time, the clock's bias taken off; None while the receiver knows no time."""
         if self.tow_ms is None:
             return None
-        weeks, time_ns = divmod(self.tow_ms * NS_PER_MS - bias_ns, WEEK_NS)
+        weeks, time_ns = divmod(self.tow_ms * MILLISECOND_NS - bias_ns, WEEK_NS)
         return TimeTag(TimeScale.GPS, time_ns, week=None if self.week is None else self.week + weeks)
 
 
@@ -98,7 +97,7 @@ class ReceiverClock:
         """Take the bias of a position, where it says one."""
         bias_ms, drift_ppm = usable(pvt.clock_bias_ms), usable(pvt.clock_drift_ppm)
         if stamp.tow_ms is not None and abs(bias_ms) < GREATEST_BIAS_MS:
-            self._tow_ms, self._bias_ns = stamp.tow_ms, bias_ms * NS_PER_MS
+            self._tow_ms, self._bias_ns = stamp.tow_ms, bias_ms * MILLISECOND_NS
             self._drift_ppm = drift_ppm if abs(drift_ppm) < GREATEST_DRIFT_PPM else 0.0
 
     def tag(self, stamp: Stamp) -> TimeTag | None:
@@ -133,7 +132,7 @@ def geodetic_fix(parts: dict[str, FixPart]) -> GnssFix | None:
     if stamp is None or not isinstance(pvt, sbf.PvtGeodetic):
         return None
     bias_ms = usable(pvt.clock_bias_ms)
-    tag = stamp.tag(round(bias_ms * NS_PER_MS) if abs(bias_ms) < GREATEST_BIAS_MS else 0)
+    tag = stamp.tag(round(bias_ms * MILLISECOND_NS) if abs(bias_ms) < GREATEST_BIAS_MS else 0)
     if tag is None:
         return None
     lat, lon, height = usable_triple((pvt.lat_rad, pvt.lon_rad, pvt.height_m))
@@ -189,7 +188,7 @@ def event_mark(stamp: Stamp, event: sbf.ExtEvent) -> EventMark | None:
     """GPS time of an event; not valid without the clock's bias. None without time."""
     bias_s, offset_s = usable(event.clock_bias_s), usable(event.offset_s)
     known = abs(bias_s) * 1000.0 < GREATEST_BIAS_MS and abs(offset_s) < GREATEST_EVENT_OFFSET_S
-    tag = stamp.tag(round(bias_s * NS_PER_S) - round(offset_s * NS_PER_S) if known else 0)
+    tag = stamp.tag(round(bias_s * SECOND_NS) - round(offset_s * SECOND_NS) if known else 0)
     if tag is None:
         return None
     return EventMark(

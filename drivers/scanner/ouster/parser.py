@@ -51,6 +51,7 @@ from swath.georef.records import (
     ScannerReturns,
     StructArray,
 )
+from swath.georef.timescales.gps_time import SECOND_NS
 
 COLUMNS_PER_PACKET = 16  # "not user configurable", Firmware User Manual, Get the lidar data format
 
@@ -100,7 +101,6 @@ def _counts_on(units: ByteRows, start: int, column_bytes: int) -> BoolArray:
     return steady
 
 
-SECOND_NS = 1_000_000_000
 LARGEST_GAP_FRAMES = 600  # half a minute to a minute; more is a head that began anew
 # A return as one 64-bit number: range, then 1 for the second of a block, then its light.
 _CONTENT = np.dtype([("intensity", "<u2"), ("second", "<u2"), ("range", "<u4")])

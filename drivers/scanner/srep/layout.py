@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from swath.georef.arrays import BoolArray
 from swath.georef.records import Int64Array, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS
 
 MAGIC = 0x50455253  # "SREP" in memory order
 VERSION = 1
@@ -51,7 +52,6 @@ PULSE_HEAD_BYTES = 8
 SLOT_DTYPE = np.dtype([("range", "<u4"), ("intensity", "<u2"), ("pulse_width", "<u2")])
 SLOT_BYTES = SLOT_DTYPE.itemsize
 _SECONDS = 1 << 32
-_NS = 1_000_000_000
 
 
 @cache
@@ -135,7 +135,7 @@ def nanoseconds(ticks: NDArray[np.uint64], tick_hz: NDArray[np.uint32]) -> Int64
     """Tick counter to device time, both (n,): floor(ticks · 10⁹ / tick_hz), seconds modulo 2³²."""
     hz = tick_hz.astype(np.uint64)
     seconds, rest = np.divmod(ticks, hz)
-    return ((seconds % np.uint64(_SECONDS)) * np.uint64(_NS) + rest * np.uint64(_NS) // hz).astype(np.int64)
+    return ((seconds % np.uint64(_SECONDS)) * np.uint64(SECOND_NS) + rest * np.uint64(SECOND_NS) // hz).astype(np.int64)
 
 
 def header_checks(header: StructArray, length: Int64Array) -> list[tuple[str, BoolArray]]:
@@ -201,15 +201,15 @@ def pulse_times(header: StructArray, ticks: NDArray[np.uint32], rows: PulseRows)
     """
     hz = int(header["tick_hz"][0])
     seconds, left = np.divmod(header["first_ticks"], np.uint64(hz))
-    base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * _NS
+    base = (seconds % np.uint64(_SECONDS)).astype(np.int64) * SECOND_NS
     rest = left.astype(np.int64)
     after = ticks.astype(np.int64)
-    if _NS % hz == 0:
-        after *= _NS // hz
-        base += rest * (_NS // hz)
+    if SECOND_NS % hz == 0:
+        after *= SECOND_NS // hz
+        base += rest * (SECOND_NS // hz)
     else:
         after += rows.spread(rest)[:, np.newaxis]
-        after *= _NS
+        after *= SECOND_NS
         after //= hz
     after += rows.spread(base)[:, np.newaxis]
     return after

@@ -26,6 +26,7 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.timescales.gps_time import SECOND_NS
 
 POSITION_BYTES = 512
 PPS_ABSENT, PPS_SYNCHRONIZING, PPS_LOCKED, PPS_ERROR = range(4)
@@ -35,7 +36,6 @@ _STAMP_AT = 198
 _STATUS = struct.Struct("<IB")
 _SENTENCE_AT = 206
 _SECOND_US = 1_000_000
-_NS = 1_000_000_000
 
 
 def encode_position_packet(stamp_us: int, pps_status: int, sentence: str) -> bytes:
@@ -134,7 +134,7 @@ class PositionReader:
         """Whether the sentence belongs to the edge just past: by the locked clock, else by being new."""
         if pps_status != PPS_LOCKED:
             return self._sentence is not None
-        if time.time_ns // _NS % 3600 == stamp_us // _SECOND_US:
+        if time.time_ns // SECOND_NS % 3600 == stamp_us // _SECOND_US:
             return True
         self._counters.errors["nmea_second_mismatch"] += 1
         return False
@@ -167,5 +167,5 @@ def rmc_time(sentence: bytes) -> tuple[TimeTag, bool] | None:
         return None
     if hour > 23 or minute > 59 or second > 60:
         return None
-    time_ns = ((hour * 60 + minute) * 60 + second) * _NS + int(fraction.ljust(9, "0"))
+    time_ns = ((hour * 60 + minute) * 60 + second) * SECOND_NS + int(fraction.ljust(9, "0"))
     return TimeTag(TimeScale.UTC, time_ns, date=day), fields[2] == "A"
