@@ -22,7 +22,7 @@ from swath.calib.equations.trajectory_prior import Knots, TrajectoryPrior, apply
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Swath
 from swath.calib.parameters import MODELS, Wish
-from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import thinned
 from swath.calib.planes.search import find_planes
 from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, replaced

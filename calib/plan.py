@@ -21,8 +21,8 @@ from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
 from swath.calib.outcome import Held
 from swath.calib.parameters import Wish
-from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import CELL_SHORT_M, CELL_SIZES_M
+from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import RIM_M
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import boresight, rot_from_quaternion

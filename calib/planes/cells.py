@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.flight import Flight, Swath, sensor_t
-from swath.calib.plane_settings import PlaneError, PlaneSettings
-from swath.calib.planes.fit import expected_sigma
+from swath.calib.planes.fit import PlaneError, PlaneSettings, expected_sigma
 from swath.calib.planes.kernels import (
     EMPTY,
     FEW,

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight, Swath, sensor_t
-from swath.calib.plane_settings import PlaneError, PlaneSettings, scaled_to
 from swath.calib.planes.cells import cell_size, keys_of
-from swath.calib.planes.fit import GATE, expected_sigma
+from swath.calib.planes.fit import GATE, PlaneError, PlaneSettings, expected_sigma, scaled_to
 from swath.calib.planes.returns import plane_of, returns_near, sights_of
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight
-from swath.calib.plane_settings import PlaneSettings, scaled_to
 from swath.calib.planes.cells import cell_size, keys_of
-from swath.calib.planes.fit import GATE, Sight, fit_sight, refusal
+from swath.calib.planes.fit import GATE, PlaneSettings, Sight, fit_sight, refusal, scaled_to
 from swath.calib.planes.returns import WIDE_M, cells_of, plane_of, pure, returns_near, thinned, well_inside
 from swath.georef.records import Int64Array
 

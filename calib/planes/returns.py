@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Swath
-from swath.calib.plane_settings import PlaneSettings
 from swath.calib.planes.cells import BLOCK, blocks, keys_of
-from swath.calib.planes.fit import Sight, fit_sight, refusal
+from swath.calib.planes.fit import PlaneSettings, Sight, fit_sight, refusal
 from swath.calib.planes.kernels import fill_table, gather
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from swath.calib.flight import Flight
-from swath.calib.height_grids import Lattice, surface
-from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.search import find_planes
-from swath.calib.prealign import NAMES, PrealignError, PrealignSettings, _damping, prealign
+from swath.calib.prealign import NAMES, Lattice, PrealignError, PrealignSettings, _damping, prealign, surface
 from swath.calib.scale import scale_of
 from swath.georef.scanner.calibration import Calibration
 from tests.calib.cast_flight import Cast, Line, cast_flight

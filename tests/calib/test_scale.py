@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.fit import PlaneSettings
 from swath.calib.scale import Scale, area_spacing_m, scale_of, spacing_m
 from tests.calib.cast_flight import cast_flight
 from tests.calib.surface_flight import swath_of

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from swath.calib.features import Features, Plane
 from swath.calib.flight import Flight
-from swath.calib.plane_settings import PlaneSettings
+from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.search import find_planes
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError

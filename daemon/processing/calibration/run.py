@@ -28,7 +28,7 @@ from swath.calib.labels import number, unknown
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
 from swath.calib.parameters import Wish as Model
-from swath.calib.plane_settings import PlaneError, PlaneSettings
+from swath.calib.planes.fit import PlaneError, PlaneSettings
 from swath.calib.planes.given import given_planes
 from swath.calib.planes.matching import rematch
 from swath.calib.planes.returns import limited

@@ -19,7 +19,7 @@ from swath.calib.control.points import ControlError, control_planes
 from swath.calib.equations.normals import NormalError
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
-from swath.calib.plane_settings import PlaneError
+from swath.calib.planes.fit import PlaneError
 from swath.calib.planes.search import find_planes
 from swath.calib.strips.cells import StripRules
 from swath.calib.strips.corrections import DEFAULTS, MODELS, Settings, StripAdjusted, StripError, adjust_strips

@@ -17,7 +17,7 @@ from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
 from swath.calib.parameters import Wish as Model
-from swath.calib.plane_settings import PlaneError
+from swath.calib.planes.fit import PlaneError
 from swath.calib.planes.search import find_planes
 from swath.calib.record.record import Document
 from swath.calib.validation.history import History, HistoryError, history
