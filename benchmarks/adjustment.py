@@ -29,7 +29,7 @@ from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import Wish, unknowns
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import LineGeometry

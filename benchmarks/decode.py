@@ -23,7 +23,7 @@ from fastcrc.crc32 import iso_hdlc as crc32
 from fastcrc.crc64 import xz as crc64_xz
 
 from benchmarks.cpu_time import cpu_seconds
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 from swath.drivers.captures.opening import read_candump, read_pcap
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cpu_time import cpu_seconds
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 from swath.georef.air.atmosphere import Air
 from swath.georef.arrays import FloatArray
 from swath.georef.georeference import BLOCK_ROWS, Georeferencer

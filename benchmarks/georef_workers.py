@@ -24,10 +24,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.georef_log import CRS, ONE_HEAD, POINT_BYTES, Bench, compress, fly
-from swath.daemon.memory import keep_freed_memory
 from swath.daemon.processing.flights.read import Wish
 from swath.daemon.processing.georeferencing.run import georeference
 from swath.daemon.processing.setup.setup import Options
+from swath.daemon.system import keep_freed_memory
 
 STRIPS = 4
 ASKED = {False: 3.2e6, True: 2.5e6}  # returns a second with two workers: without and with three sigmas

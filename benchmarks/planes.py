@@ -24,7 +24,7 @@ from benchmarks.cpu_time import cpu_seconds
 from swath.calib.flight import Flight, Head, Swath, Tangent
 from swath.calib.planes.matching import rematch
 from swath.calib.planes.search import find_planes
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import RETURN_DTYPE

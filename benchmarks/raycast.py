@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.cpu_time import cpu_seconds
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 from swath.georef.arrays import FloatArray
 from swath.sim.plan.plan import parse_plan
 from swath.sim.scene.scene import Scene, build_scene

@@ -110,14 +110,15 @@ def _follow(
 
     from swath.daemon.config import load_config
     from swath.daemon.config.tables import LiveConfig
-    from swath.daemon.processing.live.session import Live, be_humble
+    from swath.daemon.processing.live.session import Live
     from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import before_compiling, get_ready, warm_up
     from swath.daemon.recorder.service_manager import ServiceManager
+    from swath.daemon.system import lower_priority
 
     directory = log_directory(where)
     config = None if where.is_dir() else load_config(where)
-    be_humble()
+    lower_priority()
     manager = ServiceManager()
     manager.notify(STATUS="compiling")
     with before_compiling(_tell_of_compiling):

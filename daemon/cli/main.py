@@ -24,7 +24,7 @@ import typer
 
 from swath import __version__
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.daemon.memory import keep_freed_memory
+from swath.daemon.system import keep_freed_memory
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells say it
 PIPE_CLOSED = 141  # 128 + SIGPIPE

@@ -37,7 +37,7 @@ def command(
     Exit code 3 when a log could not be copied or DEST is full, 4 when a copy is not what the log holds.
     """
     from swath.daemon.exchange.offload import is_growing, offload
-    from swath.daemon.priority import give_way
+    from swath.daemon.system import give_way
 
     directory = log_directory(where)
     if any(map(is_growing, directory.glob("*.mcap"))):

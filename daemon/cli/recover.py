@@ -30,7 +30,7 @@ def command(
     """
     from swath.daemon.log.format import LogError
     from swath.daemon.log.recover import recover
-    from swath.daemon.priority import give_way
+    from swath.daemon.system import give_way
 
     if background:
         give_way()

@@ -21,7 +21,6 @@ from swath.daemon.log.events import Events
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.parts import Attachment, Parts
-from swath.daemon.memory import lock_memory
 from swath.daemon.recorder.corrections import CorrectionsWatch, Relay
 from swath.daemon.recorder.first_units import FirstUnits
 from swath.daemon.recorder.process import RecorderProcess
@@ -29,6 +28,7 @@ from swath.daemon.recorder.receivers import Receiver, Shared, UnitReceiver, Unit
 from swath.daemon.recorder.service_manager import ServiceManager
 from swath.daemon.recorder.timekeeper import TimeKeeper
 from swath.daemon.recorder.writer import Recorder, RecorderSettings
+from swath.daemon.system import lock_memory
 from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock

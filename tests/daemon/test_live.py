@@ -420,7 +420,7 @@ class TestCommand:
                 return {"state": "ended (stopped)"}
 
         monkeypatch.setattr("swath.daemon.processing.warm_up.warm_up", lambda setups: WarmUp(12, 3.25, None))
-        monkeypatch.setattr("swath.daemon.processing.live.session.be_humble", lambda: None)
+        monkeypatch.setattr("swath.daemon.system.lower_priority", lambda: None)
         monkeypatch.setattr("swath.daemon.processing.live.session.Live", Nothing)
         assert run_app(["live", str(tmp_path)]) == 0
         told = capfd.readouterr()

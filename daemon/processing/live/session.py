@@ -7,7 +7,6 @@ the operator, and what is passed over when this computer is too slow, depends on
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -33,9 +32,6 @@ FOLDER = "live"  # in the log directory
 POLL_S = 0.05
 STATUS_S = 1.0
 COVERAGE_S = 10.0
-NICE = 10
-_IOPRIO_SET = {"x86_64": 251, "aarch64": 30, "armv7l": 314, "riscv64": 30}  # system call numbers
-_IOPRIO_WHO_PROCESS, _IOPRIO_IDLE = 1, 3 << 13
 
 Told = dict[str, Any]
 
@@ -313,15 +309,3 @@ def replay(
     except OSError as error:
         raise UserError(one_line(f"{error.filename or folder}: {error.strerror or error}"), ExitCode.IO) from error
     return found
-
-
-def be_humble() -> None:
-    """Give way to the recorder: a low priority, and the disk only when nobody else wants it. None of it is vital."""
-    import ctypes
-    import platform
-
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, max(NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    number = _IOPRIO_SET.get(platform.machine())
-    if number is not None:
-        ctypes.CDLL(None, use_errno=True).syscall(number, _IOPRIO_WHO_PROCESS, 0, _IOPRIO_IDLE)
