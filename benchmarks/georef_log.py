@@ -34,13 +34,13 @@ from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.log.chunk_index import SCANNER as SCANNER_TOPICS
 from swath.daemon.log.chunk_index import index_log, read_chunks
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.live.session import replay
 from swath.daemon.processing.points.feed import LogFeed, read_clocks
 from swath.daemon.processing.points.jobs import Job, SessionPlan, run_job
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.daemon.replay.units import source_of_topic
 from swath.daemon.system import keep_freed_memory
 from swath.georef.formats.las import BLOCK, LasSettings, PointPacker
 from swath.georef.formats.las_header import POINT_FORMAT

@@ -10,9 +10,9 @@ from typing import Any
 
 from mcap.reader import make_reader
 
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.replay.units import source_of_topic
 from swath.drivers.parser import Parser
 from swath.georef.records import ChunkBatch
 

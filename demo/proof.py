@@ -19,7 +19,8 @@ from rich.live import Live
 from rich.table import Table
 
 from swath.daemon.config import load_config
-from swath.daemon.replay.units import close_outputs, open_outputs, source_of_topic
+from swath.daemon.log.format import source_of_topic
+from swath.daemon.replay.units import close_outputs, open_outputs
 from swath.daemon.replay.wire_player import Output, PlayReport, TimedUnit, play
 
 START_S, END_S = 30.0, 30.0

@@ -87,6 +87,7 @@ def command(
     """
     require_installed("swath calibrate", *(["matplotlib"] if report else []))
     from swath.daemon.cli.georef import calibrations_given
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.calibration.model import file_of, model_of
     from swath.daemon.processing.calibration.products import write_products
@@ -94,7 +95,6 @@ def command(
     from swath.daemon.processing.calibration.run import CalibrateWish, calibrate
     from swath.daemon.processing.flights.read import Wish
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
-    from swath.daemon.processing.progress import progress_bar
     from swath.daemon.processing.setup.setup import Options
 
     _refuse(output, observe, overwrite=overwrite)

@@ -66,11 +66,11 @@ def command(
     partial: parts missing, data damaged, strips that failed; 2 and 3 when there are none.
     """
     require_installed("swath georef")
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.flights.read import Wish
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
     from swath.daemon.processing.georeferencing.run import georeference
-    from swath.daemon.processing.progress import progress_bar
     from swath.daemon.processing.setup.setup import Options
     from swath.georef.strips import StripRules
 

@@ -65,7 +65,7 @@ def _unaccounted(numbers: dict[str, Any]) -> int:
 def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from swath.daemon.recorder.health import clock_text
+    from swath.daemon.log.words import clock_text
 
     start = datetime.fromtimestamp((numbers["start_ns"] or 0) * 1e-9, tz=UTC)
     console.print(

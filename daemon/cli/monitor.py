@@ -150,7 +150,7 @@ def _disk(found: dict[str, Any]) -> str:
 def _event(event: dict[str, Any]) -> Any:
     from rich.text import Text
 
-    from swath.daemon.recorder.health import clock_text
+    from swath.daemon.log.words import clock_text
 
     when, severity = clock_text(event.get("time_ns")), str(event.get("severity"))
     style = {"critical": "bold red", "error": "red", "warning": "yellow"}.get(severity, "")

@@ -120,7 +120,7 @@ def _compare(
     *,
     as_json: bool,
 ) -> None:
-    from swath.daemon.processing.progress import progress_bar
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.strips.compare import StripsWish, compare_strips, rules_of
 
     wish = StripsWish(logs.logs, logs, before, rules_of(*cells), output, level)
@@ -134,8 +134,8 @@ def _compare(
 def _adjust(
     logs: Wish, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.carried_verdict import refusal
-    from swath.daemon.processing.progress import progress_bar
     from swath.daemon.processing.strips.adjust import AdjustWish, correct_strips
     from swath.daemon.processing.strips.adjust_products import write_adjustment
 

@@ -56,10 +56,10 @@ def command(
     not to be used: data damaged, parts missing, inputs that do not go together; 2 and 3 when there is none.
     """
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.navigation.inputs import INS_USES, InputWish
     from swath.daemon.processing.navigation.navigate import NavigateWish, arm_of_text, attitude_of_text
-    from swath.daemon.processing.progress import progress_bar
     from swath.daemon.processing.trajectory.run import TrajectoryWish, make_trajectory
 
     if ins not in INS_USES:

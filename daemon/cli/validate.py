@@ -62,10 +62,10 @@ def command(
     that was asked for, could be tested; 2 and 3 as ever.
     """
     require_installed("swath validate", *(["matplotlib"] if output else []))
+    from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
     from swath.daemon.processing.flights.read import Wish
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
-    from swath.daemon.processing.progress import progress_bar
     from swath.daemon.processing.setup.setup import Options
     from swath.daemon.processing.validation.run import ValidateWish, read_file, run_validation
 

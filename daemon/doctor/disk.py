@@ -13,7 +13,7 @@ from pathlib import Path
 from swath.daemon.doctor.devices import User
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.directory import nearest_there
-from swath.daemon.recorder.health import duration_text
+from swath.daemon.log.words import duration_text
 
 SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
 OTHER_BYTES_PER_S = 0.2e6

@@ -20,11 +20,10 @@ from typing import Any
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.exchange.export_files import CandumpFile, NativeFile, PcapFile, PpsFile, SerialFile
 from swath.daemon.log.durable import sync_tree, try_sync_directory
-from swath.daemon.log.format import LogError, safe_attachment_path
+from swath.daemon.log.format import LogError, safe_attachment_path, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.log.reader import Session
-from swath.daemon.replay.units import source_of_topic
 
 MANIFEST = "swath-export.json"
 CONFIG_FOLDER = "config"

@@ -14,11 +14,11 @@ from pathlib import Path
 from swath import __version__
 from swath.daemon.config import Config
 from swath.daemon.exchange.captures import Capture, ImportUnit
-from swath.daemon.exchange.log_maker import MadeLog, session_name
+from swath.daemon.exchange.log_maker import MadeLog
 from swath.daemon.exchange.routes import Routes
 from swath.daemon.log.events import Severity
 from swath.daemon.log.format import SessionInfo
-from swath.daemon.recorder.run import read_boot_id
+from swath.daemon.log.session import read_boot_id, session_name
 
 
 def merge(captures: Iterable[Capture], routes: Routes) -> Iterator[ImportUnit]:

@@ -4,7 +4,6 @@ follow its clock. Captures that are imported and flights of the virtual aircraft
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,21 +22,12 @@ from swath.daemon.log.host_clock import ClockPair, HostClock
 from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.parts import Attachment, Parts
-from swath.daemon.recorder.receivers import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S
+from swath.daemon.log.wires import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S
 from swath.drivers.captures.base import Address
 
 STATUS_NS = 1_000_000_000
 _BEHIND = 1000  # units in a row so far behind the newest: its stamp was the wrong one
 _NO_DISK_FIGURES = {"queue_high_water": 0, "write_ms_max": 0.0, "sync_ms_max": 0.0}
-
-
-def session_name(name: str, start_ns: int, boot_id: str) -> str:
-    """``session_id`` of a session that begins at this wall clock time."""
-    try:
-        start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(start_ns // 1_000_000_000))
-    except (ValueError, OverflowError, OSError):
-        start = str(start_ns)
-    return f"{name}-{start}-{boot_id[:4]}"
 
 
 class MadeClock(HostClock):

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 from swath.daemon.config import Config
 from swath.daemon.log.format import ChannelSpec
-from swath.daemon.recorder.receivers import Wire
-from swath.daemon.recorder.run import make_wire
+from swath.daemon.log.wires import Wire, make_wire
 from swath.drivers.captures.base import CapturedUnit
 from swath.drivers.transports.spec import TransportSpec
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+_FIXED = "fixed:"
+
 PROFILE = "swath"
 LIBRARY = "swath"
 MAGIC = b"\x89MCAP0\r\n"
@@ -168,3 +170,10 @@ def safe_attachment_path(folder: Path, name: str) -> Path:
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
         raise LogError(f"attachment {name!r}: is no name; nothing is written for it")
     return folder.joinpath(*parts)
+
+
+def source_of_topic(topic: str) -> str | None:
+    """``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
+    if topic.startswith("/pps/"):
+        return topic[1:]
+    return topic[1 : -len("/raw")] if topic.endswith("/raw") else None

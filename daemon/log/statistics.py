@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import Session
-from swath.daemon.replay.units import source_of_topic
 from swath.drivers.parser import Parser
 from swath.georef.records import ChunkBatch, Int64Array
 

@@ -10,13 +10,12 @@ from typing import Any
 
 from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.follow import LogFollower, PartFollower
-from swath.daemon.log.format import LogError, SessionInfo
+from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config, stored_drivers
+from swath.daemon.log.session import read_boot_id
+from swath.daemon.log.words import duration_text, source_trouble
 from swath.daemon.monitor.source import Decoding, SourceWatch, decoded_trouble
-from swath.daemon.recorder.health import duration_text, source_trouble
-from swath.daemon.recorder.run import read_boot_id
-from swath.daemon.replay.units import source_of_topic
 
 TAIL_S = 5.0
 EVENTS_KEPT = 50

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.reader import PartDamage
-from swath.daemon.replay.units import source_of_topic
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     ChunkBatch,

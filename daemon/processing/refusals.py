@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from pyproj import CRS
 
-from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.errors import ExitCode, UserError
 from swath.georef.points import Fate
 from swath.georef.timescales import StampScale, TimeState
 from swath.georef.trajectory.buffer import COLUMNS
@@ -32,7 +32,6 @@ MUCH = 0.01  # share of returns without time that is worth a warning
 LATE_S = 0.06  # more than an IMU's samples are late at the host
 LOOKED_AT = 10_000  # epochs, whether the body flies forward and upright
 UNSAID = "a datum that is not said"
-LONGEST_NAME = 200  # bytes of a session's name, whose products' names are longer
 FLIES_MPS = 15.0  # nothing flies so fast sideways
 FORWARD = 0.5  # cosine between nose and course, below which it would
 AXES = (
@@ -104,18 +103,6 @@ def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
 def _datum_of(config: Config) -> str | None:
     """As `swath.daemon.processing.setup.setup.Setup` takes it."""
     return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
-
-
-def refuse_no_name(session_id: str, log: Path) -> None:
-    """A session's name becomes that of its products: a log from elsewhere must not lead out of their folder.
-
-    Raises:
-        UserError: it is no name of a file.
-    """
-    leads = session_id != Path(session_id).name or session_id in ("", ".", "..")
-    if leads or not session_id.isprintable() or len(session_id.encode()) > LONGEST_NAME:
-        shown = one_line(session_id[:80])
-        raise UserError(f'{log}: its session_id "{shown}" is no name of a file; is it a log of Swath\'s?')
 
 
 def _said(value: object) -> str:

@@ -7,8 +7,9 @@ never a reason to restart: a restart would only cost the data of the others.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 
+from swath.daemon.log.words import duration_text, source_trouble
 from swath.daemon.recorder.receivers import Receiver
 from swath.daemon.recorder.writer import WriterHealth, Writing
 
@@ -37,20 +38,6 @@ def a_restart_helps_nobody(stuck: Collection[str], receivers: Iterable[Receiver]
     return {receiver.source for receiver in receivers if receiver.opening}.issuperset(stuck)
 
 
-def duration_text(seconds: float) -> str:
-    """``3 h 05 min``, ``12 min``, ``40 s``."""
-    if seconds >= 3600:
-        return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
-    return f"{int(seconds // 60)} min" if seconds >= 60 else f"{int(seconds)} s"
-
-
-def clock_text(time_ns: object) -> str:
-    """UTC of a host time as ``10:15:03``; whatever else a log holds there is a question mark."""
-    if isinstance(time_ns, int) and 0 <= time_ns < 1 << 63:
-        return time.strftime("%H:%M:%S", time.gmtime(time_ns // 1_000_000_000))
-    return "?"
-
-
 def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
     """What the operator reads in ``systemctl status``."""
     if writer.state is not Writing.RECORDING:
@@ -63,19 +50,3 @@ def sentence(session_id: str, part: int, writer: WriterHealth) -> str:
         left_s = max(0, writer.free_bytes - writer.reserve_bytes) / writer.bytes_per_s
         room += f" ({duration_text(left_s)})"
     return f"recording {session_id} part {part}: {told}; {room}"
-
-
-def source_trouble(source: str, status: Mapping[str, object]) -> str:
-    """What is wrong with a source by its status, in a few words; nothing when all is well."""
-    lost = sum(int(str(status[key])) for key in ("lost_kernel", "lost_queue", "lost_write"))
-    words = []
-    if status["state"] == "silent":
-        age_s = status["last_unit_age_s"]
-        words.append("no data yet" if age_s is None else f"silent for {age_s:.0f} s")
-    elif status["state"] != "receiving":
-        words.append(str(status["state"]))
-    if lost:
-        words.append(f"{lost} units lost")
-    if status.get("time_state") not in (None, "LOCKED"):
-        words.append(f"time {status['time_state']}")
-    return f"{source} " + ", ".join(words) if words else ""

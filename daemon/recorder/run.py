@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
-import platform
 import time
-import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from swath import __version__
-from swath.daemon.acquire_pps import PpsReceiver
 from swath.daemon.config import Config, DeviceEntry, GnssConfig
 from swath.daemon.errors import ExitCode
 from swath.daemon.log.block_queue import BlockQueue
@@ -21,10 +17,12 @@ from swath.daemon.log.events import Events
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.parts import Attachment, Parts
+from swath.daemon.log.session import make_session_info
+from swath.daemon.log.wires import make_wire
 from swath.daemon.recorder.corrections import CorrectionsWatch, Relay
 from swath.daemon.recorder.first_units import FirstUnits
 from swath.daemon.recorder.process import RecorderProcess
-from swath.daemon.recorder.receivers import Receiver, Shared, UnitReceiver, UnitsSeen, Wire
+from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared, UnitReceiver, UnitsSeen
 from swath.daemon.recorder.service_manager import ServiceManager
 from swath.daemon.recorder.timekeeper import TimeKeeper
 from swath.daemon.recorder.writer import Recorder, RecorderSettings
@@ -33,32 +31,9 @@ from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock
 from swath.drivers.transports.opening import open_transport, parse_pps
-from swath.drivers.transports.spec import TransportSpec
 from swath.georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
-
-_ENCODINGS = {"serial": "x-swath-serial", "can": "x-swath-can", "udp": "x-swath-udp", "ntrip": "x-swath-serial"}
-
-
-def read_boot_id() -> str:
-    """This boot of the computer; the unit says it in ``SWATH_BOOT_ID``, because its /proc holds processes only."""
-    said = os.environ.get("SWATH_BOOT_ID", "")
-    return str(uuid.UUID(said)) if said else Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-
-
-def make_session_info(name: str, clock: HostClock) -> SessionInfo:
-    """Name a session by its start and this boot of the computer."""
-    boot_id = read_boot_id()
-    start = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(clock.realtime_ns // 1_000_000_000))
-    return SessionInfo(
-        session_id=f"{name}-{start}-{boot_id[:4]}",
-        software=f"swath {__version__}",
-        host=platform.node(),
-        boot_id=boot_id,
-        realtime_ns=clock.realtime_ns,
-        monotonic_ns=clock.monotonic_ns,
-    )
 
 
 @dataclass(slots=True)
@@ -182,22 +157,6 @@ def _watch_corrections(assembly: Assembly, device: DeviceEntry) -> CorrectionsWa
     parser = find_driver(device.kind, device.protocol).make_parser(device.settings)
     watch = assembly.corrections[device.source] = CorrectionsWatch(device.source, parser, relay)
     return watch
-
-
-def make_wire(device: DeviceEntry, transport: TransportSpec, suffix: str) -> Wire:
-    """Where the units of a device's port go in a log; ``suffix`` is ``/aux`` for a second port."""
-    metadata = {"protocol": device.protocol, "transport": transport.text}
-    if transport.kind == "udp":
-        metadata["port"] = str(transport.port)
-    if "dbc" in device.files:
-        metadata["dbc"] = f"dbc/{device.files['dbc'].name}"
-    return Wire(
-        source=f"{device.source}{suffix}",
-        topic=f"/{device.source}{suffix}/raw",
-        encoding=_ENCODINGS[transport.kind],
-        chunk_class="scanner" if device.kind == "scanner" else "other",
-        metadata=metadata,
-    )
 
 
 def record(config: Config, seconds: float | None = None, queue_bytes: int = QUEUE_BYTES) -> ExitCode:

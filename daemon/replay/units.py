@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from swath.daemon.config import Config
+from swath.daemon.log.format import _FIXED, source_of_topic
 from swath.daemon.log.mcap.chunks import json_objects
 from swath.daemon.log.reader import Session
 from swath.daemon.replay.wire_player import Output, PpsOutput, TimedUnit, open_output
-
-_FIXED = "fixed:"
 
 
 def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
@@ -32,13 +31,6 @@ def timed_units(session: Session, *, with_pps: bool) -> Iterator[TimedUnit]:
             continue
         for time_ns, row in zip(batch.log_time_ns.tolist(), batch.units, strict=True):
             yield TimedUnit(time_ns, source, row.tobytes())
-
-
-def source_of_topic(topic: str) -> str | None:
-    """``/scanner/left/aux/raw`` → ``scanner/left/aux``; ``/pps/main`` → ``pps/main``; None for the rest."""
-    if topic.startswith("/pps/"):
-        return topic[1:]
-    return topic[1 : -len("/raw")] if topic.endswith("/raw") else None
 
 
 def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], Output]]:

@@ -18,15 +18,16 @@ import numpy as np
 
 from swath import __version__
 from swath.daemon.config import Config
-from swath.daemon.exchange.log_maker import MadeLog, Source, session_name
+from swath.daemon.exchange.log_maker import MadeLog, Source
 from swath.daemon.exchange.routes import Port, Routes
 from swath.daemon.log.block_queue import SourceCount
 from swath.daemon.log.channels import JsonChannel
 from swath.daemon.log.events import Severity
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
+from swath.daemon.log.session import session_name
+from swath.daemon.log.wires import SILENT_AFTER_S
 from swath.daemon.recorder.process import CLOCK_PERIOD_S
-from swath.daemon.recorder.receivers import SILENT_AFTER_S
 from swath.daemon.recorder.run import make_timekeeper
 from swath.daemon.simulate.flight import Flight, VirtualClock, VirtualUnit
 from swath.drivers.captures.base import Address

@@ -2,8 +2,8 @@
 beams that bend (FORMULAS 3.2, 4; ``[atmosphere]`` of the configuration).
 
 Group refractivity: the closed form of IAG 1999, in the International Standard Atmosphere (dry) or in one that goes
-through a measured temperature, pressure and humidity.
-Bending models bring their own air. Heights are ellipsoidal where the models count from the sea: with a geoid 50 m away ranges change by 1.3 ppm.
+through a measured temperature, pressure and humidity. Bending models bring their own air. Heights are ellipsoidal
+where the models count from the sea: with a geoid 50 m away ranges change by 1.3 ppm.
 
 Bending of beams by air: ARDC's K, spherical layers (FORMULAS 4; NGA Eq. 4 to 11).
 

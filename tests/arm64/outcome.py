@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.flights.read import Flight, Wish, read_flights
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Options
-from swath.daemon.replay.units import source_of_topic
 from swath.georef.points import Points
 from swath.georef.records import ChunkBatch
 

@@ -29,9 +29,9 @@ from swath.daemon.log.follow import LogFollower, PartFollower
 from swath.daemon.log.mcap.encode import encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
+from swath.daemon.log.session import read_boot_id
 from swath.daemon.monitor.display import Monitor
 from swath.daemon.monitor.source import Decoding
-from swath.daemon.recorder.run import read_boot_id
 from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ByteRows, Int64Array, Record

@@ -16,9 +16,8 @@ from typing import Any
 
 import pytest
 
-from swath.daemon.checksum_list import ChecksumList
 from swath.daemon.cli.offload import _print as show
-from swath.daemon.exchange.offload import BLOCK_BYTES, OffloadReport, offload
+from swath.daemon.exchange.offload import BLOCK_BYTES, ChecksumList, OffloadReport, offload
 from tests.daemon.commands import swath
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, session_table, wait_until
 from tests.daemon.test_cli import ROOT

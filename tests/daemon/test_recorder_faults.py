@@ -22,7 +22,7 @@ import pytest
 from swath.daemon.errors import UserError
 from swath.daemon.log.directory import take_directory
 from swath.daemon.log.reader import open_logs
-from swath.daemon.recorder.receivers import MAX_SENDERS
+from swath.daemon.log.wires import MAX_SENDERS
 from swath.daemon.recorder.repair import MCAP_MAGIC, unfinished_logs
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, check_status, official_counts, read_log

@@ -16,7 +16,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from swath.daemon.acquire_pps import PpsReceiver
 from swath.daemon.log.block_queue import BlockQueue, QueueItem, SourceCount
 from swath.daemon.log.channels import ChannelTable
 from swath.daemon.log.events import Events, Severity
@@ -26,7 +25,7 @@ from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, enc
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.parts import Attachment, Parts
 from swath.daemon.recorder.health import a_restart_helps_nobody, sentence, stuck_threads
-from swath.daemon.recorder.receivers import Receiver, Shared
+from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared
 from swath.daemon.recorder.service_manager import ServiceManager
 from swath.daemon.recorder.wire_trouble import WireTrouble
 from swath.daemon.recorder.writer import Recorder, RecorderSettings, WriterHealth, Writing

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from swath.daemon.errors import UserError
 from swath.daemon.exchange.routes import Routes
 from swath.daemon.log.reader import open_logs
-from swath.daemon.recorder.run import make_wire
+from swath.daemon.log.wires import make_wire
 from swath.daemon.replay.units import timed_units
 from swath.daemon.simulate.into_log import SimReport, fly_into_log, virtual_boot_id
 from tests.daemon.commands import swath

@@ -169,7 +169,7 @@ def test_a_wrong_calibration_does_not(log: Path, tmp_path: Path) -> None:
 def test_the_calibrations_own_log_is_no_independent_proof(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from swath.daemon.processing.georeferencing.sidecar import sha256_of
+    from swath.daemon.processing.files import sha256_of
 
     path = file_of(tmp_path / "own.toml", boresight(0.0))
     text = path.read_text()

@@ -13,9 +13,9 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.exchange.export import export_session
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.calibration import products as calibrate_products
+from swath.daemon.processing.files import put_in_place, write_aside, write_whole
 from swath.daemon.processing.georeferencing.sidecar import write_sidecar
 from swath.daemon.processing.trajectory import files as trajectory_files
-from swath.daemon.processing.trajectory.files import put_in_place, write_aside, write_whole
 from tests.daemon.one_line import fly
 from tests.daemon.test_log import INFO, write_part
 

@@ -14,11 +14,11 @@ from unittest.mock import patch
 
 import numpy as np
 
-from swath.daemon.checksum_list import NAME, ChecksumList
 from swath.daemon.config import load_config
 from swath.daemon.exchange.capture_files import Told, find_captures
 from swath.daemon.exchange.export import MANIFEST, export_session
 from swath.daemon.exchange.import_ import merge
+from swath.daemon.exchange.offload import NAME, ChecksumList
 from swath.daemon.exchange.routes import Routes
 from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.format import ChannelSpec, LogError

@@ -23,9 +23,9 @@ from typing import Any
 
 import pytest
 
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.replay.units import source_of_topic
 from swath.georef.records import ChunkBatch, FixType, GnssFix, TimeScale
 
 pytestmark = pytest.mark.peers

@@ -33,11 +33,10 @@ from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
 from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrateWish, paths_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
+from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
-from swath.daemon.processing.georeferencing.sidecar import sha256_of
 from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
-from swath.daemon.processing.trajectory.files import write_whole
 from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 

@@ -24,18 +24,13 @@ from swath import __version__
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
 from swath.daemon.processing import refusals
+from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
-from swath.daemon.processing.georeferencing.sidecar import (
-    count_unread,
-    reasons_text,
-    run_record,
-    sha256_of,
-    write_sidecar,
-)
+from swath.daemon.processing.georeferencing.sidecar import count_unread, reasons_text, run_record, write_sidecar
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.quicklook.product_facts import read_sidecar, sessions_in
-from swath.daemon.processing.trajectory.files import TrajectoryFiles, put_in_place, write_trajectory
+from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.unread import unread_lines
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.drivers.driver import find_driver

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swath import __version__
 from swath.daemon.processing.carried_verdict import trajectory_entry
+from swath.daemon.processing.files import utc_text, write_whole
 from swath.daemon.processing.setup.models import air_of
-from swath.daemon.processing.trajectory.files import write_whole
 from swath.daemon.processing.unread import unread_lines
 from swath.georef.points import Fate
 from swath.georef.scanner.calibration import PARAMETERS
@@ -30,16 +28,6 @@ FORMAT_VERSION = 1
 CARRIED = ("verdict", "verdict_reasons", "held", "trajectory", "installation")  # of a calibration's header
 IN_FILES = Fate.GEOREFERENCED.name.lower()
 UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
-_HASH_BLOCK = 1 << 20
-
-
-def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
-    """Of a file, or of some of it where that is given up meanwhile; raises OSError."""
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        while (block := file.read(_HASH_BLOCK)) and not given_up():
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def calibration_entry(calibration: Calibration) -> dict[str, Any]:
@@ -273,11 +261,6 @@ def _holes(flight: Flight, results: Sequence[JobResult]) -> list[str]:
                 if reason in UNCOVERED and count
             ]
     return lines
-
-
-def utc_text(time_ns: int) -> str:
-    """A host time for people."""
-    return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def write_sidecar(path: Path, content: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
+from swath.daemon.log.session import read_boot_id
 from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
 from swath.daemon.processing.live.follow import LiveFollower, Skipped
 from swath.daemon.processing.live.points import PointsFile
@@ -24,7 +25,6 @@ from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
 from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.daemon.recorder.run import read_boot_id
 from swath.georef.records import StructArray
 from swath.georef.trajectory.trajectory import Trajectory
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from swath.daemon.log.chunk_index import SCANNER, Listening
+from swath.daemon.log.format import source_of_topic
+from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.reader import Session
-from swath.daemon.processing.points.feed import edges_of, readings_of
 from swath.daemon.processing.unread import refused_by
-from swath.daemon.replay.units import source_of_topic
 from swath.drivers.parser import PacketParser
 from swath.georef.records import (
     IMU_DTYPE,

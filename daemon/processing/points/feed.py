@@ -7,7 +7,6 @@ while it is written, and one that comes message by message.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -18,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.daemon.log.mcap.chunks import LogBatch, json_objects
+from swath.daemon.log.format import source_of_topic
+from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.setup.models import connect
 from swath.daemon.processing.setup.setup import Setup
-from swath.daemon.replay.units import source_of_topic
 from swath.drivers.parser import Parser
 from swath.georef.points import Points
 from swath.georef.records import (
@@ -33,7 +33,6 @@ from swath.georef.records import (
     GnssFix,
     ImuSamples,
     InsSolution,
-    PpsEdge,
     Record,
     ScannerReturns,
     StructArray,
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
 TICK_NS = 200_000_000
 TICK_BYTES = 32 << 20
 JOINED_BYTES = 256 << 10  # of a source's units, that are decoded at once where others' stand between them
-MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
 Placed = list[tuple[str, Points]]
 Tick = tuple[int, int, int | None]  # messages from one to before another, and the tick that comes after them
 
@@ -258,33 +256,6 @@ class LogFeed:
             rows = rows.copy()
             rows["flags"] |= CONTEXT_FLAG
         self.stream.add_returns(name, rows)
-
-
-def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
-    """realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left out."""
-    for _, value in json_objects(batch):
-        realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
-        raw_ns = _time_of(value.get("monotonic_raw_ns"))
-        if realtime_ns is not None and monotonic_ns is not None and raw_ns is not None:
-            yield realtime_ns, monotonic_ns, raw_ns, _error_of(value.get("max_error_s"))
-
-
-def _error_of(value: Any) -> float:
-    said = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
-    return float(value) if said else math.inf
-
-
-def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
-    """Edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
-    for _, value in json_objects(batch):
-        time_ns, sequence = _time_of(value.get("edge_time_ns")), _time_of(value.get("sequence", 0))
-        wanted = value.get("edge", edge) == edge
-        yield PpsEdge(time_ns, sequence) if wanted and time_ns is not None and sequence is not None else None
-
-
-def _time_of(value: Any) -> int | None:
-    """A whole number that can be a time; None for anything else that a stranger's log may say."""
-    return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS else None
 
 
 # ---------------------------------------------------------------------- all of a log's clocks, before its returns

@@ -21,13 +21,13 @@ import lazrs
 import numpy as np
 
 from swath.daemon.log.chunk_index import SCANNER, ChunkPlace, LogIndex, read_chunks
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import PartDamage
 from swath.daemon.processing.points.dropped import Dropped
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.unread import Unread
-from swath.daemon.replay.units import source_of_topic
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import Clipped, LasError, LasSettings, LasWriter
 from swath.georef.geodesy.earth import geodetic_from_e

@@ -17,12 +17,12 @@ from swath.calib.strips.corrections import StripChoice
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.products import Told, strips_entry
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, trajectory_entry
+from swath.daemon.processing.files import gone_on_failure, put_in_place, sha256_of, write_aside
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import verdict_of
-from swath.daemon.processing.georeferencing.sidecar import sha256_of
 from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, files_of
-from swath.daemon.processing.trajectory.files import gone_on_failure, put_in_place, write_aside, write_trajectory
+from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.georef.arrays import FloatArray
 from swath.georef.trajectory.trajectory import Trajectory

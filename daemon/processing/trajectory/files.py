@@ -5,18 +5,15 @@ Epochs are written in blocks, so that five hours of them do not stand in memory 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.log.durable import try_sync_directory
+from swath.daemon.processing.files import gone_on_failure, write_aside
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
 from swath.georef.formats.trajectory_csv import csv_text
@@ -25,7 +22,6 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 BLOCK = 1 << 16  # epochs written at once
 SBETS = (".sbet", ".out")
-PARTIAL = ".partial"
 COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_l", "attitude_sigma_rad")
 
 
@@ -126,60 +122,6 @@ def write_trajectory(
             if path is not None:
                 written.append((write_aside(path, write), path))
     return written
-
-
-def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
-    """Write a file beside its place; gives where it stands. OSError: it cannot be written, and is not there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + PARTIAL)
-    try:
-        with aside.open("wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-    except BaseException:  # an interrupt too
-        aside.unlink(missing_ok=True)
-        raise
-    return aside
-
-
-def put_in_place(written: list[tuple[Path, Path]]) -> None:
-    """Files to their names, in the order given, and the names to the disk; OSError: it cannot be, nothing is aside."""
-    with gone_on_failure(written):
-        for aside, path in written:
-            aside.replace(path)
-    for folder in dict.fromkeys(path.parent for _, path in written):
-        try_sync_directory(folder)
-
-
-def write_whole(files: Mapping[Path, bytes]) -> None:
-    """Write files, all of them aside before the first is put in its place; OSError: it cannot be, nothing is aside."""
-    written: list[tuple[Path, Path]] = []
-    with gone_on_failure(written):
-        for path, data in files.items():
-            written.append((write_aside(path, partial(_put, data)), path))
-    put_in_place(written)
-
-
-def _put(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)
-
-
-@contextmanager
-def gone_on_failure(written: list[tuple[Path, Path]]) -> Iterator[None]:
-    """What was written aside goes where it comes to nothing, by an interrupt too."""
-    try:
-        yield
-    except BaseException:
-        remove(written)
-        raise
-
-
-def remove(written: list[tuple[Path, Path]]) -> None:
-    """What was written aside, where it came to nothing."""
-    for aside, _ in written:
-        with suppress(OSError):
-            aside.unlink(missing_ok=True)
 
 
 def _write(stream: IO[bytes], blocks: Iterator[bytes]) -> None:

@@ -13,18 +13,12 @@ import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.processing.files import put_in_place, refuse_no_name, remove, write_aside
 from swath.daemon.processing.ins_as_is import ins_as_is
 from swath.daemon.processing.navigation.inputs import Mark
 from swath.daemon.processing.navigation.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
-from swath.daemon.processing.refusals import refuse_no_name
 from swath.daemon.processing.trajectory.event_marks import EventTable, event_table
-from swath.daemon.processing.trajectory.files import (
-    TrajectoryFiles,
-    put_in_place,
-    remove,
-    write_aside,
-    write_trajectory,
-)
+from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.trajectory.summary import pages_of, summary_head, summary_of_run, write_json
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text

@@ -14,9 +14,8 @@ import numpy as np
 
 from swath import __version__
 from swath.daemon.log.durable import sync_file
-from swath.daemon.processing.georeferencing.sidecar import sha256_of, utc_text
+from swath.daemon.processing.files import PARTIAL, gone_on_failure, sha256_of, utc_text
 from swath.daemon.processing.trajectory.figures import figures_of
-from swath.daemon.processing.trajectory.files import PARTIAL, gone_on_failure
 from swath.daemon.processing.trajectory.series import Flight, separation_of
 from swath.daemon.processing.trajectory.verdict import judge
 

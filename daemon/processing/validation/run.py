@@ -36,11 +36,10 @@ from swath.daemon.processing.calibration.inputs import control_of
 from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, replaced
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
+from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import Wish, verdicts_of
-from swath.daemon.processing.georeferencing.sidecar import sha256_of
 from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strips.compare import refuse_installations
-from swath.daemon.processing.trajectory.files import write_whole
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of

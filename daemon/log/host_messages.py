@@ -1,0 +1,39 @@
+"""Reads the messages that the recorder itself writes: clock readings and PPS edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from swath.daemon.log.mcap.chunks import LogBatch, json_objects
+from swath.georef.records import PpsEdge
+
+MAX_NS = 1 << 62  # of a stranger's clocks, in either direction
+
+
+def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:
+    """realtime_ns, monotonic_ns, monotonic_raw_ns and max_error_s (inf: unsaid) of ``/clock``; none is left out."""
+    for _, value in json_objects(batch):
+        realtime_ns, monotonic_ns = _time_of(value.get("realtime_ns")), _time_of(value.get("monotonic_ns"))
+        raw_ns = _time_of(value.get("monotonic_raw_ns"))
+        if realtime_ns is not None and monotonic_ns is not None and raw_ns is not None:
+            yield realtime_ns, monotonic_ns, raw_ns, _error_of(value.get("max_error_s"))
+
+
+def _error_of(value: Any) -> float:
+    said = isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
+    return float(value) if said else math.inf
+
+
+def edges_of(batch: LogBatch, edge: str) -> Iterator[PpsEdge | None]:
+    """Edges of ``/pps/<name>`` of the polarity wanted; None for what is none."""
+    for _, value in json_objects(batch):
+        time_ns, sequence = _time_of(value.get("edge_time_ns")), _time_of(value.get("sequence", 0))
+        wanted = value.get("edge", edge) == edge
+        yield PpsEdge(time_ns, sequence) if wanted and time_ns is not None and sequence is not None else None
+
+
+def _time_of(value: Any) -> int | None:
+    """A whole number that can be a time; None for anything else that a stranger's log may say."""
+    return value if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_NS else None

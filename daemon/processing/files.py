@@ -1,0 +1,101 @@
+"""Writes result files whole or not at all, and describes them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import IO
+
+from swath.daemon.errors import UserError, one_line
+from swath.daemon.log.durable import try_sync_directory
+
+LONGEST_NAME = 200  # bytes of a session's name, whose products' names are longer
+
+_HASH_BLOCK = 1 << 20
+
+PARTIAL = ".partial"
+
+
+def write_aside(path: Path, write: Callable[[IO[bytes]], None]) -> Path:
+    """Write a file beside its place; gives where it stands. OSError: it cannot be written, and is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + PARTIAL)
+    try:
+        with aside.open("wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException:  # an interrupt too
+        aside.unlink(missing_ok=True)
+        raise
+    return aside
+
+
+def put_in_place(written: list[tuple[Path, Path]]) -> None:
+    """Files to their names, in the order given, and the names to the disk; OSError: it cannot be, nothing is aside."""
+    with gone_on_failure(written):
+        for aside, path in written:
+            aside.replace(path)
+    for folder in dict.fromkeys(path.parent for _, path in written):
+        try_sync_directory(folder)
+
+
+def write_whole(files: Mapping[Path, bytes]) -> None:
+    """Write files, all of them aside before the first is put in its place; OSError: it cannot be, nothing is aside."""
+    written: list[tuple[Path, Path]] = []
+    with gone_on_failure(written):
+        for path, data in files.items():
+            written.append((write_aside(path, partial(_put, data)), path))
+    put_in_place(written)
+
+
+def _put(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)
+
+
+@contextmanager
+def gone_on_failure(written: list[tuple[Path, Path]]) -> Iterator[None]:
+    """What was written aside goes where it comes to nothing, by an interrupt too."""
+    try:
+        yield
+    except BaseException:
+        remove(written)
+        raise
+
+
+def remove(written: list[tuple[Path, Path]]) -> None:
+    """What was written aside, where it came to nothing."""
+    for aside, _ in written:
+        with suppress(OSError):
+            aside.unlink(missing_ok=True)
+
+
+def sha256_of(path: Path, given_up: Callable[[], bool] = lambda: False) -> str:
+    """Of a file, or of some of it where that is given up meanwhile; raises OSError."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while (block := file.read(_HASH_BLOCK)) and not given_up():
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def utc_text(time_ns: int) -> str:
+    """A host time for people."""
+    return datetime.fromtimestamp(time_ns / 1e9, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def refuse_no_name(session_id: str, log: Path) -> None:
+    """A session's name becomes that of its products: a log from elsewhere must not lead out of their folder.
+
+    Raises:
+        UserError: it is no name of a file.
+    """
+    leads = session_id != Path(session_id).name or session_id in ("", ".", "..")
+    if leads or not session_id.isprintable() or len(session_id.encode()) > LONGEST_NAME:
+        shown = one_line(session_id[:80])
+        raise UserError(f'{log}: its session_id "{shown}" is no name of a file; is it a log of Swath\'s?')
