@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-_FIXED = "fixed:"
+FIXED_SCHEME = "fixed:"
 
 PROFILE = "swath"
 LIBRARY = "swath"

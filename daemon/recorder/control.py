@@ -22,16 +22,15 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from swath.daemon.errors import one_line
 from swath.daemon.log.directory import CONTROL_LINK
-from swath.daemon.log.events import Severity
-from swath.daemon.recorder.writer import Writing
+from swath.daemon.log.events import Events, Severity
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.log.parts import Parts
+from swath.daemon.recorder.writer import Recorder, Writing
 from swath.daemon.system import name_thread
-
-if TYPE_CHECKING:
-    from swath.daemon.recorder.run import Assembly
 
 log = logging.getLogger("swath")
 
@@ -157,21 +156,34 @@ class _Allowance:
         return True
 
 
+class Recording(Protocol):
+    """The parts of a running recorder that an operator's requests reach."""
+
+    @property
+    def info(self) -> SessionInfo: ...
+
+    @property
+    def parts(self) -> Parts: ...
+
+    @property
+    def recorder(self) -> Recorder: ...
+
+
 class Control(threading.Thread):
-    """Listens to an operator for an `Assembly`; a defect here ends this thread and nothing else.
+    """Listens to an operator of a recorder; a defect here ends this thread and nothing else.
 
     Attributes:
         ignored: connections that did not bring a request: too long, too late, not understood.
     """
 
-    def __init__(self, assembly: Assembly) -> None:
+    def __init__(self, recording: Recording, events: Events) -> None:
         super().__init__(name="control", daemon=True)
-        directory = assembly.parts.directory
+        directory = recording.parts.directory
         self.place = control_place(directory)
         self.ignored = 0
         self._link = directory / CONTROL_LINK
-        self._assembly = assembly
-        self._events = assembly.shared.events
+        self._recording = recording
+        self._events = events
         self._end = threading.Event()
         self._sock: socket.socket | None = None
         self._inode: tuple[int, int] | None = None
@@ -306,11 +318,11 @@ class Control(threading.Thread):
     # ------------------------------------------------------------------ what can be asked
 
     def _do(self, request: dict[str, object]) -> dict[str, object]:
-        health = self._assembly.recorder.health
+        health = self._recording.recorder.health
         recording = health.state is Writing.RECORDING
         answer: dict[str, object] = {
-            "session_id": self._assembly.info.session_id,
-            "part": self._assembly.parts.part,
+            "session_id": self._recording.info.session_id,
+            "part": self._recording.parts.part,
             "recording": recording,
             "reason": health.reason if not recording else "",
         }
@@ -332,7 +344,7 @@ class Control(threading.Thread):
         return {"time_ns": event.time_ns, "text": note}
 
     def _split(self) -> None:
-        recorder = self._assembly.recorder
+        recorder = self._recording.recorder
         if recorder.health.state is not Writing.RECORDING:
             raise BadRequestError(f"nothing is being recorded: {recorder.health.reason}")
         if not self._splits.take():

@@ -10,12 +10,12 @@ import signal
 import time
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.block_queue import QueueItem
 from swath.daemon.log.events import Severity
 from swath.daemon.log.host_clock import read_clock_discipline, read_clock_sample
+from swath.daemon.recorder.assembly import Assembly
 from swath.daemon.recorder.control import Control
 from swath.daemon.recorder.first_units import judge
 from swath.daemon.recorder.health import a_restart_helps_nobody, sentence, stuck_threads
@@ -23,9 +23,6 @@ from swath.daemon.recorder.journal import threads_text
 from swath.daemon.recorder.repair import repair_left_open
 from swath.daemon.recorder.service_manager import ServiceManager
 from swath.daemon.recorder.writer import Writing
-
-if TYPE_CHECKING:
-    from swath.daemon.recorder.run import Assembly
 
 log = logging.getLogger("swath")
 
@@ -44,7 +41,7 @@ class RecorderProcess:
         self._assembly = assembly
         self._service = service
         self._stop = asyncio.Event()
-        self._control = Control(assembly)
+        self._control = Control(assembly, assembly.shared.events)
         self._stuck: list[str] = []
         self._failed = False
 

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from swath.daemon.config import Config
-from swath.daemon.log.format import _FIXED, source_of_topic
+from swath.daemon.log.format import FIXED_SCHEME, source_of_topic
 from swath.daemon.log.mcap.chunks import json_objects
 from swath.daemon.log.reader import Session
 from swath.daemon.replay.wire_player import Output, PpsOutput, TimedUnit, open_output
@@ -41,8 +41,8 @@ def output_makers(config: Config, *, with_pps: bool) -> dict[str, Callable[[], O
             if spec is not None and spec.kind not in ("gnss", "ntrip"):  # a caster is nobody to play to
                 makers[device.source + suffix] = partial(open_output, spec)
     for name, pps in config.pps.items():
-        if with_pps and pps.source.startswith(_FIXED):
-            makers[f"pps/{name}"] = partial(PpsOutput, Path(pps.source.removeprefix(_FIXED)))
+        if with_pps and pps.source.startswith(FIXED_SCHEME):
+            makers[f"pps/{name}"] = partial(PpsOutput, Path(pps.source.removeprefix(FIXED_SCHEME)))
     return makers
 
 

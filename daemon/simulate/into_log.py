@@ -27,8 +27,8 @@ from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from swath.daemon.log.session import session_name
 from swath.daemon.log.wires import SILENT_AFTER_S
+from swath.daemon.recorder.assembly import make_timekeeper
 from swath.daemon.recorder.process import CLOCK_PERIOD_S
-from swath.daemon.recorder.run import make_timekeeper
 from swath.daemon.simulate.flight import Flight, VirtualClock, VirtualUnit
 from swath.drivers.captures.base import Address
 from swath.drivers.transports.base import UnitBlock

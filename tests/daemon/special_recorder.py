@@ -10,8 +10,9 @@ from typing import NoReturn
 
 from swath.daemon.config import load_config
 from swath.daemon.log.account import Account
+from swath.daemon.recorder.assembly import QUEUE_BYTES
 from swath.daemon.recorder.receivers import UnitReceiver
-from swath.daemon.recorder.run import QUEUE_BYTES, record
+from swath.daemon.recorder.run import record
 
 SMALL_QUEUE_BYTES = 300_000
 _started_s = time.monotonic()

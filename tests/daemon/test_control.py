@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import Any
 
 import pytest
 
@@ -36,7 +36,7 @@ from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recorder_faults import Numbers, scanner
 
 if TYPE_CHECKING:
-    from swath.daemon.recorder.run import Assembly
+    from swath.daemon.recorder.assembly import Assembly
 
 NOBODY = 65534
 CONNECT_AS = """
@@ -246,10 +246,10 @@ def test_what_is_no_socket_is_not_touched(tmp_path: Path, logs: Path) -> None:
 
 def test_after_a_defect_nobody_waits_for_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    events = SimpleNamespace(post=lambda severity, source, code, text: said.append(code))
-    assembly = SimpleNamespace(parts=SimpleNamespace(directory=tmp_path), shared=SimpleNamespace(events=events))
+    events: Any = SimpleNamespace(post=lambda severity, source, code, text: said.append(code))
+    recording: Any = SimpleNamespace(parts=SimpleNamespace(directory=tmp_path))
     monkeypatch.setattr(Control, "_turn", lambda self: 1 / 0)
-    control = Control(cast("Assembly", assembly))
+    control = Control(recording, events)
     control.open()
     control.join(HANGS_S)
     assert "no recorder is running there" in swath("mark", "x", str(tmp_path)).stderr

@@ -12,7 +12,7 @@ import pytest
 from demo.captures import gnss_units, pps_units
 from swath.daemon.config import load_config
 from swath.daemon.log.host_clock import ClockDiscipline
-from swath.daemon.recorder.run import Assembly, assemble
+from swath.daemon.recorder.assembly import Assembly, assemble
 from swath.daemon.replay.wire_player import TimedUnit
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.timescales import SECOND_NS, PpsClock

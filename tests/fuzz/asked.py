@@ -73,13 +73,12 @@ class _Heard(Events):
 def _control(folder: Path) -> Control:
     """Of a recorder at work, which notes and begins parts."""
     clock: Any = SimpleNamespace(now_ns=lambda: NOW_NS)
-    assembly: Any = SimpleNamespace(
+    recording: Any = SimpleNamespace(
         parts=SimpleNamespace(directory=folder, part=3),
-        shared=SimpleNamespace(events=_Heard(clock)),
         info=SimpleNamespace(session_id=SESSION),
         recorder=SimpleNamespace(health=WriterHealth(), new_part=SimpleNamespace(set=lambda: None)),
     )
-    return Control(assembly)
+    return Control(recording, _Heard(clock))
 
 
 def _requests() -> Target:
