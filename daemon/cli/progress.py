@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 

@@ -35,9 +35,6 @@ from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, session_table, wa
 from tests.daemon.test_cli import ROOT
 from tests.daemon.test_recorder_faults import Numbers, scanner
 
-if TYPE_CHECKING:
-    from swath.daemon.recorder.assembly import Assembly
-
 NOBODY = 65534
 CONNECT_AS = """
 import os, socket, sys

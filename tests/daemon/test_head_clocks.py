@@ -21,7 +21,7 @@ from swath.daemon.log.chunk_index import index_log
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
 from swath.daemon.processing.points.feed import read_clocks
-from swath.daemon.processing.refusals import refuse_no_time, time_trouble
+from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.scanner.hesai.gps import encode_gps_packet
 from swath.drivers.scanner.hesai.parser import encode_point_packet

@@ -13,9 +13,18 @@ import pytest
 from swath.daemon.config.config import Config
 from swath.daemon.config.load import parse_config
 from swath.daemon.errors import UserError
-from swath.daemon.processing import refusals
+from swath.daemon.processing.files import refuse_no_name
+from swath.daemon.processing.flights.read import (
+    note_strips_elsewhere,
+    of_log,
+    refuse_different_settings,
+    refuse_overlap,
+)
+from swath.daemon.processing.flights.trajectory_choice import attitude_doubts, refuse_other_motion
+from swath.daemon.processing.georeferencing.run import refuse_nothing
 from swath.daemon.processing.georeferencing.sidecar import unit_doubts
 from swath.daemon.processing.points.feed import LogClocks
+from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.unread import Unread, unread_lines
 from swath.drivers.parser import Parser, ParserCounters
@@ -54,19 +63,19 @@ def line(refused: Any) -> str:
 def test_logs_with_different_frames() -> None:
     configs = {A: config(), B: config(crs="EPSG:2056")}
     with pytest.raises(UserError) as refused:
-        refusals.refuse_different_settings(configs, None)
+        refuse_different_settings(configs, None)
     assert all(word in line(refused) for word in ("a.mcap", "b.mcap", "EPSG:2056", "EPSG:25832", "--crs"))
-    refusals.refuse_different_settings(configs, "EPSG:25832")
+    refuse_different_settings(configs, "EPSG:25832")
     with pytest.raises(UserError, match=r"output\.epoch is 2020\.0"):
-        refusals.refuse_different_settings({A: config(), B: config(epoch=2020.0)}, None)
-    refusals.refuse_different_settings({A: config(), B: config()}, None)
+        refuse_different_settings({A: config(), B: config(epoch=2020.0)}, None)
+    refuse_different_settings({A: config(), B: config()}, None)
 
 
 def test_an_epoch_that_is_said_settles_different_ones_and_a_frame_does_not() -> None:
     configs = {A: config(), B: config(epoch=2020.0)}
-    refusals.refuse_different_settings(configs, None, epoch=2026.5)
+    refuse_different_settings(configs, None, epoch=2026.5)
     with pytest.raises(UserError, match=r"output\.epoch is 2020\.0, .* say one with --epoch"):
-        refusals.refuse_different_settings(configs, "EPSG:25832")
+        refuse_different_settings(configs, "EPSG:25832")
 
 
 def test_sessions_with_positions_in_different_datums() -> None:
@@ -77,59 +86,57 @@ def test_sessions_with_positions_in_different_datums() -> None:
         Path("swath.toml"),
     )
     with pytest.raises(UserError) as refused:
-        refusals.refuse_different_settings({A: config(), B: other}, None)
+        refuse_different_settings({A: config(), B: other}, None)
     words = ("b.mcap", "in EPSG:7912", "in a datum that is not said", "--trajectory-datum")
     assert all(word in line(refused) for word in words)
-    refusals.refuse_different_settings({A: config(), B: other}, None, "EPSG:7912")
-    refusals.refuse_different_settings({A: other, B: other}, None)
+    refuse_different_settings({A: config(), B: other}, None, "EPSG:7912")
+    refuse_different_settings({A: other, B: other}, None)
 
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/b", "", ".", "..", "a\0b", "a\nb", "x" * 300])
 def test_a_session_whose_name_leads_elsewhere(name: str) -> None:
     with pytest.raises(UserError, match="is no name of a file"):
-        refusals.refuse_no_name(name, A)
-    refusals.refuse_no_name("flight-20261125T101500Z-ab12", A)
+        refuse_no_name(name, A)
+    refuse_no_name("flight-20261125T101500Z-ab12", A)
 
 
 def test_sessions_with_different_antennas() -> None:
     with pytest.raises(UserError) as refused:
-        refusals.refuse_different_settings({A: config(), B: config(arm="[0.1, 0.0, -1.3]")}, None)
+        refuse_different_settings({A: config(), B: config(arm="[0.1, 0.0, -1.3]")}, None)
     assert all(word in line(refused) for word in ("gnss.rover.lever_arm_m", "-1.3", "-1.2", "another antenna"))
 
 
 def test_logs_of_one_time() -> None:
-    refusals.refuse_overlap({B: (200, 300), A: (0, 200)})
+    refuse_overlap({B: (200, 300), A: (0, 200)})
     with pytest.raises(UserError) as refused:
-        refusals.refuse_overlap({B: (199, 300), A: (0, 200)})
+        refuse_overlap({B: (199, 300), A: (0, 200)})
     assert all(word in line(refused) for word in ("a.mcap", "b.mcap", "two recordings"))
 
 
 def test_a_second_that_is_not_certain_and_no_time() -> None:
     good = ClockStatus(TimeState.LOCKED, 100.0)
     settings = config()
-    refusals.refuse_no_time(A, "pps/main", good, settings)
+    refuse_no_time(A, "pps/main", good, settings)
     with pytest.raises(UserError, match="not certain: messages contradict"):
-        refusals.refuse_no_time(
-            A, "pps/main", ClockStatus(TimeState.COARSE, 1e8, ambiguous="messages contradict"), settings
-        )
+        refuse_no_time(A, "pps/main", ClockStatus(TimeState.COARSE, 1e8, ambiguous="messages contradict"), settings)
     silent = ClockStatus(TimeState.NO_TIME, float("inf"))
     with pytest.raises(UserError, match="nothing in the log says the time"):
-        refusals.refuse_no_time(A, "gnss/rover", silent, settings)
+        refuse_no_time(A, "gnss/rover", silent, settings)
     with pytest.raises(UserError, match="no source of time"):
-        refusals.refuse_no_time(A, None, None, settings)
+        refuse_no_time(A, None, None, settings)
 
 
 def test_edges_that_no_receiver_names() -> None:
     silent = ClockStatus(TimeState.NO_TIME, float("inf"))
     with pytest.raises(UserError, match=r"no gnss.….pps is set") as refused:
-        refusals.refuse_no_time(A, "pps/main", silent, config())
+        refuse_no_time(A, "pps/main", silent, config())
     assert "pps/main" in line(refused)
     tables = TEXT.format(arm="[0.1, 0.0, -1.2]", crs="EPSG:25832", epoch=2026.5)
     tables = tables.replace('"novatel"', '"novatel"\npps = "other"') + '[pps.other]\nsource = "/dev/pps1"\n'
     with pytest.raises(UserError, match=r'gnss.rover.pps is "other"'):
-        refusals.refuse_no_time(A, "pps/main", silent, parse_config(tables, Path("swath.toml")))
+        refuse_no_time(A, "pps/main", silent, parse_config(tables, Path("swath.toml")))
     with pytest.raises(UserError, match="nothing in the log says the time"):
-        refusals.refuse_no_time(A, "pps/other", silent, parse_config(tables, Path("swath.toml")))
+        refuse_no_time(A, "pps/other", silent, parse_config(tables, Path("swath.toml")))
 
 
 @pytest.mark.parametrize(
@@ -143,14 +150,14 @@ def test_edges_that_no_receiver_names() -> None:
 )
 def test_why_returns_have_no_time(refused: dict[str, int], state: TimeState, words: str) -> None:
     fates = {"no_time": 500, "georeferenced": 500}
-    told = refusals.time_trouble("left", fates, refused, ClockStatus(state, 1.0))
+    told = time_trouble("left", fates, refused, ClockStatus(state, 1.0))
     assert words in told
     assert "500 of 1,000 returns" in told
-    assert refusals.time_trouble("left", {"no_time": 10, "georeferenced": 990}, refused, None) == ""
+    assert time_trouble("left", {"no_time": 10, "georeferenced": 990}, refused, None) == ""
     with pytest.raises(UserError, match="have no time"):
-        refusals.refuse_nothing(A, [told], "")
+        refuse_nothing(A, [told], "")
     with pytest.raises(UserError, match=r"a\.mcap: no return could be georeferenced: 7 outside trajectory"):
-        refusals.refuse_nothing(A, [], "7 outside trajectory")
+        refuse_nothing(A, [], "7 outside trajectory")
 
 
 def turning(time_ns: np.ndarray[Any, np.dtype[np.int64]], seed: int = 1) -> Trajectory:
@@ -169,12 +176,12 @@ def test_a_trajectory_that_turns_at_another_time_is_doubted_or_refused() -> None
     clocks = LogClocks(
         cast(Any, None), np.empty(0, INS_DTYPE), time_ns, np.vstack([np.zeros(3), flown.turn_rates_b("i")])
     )
-    assert refusals.refuse_other_motion(clocks, flown, "x.csv", A) == []
-    (late,) = refusals.refuse_other_motion(clocks, replace(flown, time_ns=time_ns + S // 8), "x.csv", A)
+    assert refuse_other_motion(clocks, flown, "x.csv", A) == []
+    (late,) = refuse_other_motion(clocks, replace(flown, time_ns=time_ns + S // 8), "x.csv", A)
     assert late.startswith("x.csv: turns 0.12")
     assert "later" in late
     with pytest.raises(UserError, match=r"x\.csv: its time is UTC"):
-        refusals.refuse_other_motion(clocks, replace(flown, time_ns=time_ns - 18 * S), "x.csv", A)
+        refuse_other_motion(clocks, replace(flown, time_ns=time_ns - 18 * S), "x.csv", A)
 
 
 @dataclass
@@ -187,20 +194,20 @@ class Flew:
 
 def test_strips_of_a_file_that_lie_in_no_log() -> None:
     flights: list[Any] = [Flew((0, 100)), Flew((200, 300))]
-    refusals.note_strips_elsewhere("s.csv", [(50, 120), (250, 260)], flights)
+    note_strips_elsewhere("s.csv", [(50, 120), (250, 260)], flights)
     assert flights[0].holes == []
-    refusals.note_strips_elsewhere("s.csv", [(50, 120), (300, 310)], flights)
+    note_strips_elsewhere("s.csv", [(50, 120), (300, 310)], flights)
     (hole,) = flights[0].holes
     assert hole.startswith("s.csv: its strip from GPS week 0")
     with pytest.raises(UserError, match=r"s\.csv: none of its strips lies in the logs"):
-        refusals.note_strips_elsewhere("s.csv", [(120, 200), (300, 310)], flights)
+        note_strips_elsewhere("s.csv", [(120, 200), (300, 310)], flights)
 
 
 def test_the_log_is_named_where_its_own_configuration_is_wrong() -> None:
     lines = ["imu.main: dbc: missing", "left.toml: calibration.scanner: is of another", 'output.crs = "x" is none']
     given = Options(crs="x", calibrations={"left": ("", "left.toml")})
-    assert refusals.of_log(A, lines, given) == ["a.mcap: imu.main: dbc: missing", *lines[1:]]
-    assert refusals.of_log(A, lines, Options()) == [f"a.mcap: {said}" for said in lines]
+    assert of_log(A, lines, given) == ["a.mcap: imu.main: dbc: missing", *lines[1:]]
+    assert of_log(A, lines, Options()) == [f"a.mcap: {said}" for said in lines]
 
 
 def test_messages_that_were_not_read() -> None:
@@ -261,7 +268,7 @@ def level_flight(
     ],
 )
 def test_an_attitude_of_other_axes_is_doubted(flown: Trajectory, words: list[str]) -> None:
-    lines = refusals.attitude_doubts(flown, "x.out")
+    lines = attitude_doubts(flown, "x.out")
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):
         assert line.startswith(f"x.out: {word}")

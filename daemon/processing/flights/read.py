@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj import CRS
 
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.chunk_index import Listening, LogIndex, index_log
 from swath.daemon.log.reader import Session, open_logs
-from swath.daemon.processing import refusals
 from swath.daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
@@ -21,14 +22,16 @@ from swath.daemon.processing.carried_verdict import (
     navigated_verdicts,
     verdict_entry,
 )
+from swath.daemon.processing.files import refuse_no_name
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, choose_trajectory
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
 from swath.daemon.processing.points.feed import LogClocks, read_clocks
+from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.points.workers import refuse_in_import
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.text_files import text_of
 from swath.georef.strips import Span, StripRules, cut, laser_spans, read_strips, straight_spans
-from swath.georef.trajectory.trajectory import Trajectory
+from swath.georef.trajectory.trajectory import Trajectory, gps_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,6 +42,11 @@ if TYPE_CHECKING:
     from swath.georef.timescales import ClockStatus
 
     Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
+    from swath.daemon.config.config import Config
+    from swath.daemon.processing.setup.setup import Options
+
+
+UNSAID = "a datum that is not said"
 
 INTENSITY_FACTOR = 257.0  # eight bits, 0 … 255, fill the field of 16
 
@@ -191,15 +199,15 @@ def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = la
     logs = [session.parts[0].path for session in sessions]
     configs = dict(zip(logs, (setup.config for setup in setups), strict=True))
     for session in sessions:
-        refusals.refuse_no_name(session.session_id, session.parts[0].path)
+        refuse_no_name(session.session_id, session.parts[0].path)
     check(list(dict.fromkeys(name for setup in setups for name in setup.scanners)))
-    refusals.refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
+    refuse_different_settings(configs, wish.options.crs, wish.options.datum, wish.options.epoch)
     flights: list[Flight] = []
     for number, (session, setup) in enumerate(zip(sessions, setups, strict=True)):
         tell("clocks and trajectory", number, len(sessions))
         flights.append(_read(session, setup, positions=wish.trajectory.file is not None))
     flights[0].holes += [f"passed over: {line}" for line in passed_over]
-    refusals.refuse_overlap({flight.log: flight.span for flight in flights})
+    refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come by their hosts' clocks, which may be wrong
     for flight in flights:
         _choose(wish, flight)
@@ -212,14 +220,14 @@ def _setup(wish: Wish, session: Session) -> Setup:
         try:
             setup = Setup.of_log(session.attachments(), wish.options)
         except UserError as error:
-            lines = refusals.of_log(session.parts[0].path, error.message.splitlines(), wish.options)
+            lines = of_log(session.parts[0].path, error.message.splitlines(), wish.options)
             raise UserError("\n".join(lines), error.exit_code) from error
     else:
         setup = Setup.of_config(wish.config, wish.options)
     crs = wish.options.crs or setup.config.output.crs
     if crs is None:
         raise UserError(f"{session.parts[0].path}: its configuration has no output.crs; want --crs", ExitCode.USAGE)
-    refusals.refuse_geocentric(crs)
+    refuse_geocentric(crs)
     return setup
 
 
@@ -241,7 +249,7 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
     status, trouble = flight.status(flight.host_span[1]), clocks.clocks.trouble(flight.clock)
-    refusals.refuse_no_time(log, flight.clock, status, setup.config, clocks.remarks, trouble)
+    refuse_no_time(log, flight.clock, status, setup.config, clocks.remarks, trouble)
     flight.troubles += [f"{log}: {remark}" for remark in [*clocks.remarks, *stamp_lines(clocks.clocks)]]
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)
@@ -262,7 +270,7 @@ def _choose(wish: Wish, flight: Flight) -> None:
     flight.setup.mapping.settle(places_e)
     misfit = flight.setup.mapping.misfit(places_e)
     if misfit and not wish.options.force_crs:
-        lines = refusals.of_log(flight.log, [misfit], wish.options)
+        lines = of_log(flight.log, [misfit], wish.options)
         raise UserError(f"{lines[0]}; --force-crs takes it as it is", ExitCode.USAGE)
     flight.troubles += [misfit] if misfit else []
 
@@ -301,7 +309,7 @@ def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
         flight.strips, flight.first_number = _strips(wish, flight, given), number
         number += len(flight.strips)
     if given is not None:
-        refusals.note_strips_elsewhere(wish.strips, given, flights)
+        note_strips_elsewhere(wish.strips, given, flights)
     if number == 1:
         raise UserError(
             f"{flights[0].log}: no strip: nowhere straight flight with data for {wish.rules.min_strip_s:g} s; "
@@ -322,7 +330,7 @@ def note_times(flights: Sequence[Flight], results: Sequence[JobResult]) -> None:
                 refused.update(result.time_refused.get(name, {}))
             source = f"scanner/{name}"
             stamps, trouble = clocks.stamps.get(source), clocks.trouble(source)
-            line = refusals.time_trouble(name, fates, refused, status, stamps, trouble)
+            line = time_trouble(name, fates, refused, status, stamps, trouble)
             flight.holes += [f"{flight.log}: {line}"] if line else []
 
 
@@ -364,3 +372,107 @@ def _straight(wish: Wish, flight: Flight) -> list[Span]:
         ]
     roll, _, heading = trajectory.attitude()
     return straight_spans(trajectory.time_ns, heading, roll, wish.rules, unknown)
+
+
+def refuse_different_settings(
+    configs: Mapping[Path, Config], crs: str | None, datum: str | None = None, epoch: float | None = None
+) -> None:
+    """Logs of one run share the mapping frame, and of their trajectory the antenna and the datum.
+
+    Args:
+        configs: by log.
+        crs, datum, epoch: what the command line says, over the configurations.
+
+    Raises:
+        UserError: they do not.
+    """
+    for (one, first), (other, second) in pairwise(configs.items()):
+        for key, said in (("crs", crs), ("epoch", epoch)):
+            ours, theirs = getattr(first.output, key), getattr(second.output, key)
+            if said is None and ours != theirs:
+                raise UserError(
+                    f"{other}: its output.{key} is {_said(theirs)}, that of {one} {_said(ours)}; "
+                    f"say one with --{key} (of swath georef) or --config, or take them one by one",
+                    ExitCode.USAGE,
+                )
+        if datum is None and (theirs := _datum_of(second)) != (ours := _datum_of(first)):
+            raise UserError(
+                f"{other}: its positions are in {theirs or UNSAID}, those of {one} in {ours or UNSAID} "
+                "(gnss.….datum); say one with --trajectory-datum, or georeference them one by one",
+                ExitCode.USAGE,
+            )
+        arms = {name: list(gnss.lever_arm_m) for name, gnss in first.gnss.items()}
+        others = {name: list(gnss.lever_arm_m) for name, gnss in second.gnss.items()}
+        if arms != others:
+            name = next(name for name in {**arms, **others} if arms.get(name) != others.get(name))
+            raise UserError(
+                f"{other}: gnss.{name}.lever_arm_m is {_said(others.get(name))}, in {one} {_said(arms.get(name))}: "
+                "another antenna; georeference them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def refuse_geocentric(crs: str) -> None:
+    """Files of points hold eastings, northings and heights; ``crs`` is one that PROJ reads.
+
+    Raises:
+        UserError: its coordinates are not those.
+    """
+    read = CRS.from_user_input(crs)
+    if read.is_geocentric:
+        raise UserError(
+            f'output.crs = "{crs}" ({read.name}) is geocentric: files of points want a projected one, such as '
+            '"EPSG:326ZZ" for UTM zone ZZ north on WGS 84',
+            ExitCode.USAGE,
+        )
+
+
+def of_log(log: Path, lines: Sequence[str], options: Options) -> list[str]:
+    """What is wrong with the configuration in a log names the log; what the command line said does not."""
+    files = [file for _, file in options.calibrations.values()]
+    own = ("output.", "datum", *files) if options.crs or options.datum or options.epoch else ("--", *files)
+    return [line if line.startswith(own) else f"{log}: {line}" for line in lines]
+
+
+def _datum_of(config: Config) -> str | None:
+    """As `swath.daemon.processing.setup.setup.Setup` takes it."""
+    return next((gnss.datum for gnss in config.gnss.values() if gnss.datum), None)
+
+
+def _said(value: object) -> str:
+    return "not set" if value is None else str(value)
+
+
+def refuse_overlap(spans: Mapping[Path, Span]) -> None:
+    """Logs of one run follow each other; spans in GPS ns.
+
+    Raises:
+        UserError: two overlap.
+    """
+    ordered = sorted(spans.items(), key=lambda item: item[1])
+    for (one, (_, end_ns)), (other, (start_ns, _)) in pairwise(ordered):
+        if start_ns < end_ns:
+            raise UserError(
+                f"{other}: begins at {gps_text(start_ns)}, before {one} ends at {gps_text(end_ns)}: "
+                "two recordings of one time; georeference them one by one",
+                ExitCode.USAGE,
+            )
+
+
+def note_strips_elsewhere(file: str, strips: Sequence[Span], flights: Sequence[Flight]) -> None:
+    """Strips that a file asks for and that lie in no log will be missing; spans in GPS ns.
+
+    Raises:
+        UserError: all of them.
+    """
+    elsewhere = [
+        (start, end)
+        for start, end in strips
+        if not any(start < flight.span[1] and end > flight.span[0] for flight in flights)
+    ]
+    if len(elsewhere) == len(strips):
+        logs = ", ".join(f"{gps_text(flight.span[0])} to {gps_text(flight.span[1])}" for flight in flights)
+        raise UserError(f"{file}: none of its strips lies in the logs, {logs}; want GPS nanoseconds since 1980-01-06")
+    flights[0].holes += [
+        f"{file}: its strip from {gps_text(start)} to {gps_text(end)} lies in no log" for start, end in elsewhere
+    ]

@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.given_trajectory import Given, judge_given, points_of
-from swath.daemon.processing.refusals import attitude_doubts, refuse_no_overlap, refuse_other_motion
 from swath.daemon.processing.trajectory.files import smrmsg_beside
 from swath.georef.formats.trajectory_file import read_trajectory
 from swath.georef.stream.path import SHORTEST_TRAJECTORY
-from swath.georef.trajectory.buffer import TrajectoryBuffer
-from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
+from swath.georef.strips import Span
+from swath.georef.trajectory.buffer import COLUMNS, TrajectoryBuffer
+from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
     from swath.daemon.processing.navigation.navigate import Navigated
     from swath.daemon.processing.points.feed import LogClocks
     from swath.daemon.processing.setup.setup import Setup
+    from swath.georef.trajectory.trajectory import Trajectory
+
+
+LATE_S = 0.06  # more than an IMU's samples are late at the host
+LOOKED_AT = 10_000  # epochs, whether the body flies forward and upright
+FLIES_MPS = 15.0  # nothing flies so fast sideways
+FORWARD = 0.5  # cosine between nose and course, below which it would
+AXES = (
+    "want the attitude of axes forward, right, down: of a device's INS imu.….rotation_b_imu turns it, as it turns the "
+    "samples"
+)
 
 Vector = tuple[float, float, float]
 FROM_LOG = "INS solution in the log"
@@ -194,3 +207,56 @@ def offset_of(at: str, setup: Setup) -> Vector | None:
 
 def _vector(values: Sequence[float]) -> Vector:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def refuse_no_overlap(trajectory: Trajectory, file: str, span: Span, log: Path) -> None:
+    """A trajectory and a log have some time in common.
+
+    Raises:
+        UserError: they have none; the line says from when to when each is.
+    """
+    first_ns, last_ns = trajectory.span
+    if first_ns <= span[1] and last_ns >= span[0]:
+        return
+    raise UserError(
+        f"{file}: is from {gps_text(first_ns)} to {gps_text(last_ns)}, {log} from {gps_text(span[0])} to "
+        f"{gps_text(span[1])}: they do not overlap; want the trajectory of this flight, or --week"
+    )
+
+
+def refuse_other_motion(clocks: LogClocks, trajectory: Trajectory, file: str, log: Path) -> list[str]:
+    """The trajectory turns when the log's IMU does; one in UTC or of another week does not.
+
+    Gives a line of doubt where it turns a little earlier or later.
+
+    Raises:
+        UserError: it turns at other times; the line says by how much.
+    """
+    if len(clocks.imu_gps_ns) < 2 or len(trajectory) < 2:
+        return []
+    from swath.georef.trajectory.turn_rates import correlate_turn_rates  # scipy.signal, which takes seconds to load
+
+    shift = correlate_turn_rates(trajectory, clocks.imu_gps_ns, clocks.imu_rate_b)
+    if shift.is_wrong:
+        raise UserError(f"{file}: {shift.what}, by how it turns and how the IMU in {log} does")
+    if shift.is_certain and abs(shift.seconds) > LATE_S:
+        return [f"{file}: turns {-shift.seconds:.3f} s later than the IMU in {log} does; its time may be off by that"]
+    return []
+
+
+def attitude_doubts(trajectory: Trajectory, named: str) -> list[str]:
+    """A line where the body would fly on its back or not forward: the attitude is of other axes than b's."""
+    step = max(1, len(trajectory) // LOOKED_AT)
+    seen = replace(trajectory, **{column: getattr(trajectory, column)[::step] for column in COLUMNS})
+    roll, pitch, heading = seen.attitude()
+    north, east, _ = seen.velocity_l().T
+    flies = np.hypot(north, east) > FLIES_MPS
+    lines = []
+    if len(seen) and np.median(np.cos(roll) * np.cos(pitch)) < 0.0:
+        lines.append(f"{named}: its z axis points up, the body would fly on its back; {AXES}")
+    if flies.any():
+        apart = heading[flies] - np.arctan2(east[flies], north[flies])
+        if np.median(np.cos(apart)) < FORWARD:
+            usual_deg = np.degrees(np.arctan2(np.median(np.sin(apart)), np.median(np.cos(apart))))
+            lines.append(f"{named}: its x axis points {usual_deg:+.0f}° beside the course; {AXES}")
+    return lines

@@ -16,14 +16,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from swath import __version__
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
-from swath.daemon.processing import refusals
 from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
 from swath.daemon.processing.georeferencing.sidecar import count_unread, reasons_text, run_record, write_sidecar
@@ -252,7 +251,7 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
         lines = [line for flight in flights for line in (*flight.troubles, *flight.holes)]
         lines += [line for told in unread_lines(str(flights[0].log), count_unread(results)) for line in told]
         became = reasons_text(fates for result in results for fates in result.fates.values())
-        refusals.refuse_nothing(flights[0].log, lines, became)
+        refuse_nothing(flights[0].log, lines, became)
 
 
 def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
@@ -265,3 +264,17 @@ def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
     written = write_trajectory(TrajectoryFiles.in_folder(folder, flight.session.session_id, csv=True), used, None)
     put_in_place(written)
     return sorted(path for _, path in written)
+
+
+def refuse_nothing(log: Path, troubles: Sequence[str], became: str) -> NoReturn:
+    """Where no return at all could be placed, there is no product.
+
+    Args:
+        log: the first one.
+        troubles: lines that say why; empty: unknown.
+        became: what became of the returns.
+
+    Raises:
+        UserError: always.
+    """
+    raise UserError("\n".join(troubles) or f"{log}: no return could be georeferenced: {became}")

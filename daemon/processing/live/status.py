@@ -16,7 +16,7 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.processing.carried_verdict import first_lines
 from swath.daemon.processing.live.follow import BEHIND_NS, LiveFollower
 from swath.daemon.processing.live.products import LiveProducts, replace_file
-from swath.daemon.processing.refusals import time_trouble
+from swath.daemon.processing.points.time_checks import time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.georef.points import FATE_NAMES
 from swath.georef.stream.stream import Stream

@@ -1,0 +1,120 @@
+"""Checks that a log knows its time well enough, and says why returns have none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swath.daemon.errors import ExitCode, UserError
+from swath.georef.points import Fate
+from swath.georef.timescales import StampScale, TimeState
+
+if TYPE_CHECKING:
+    from swath.daemon.config.config import Config
+    from swath.georef.timescales import ClockStatus, Stamps
+
+NO_TIME = Fate.NO_TIME.name.lower()
+GOOD_STATES = (TimeState.LOCKED, TimeState.HOLDOVER)
+MUCH = 0.01  # share of returns without time that is worth a warning
+
+
+def refuse_no_time(
+    log: Path,
+    clock: str | None,
+    status: ClockStatus | None,
+    config: Config,
+    remarks: Sequence[str] = (),
+    trouble: str = "",
+) -> None:
+    """The log's own clock must be known well enough to say which second a pulse belongs to.
+
+    Args:
+        log: stands for the session.
+        clock: the source that shows the time.
+        status: of that clock at the end.
+        config: of the session.
+        remarks: what the receivers' parsers have to say.
+        trouble: why what the head says of time cannot be used, where the clock is a head's own.
+
+    Raises:
+        UserError: it is not, and why.
+    """
+    if trouble and status is not None and status.state is TimeState.NO_TIME:
+        raise UserError(f"{log}: {clock}: no receiver is in the log, and the head {trouble}")
+    if remarks and clock is not None and clock.startswith("scanner/") and status is not None:
+        _refuse_by_remarks(log, status, remarks)
+    if status is None or clock is None or (clock.startswith("scanner/") and status.state is TimeState.NO_TIME):
+        key = "" if clock is None else f"{clock.replace('/', '.')}.clock"
+        hint = (
+            f"; or the head's position packets (auxiliary), or {key} where its stamps are UTC or TAI" if clock else ""
+        )
+        raise UserError(
+            f"{log}: no source of time in its configuration; want [pps.…] or [gnss.…]{hint}", ExitCode.USAGE
+        )
+    if status.ambiguous:
+        raise UserError(
+            f"{log}: {clock}: which second an edge is, is not certain: {status.ambiguous}; "
+            "want the time messages of the receiver that gives the pulse (gnss.….pps)"
+        )
+    said = {f"pps/{gnss.pps}": name for name, gnss in config.gnss.items() if gnss.pps}
+    if status.state is TimeState.NO_TIME and clock.startswith("pps/") and clock not in said:
+        heard = "; ".join(f'gnss.{name}.pps is "{pps.removeprefix("pps/")}"' for pps, name in said.items())
+        raise UserError(
+            f"{log}: {clock}: no receiver says which second its edges are ({heard or 'no gnss.….pps is set'}); "
+            "want the receiver that gives the pulse there, with --config"
+        )
+    if status.leap_doubt:
+        raise UserError(f"{log}: {clock}: UTC cannot be brought to GPS time: {status.leap_doubt}")
+    _refuse_by_remarks(log, status, remarks)
+    if status.state is TimeState.NO_TIME:
+        raise UserError(f"{log}: {clock}: nothing in the log says the time; want PPS edges and time messages")
+
+
+def _refuse_by_remarks(log: Path, status: ClockStatus, remarks: Sequence[str]) -> None:
+    """Refuse a log without time by what parsers say of the dates that they did not believe."""
+    if status.state is TimeState.NO_TIME and remarks:
+        raise UserError("\n".join(f"{log}: {remark}" for remark in remarks))
+
+
+def time_trouble(
+    scanner: str,
+    fates: Mapping[str, int],
+    refused: Mapping[str, int],
+    status: ClockStatus | None,
+    stamps: Stamps | None = None,
+    trouble: str = "",
+) -> str:
+    """Return how many returns have no time good enough, and why; empty: few or none.
+
+    Args:
+        scanner: its name.
+        fates: of its returns.
+        refused: stamps that its clock did not believe, by reason.
+        status: of the host's clock.
+        stamps: what its stamps were found to count from; None: it says itself whether it is locked, or nobody knew.
+        trouble: why what it says of time itself cannot be used; empty: it can, or it says nothing.
+    """
+    total = sum(fates.values())
+    lost = fates.get(NO_TIME, 0)
+    if not total or lost <= MUCH * total:
+        return ""
+    told = f"scanner/{scanner}: {lost:,} of {total:,} returns have no time"
+    if refused.get("past_hour"):
+        return (
+            f"{told}: its stamps contradict the host's clock by more than half a second: the head is locked to another "
+            "second; want the NMEA sentences and the pulse of one receiver at the head"
+        )
+    if trouble:
+        return f"{told}: the head {trouble}"
+    if status is not None and status.state not in GOOD_STATES:
+        return f"{told}: the host's clock is {status.state.value}; want PPS edges and time messages all through"
+    if refused.get("spacing"):
+        return f"{told}: {refused['spacing']:,} edges that it latched are not a second apart; want the receiver's PPS"
+    if refused.get("stamp_jump"):
+        return f"{told}: {refused['stamp_jump']:,} stamps lie more than a second from their arrival: its clock was set"
+    found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
+    return (
+        f"{told}: its stamps run free{found}; want a head that is locked to the PPS, or latches it, or "
+        f"scanner.{scanner}.clock where its stamps are UTC or TAI all the same"
+    )
