@@ -38,7 +38,8 @@ from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.live.session import replay
-from swath.daemon.processing.points.feed import LogFeed, read_clocks
+from swath.daemon.processing.points.clocks import read_clocks
+from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import Job, SessionPlan, run_job
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.system import keep_freed_memory

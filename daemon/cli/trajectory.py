@@ -60,7 +60,8 @@ def command(
     from swath.daemon.config import load_config
     from swath.daemon.processing.navigation.inputs import INS_USES, InputWish
     from swath.daemon.processing.navigation.navigate import NavigateWish, arm_of_text, attitude_of_text
-    from swath.daemon.processing.trajectory.run import TrajectoryWish, make_trajectory
+    from swath.daemon.processing.trajectory.request import TrajectoryWish
+    from swath.daemon.processing.trajectory.run import make_trajectory
 
     if ins not in INS_USES:
         raise UserError(f'--ins: got "{ins}", want {", ".join(INS_USES)}', ExitCode.USAGE)

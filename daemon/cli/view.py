@@ -63,10 +63,10 @@ def _make(
     """Read, draw, write, tell; gives whether a file could be read in part only."""
     from rich.console import Console
 
-    from swath.daemon.processing.json_values import finite
     from swath.daemon.processing.quicklook.page import make_page
     from swath.daemon.processing.quicklook.read import QuickLookError
     from swath.daemon.processing.quicklook.run import look_at, numbers_of
+    from swath.daemon.processing.user_errors import finite
 
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
     first = paths[0]

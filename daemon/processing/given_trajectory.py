@@ -28,7 +28,7 @@ from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, utc_
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from swath.daemon.processing.points.feed import LogClocks
+    from swath.daemon.processing.points.clocks import LogClocks
     from swath.daemon.processing.setup.setup import Setup
     from swath.georef.trajectory.trajectory import Trajectory
 

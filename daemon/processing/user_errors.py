@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.format import LogError
@@ -29,3 +31,12 @@ def told_in_a_line(place: Path, *refused: type[Exception]) -> Iterator[None]:
         raise UserError(str(error), ExitCode.IO) from error
     except OSError as error:
         raise UserError(f"{error.filename or place}: {error.strerror or error}", ExitCode.IO) from error
+
+
+def finite(value: Any) -> Any:
+    """The value with null for every number that is none, in lists and tables too."""
+    if isinstance(value, dict):
+        return {key: finite(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -23,7 +23,14 @@ from typing import Any
 import numba.core.event
 import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
+from swath.calib.adjust import adjust
+from swath.calib.equations.trajectory_prior import gauss_markov
+from swath.calib.flight import Flight, Head, Swath, Tangent
+from swath.calib.parameters import Wish
+from swath.calib.planes.matching import rematch
+from swath.calib.planes.search import find_planes
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import SessionInfo
@@ -31,7 +38,6 @@ from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.grid import CountGrid, count_points
 from swath.daemon.processing.live.products import Thinning
 from swath.daemon.processing.setup.setup import Options, Setup
-from swath.daemon.processing.warm_navigation import warm_navigation
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, Parser
 from swath.drivers.scanner.hesai.heads import XT32
@@ -41,12 +47,20 @@ from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.velodyne.parser import MODE_DUAL, MODE_STRONGEST, encode_data_packet
 from swath.georef.formats.las import LasSettings, LasWriter
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
+from swath.georef.geodesy.gravity import gravity_e
+from swath.georef.navigation.alignment.align import Aligner
+from swath.georef.navigation.filter.filter import NavigationFilter, run_filter
+from swath.georef.navigation.filter.smoother import forward, smooth
+from swath.georef.navigation.inputs import GRADES, OBSERVATION_DTYPE, Inertial, Kind, Start, sort_observations
+from swath.georef.navigation.inputs import Setup as NavigationSetup
 from swath.georef.points import Points
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,
     INS_DTYPE,
     RETURN_DTYPE,
     ChunkBatch,
+    FixType,
     Int64Array,
     NamesEdge,
     PpsEdge,
@@ -56,8 +70,20 @@ from swath.georef.records import (
     TimeScale,
     TimeTag,
 )
+from swath.georef.scanner.beams import LineGeometry
+from swath.georef.scanner.calibration import nominal
+from swath.georef.scanner.uncertainty import Noise
 from swath.georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory
+
+LINE_FROM_NS = 1_465_000_000 * SECOND_NS
+LINE_S, APART_S = 4, 60
+RETURNS_HZ, SCANS_HZ, HALF_ANGLE_RAD = 4000, 20, 0.3
+LINE_MPS, LINE_HEIGHT_M = 10.0, 50.0
+
+NAVIGATED_S, IMU_RATE_HZ = 12, 50
+NAVIGATED_FROM_NS = 1_465_000_000 * SECOND_NS
+PLACE = (np.radians(47.0), np.radians(9.0), 500.0)
 
 COMPILE_EVENT = "numba:compile"
 ROWS = 500
@@ -170,8 +196,6 @@ def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False) -> WarmU
         for setup in setups:
             warm_setup(setup)
         if calibration:
-            from swath.daemon.processing.warm_calibration import warm_calibration
-
             warm_calibration()
     return WarmUp(len(names), time.monotonic() - began_s, cache_folder())
 
@@ -364,3 +388,89 @@ def _ouster(parser: OusterParser) -> list[bytes]:
 
 
 _PACKETS: dict[str, Callable[[], list[list[bytes]]]] = {"srep": _srep, "velodyne": _velodyne, "hesai": _hesai}
+
+
+def warm_navigation() -> None:
+    """Run everything once."""
+    position_e = e_from_geodetic(*PLACE)
+    inertial, observations = _standing(float(np.linalg.norm(gravity_e(position_e)))), _seen(position_e)
+    setup = NavigationSetup(GRADES["tactical"], np.array([[0.1, 0.0, -1.0]]))
+    aligner = Aligner(setup)
+    aligner.feed(inertial)
+    aligner.observe(observations)
+    small = np.full(3, 0.1)
+    start = Start(NAVIGATED_FROM_NS, position_e, np.zeros(3), np.zeros(3), small, small, np.radians(small))
+    run = run_filter(inertial, observations, setup, start)
+    forward(run)
+    smooth(run)
+    live = NavigationFilter(setup, start, smoothed=False)
+    live.observe(observations)
+    live.feed(inertial)
+
+
+def _standing(gravity_mps2: float) -> Inertial:
+    count = NAVIGATED_S * IMU_RATE_HZ
+    time_ns = NAVIGATED_FROM_NS + np.arange(1, count + 1) * (SECOND_NS // IMU_RATE_HZ)
+    velocity_b = np.tile([0.0, 0.0, -gravity_mps2 / IMU_RATE_HZ], (count, 1))
+    return Inertial(
+        time_ns, np.full(count, 1 / IMU_RATE_HZ), np.zeros((count, 3)), velocity_b, np.zeros(count, np.bool_)
+    )
+
+
+def _seen(position_e: NDArray[np.float64]) -> StructArray:
+    rows = np.zeros(2 * NAVIGATED_S, OBSERVATION_DTYPE)
+    rows["time_ns"] = NAVIGATED_FROM_NS + np.repeat(np.arange(NAVIGATED_S), 2) * SECOND_NS
+    rows["kind"] = np.tile([int(Kind.POSITION), int(Kind.VELOCITY)], NAVIGATED_S)
+    rows["fix_type"], rows["satellites"], rows["sigma"] = int(FixType.RTK_FIXED), 12, 0.02
+    rows["value"][::2] = position_e
+    return sort_observations(rows)
+
+
+def warm_calibration() -> None:
+    """Run everything once."""
+    flight = _flight()
+    planes = find_planes(flight)
+    planes = rematch(flight, planes)
+    with contextlib.suppress(ValueError):  # what such a flight does not determine is no matter here
+        adjust(flight, planes, Wish("basic"), gauss_markov(flight))
+
+
+def _flight() -> Flight:
+    frame = Tangent.at(e_from_geodetic(np.radians(47.0), np.radians(9.0), 0.0))
+    head = Head("line", nominal("line", np.zeros(3), np.eye(3)), LineGeometry(), Noise(0.02, 1e-5, 0.0, 0.0))
+    trajectory = _trajectory(frame)
+    bare = Flight(frame, (head,), (trajectory,), ())
+    swaths = []
+    for strip, begin_ns in enumerate((LINE_FROM_NS, LINE_FROM_NS + APART_S * SECOND_NS), start=1):
+        swath = _swath(strip, begin_ns + SECOND_NS // 2)
+        points_t = bare.place(swath, head.start)
+        swaths.append(Swath(swath.name, 0, strip, 0, swath.rows, swath.time_ns, points_t))
+    return Flight(frame, (head,), (trajectory,), tuple(swaths))
+
+
+def _trajectory(frame: Tangent) -> Trajectory:
+    """The same way twice, northwards."""
+    since_s = np.arange(0.0, LINE_S + 1.0, 0.02)
+    north_m = LINE_MPS * (since_s - 0.5 * LINE_S)
+    lat, lon, height = geodetic_from_e(
+        frame.e_from_t(np.stack([0.0 * north_m, north_m, np.full(len(north_m), LINE_HEIGHT_M)], axis=1))
+    )
+    one_ns = LINE_FROM_NS + np.rint(since_s * SECOND_NS).astype(np.int64)
+    time_ns = np.concatenate([one_ns, one_ns + APART_S * SECOND_NS])
+    level, sigma = np.zeros(len(time_ns)), np.full((len(time_ns), 3), 0.02)
+    return Trajectory.from_geodetic(
+        time_ns, np.tile(lat, 2), np.tile(lon, 2), np.tile(height, 2), np.zeros_like(sigma), level, level, level,
+        position_sigma_l=sigma, attitude_sigma_rad=0.01 * sigma, name="warm-up",
+    )  # fmt: skip
+
+
+def _swath(strip: int, begin_ns: int) -> Swath:
+    """Returns from level ground, not placed yet."""
+    count = LINE_S * RETURNS_HZ
+    since_s = np.arange(count) / RETURNS_HZ
+    rows = np.zeros(count, RETURN_DTYPE)
+    rows["return_number"] = rows["number_of_returns"] = 1
+    rows["encoder_rad"] = HALF_ANGLE_RAD * np.sin(2.0 * np.pi * SCANS_HZ * since_s)
+    rows["range_m"] = LINE_HEIGHT_M / np.cos(rows["encoder_rad"])
+    time_ns = begin_ns + np.rint(since_s * SECOND_NS).astype(np.int64)
+    return Swath(f"{strip:02d}", 0, strip, 0, rows, time_ns, np.zeros((count, 3)))

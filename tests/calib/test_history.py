@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from swath.calib.validation.history import BORESIGHT, HistoryError, compare, history
-from swath.daemon.processing.calibration.report.history_picture import history_png
+from swath.daemon.processing.validation.run import history_png
 from swath.georef.scanner.calibration import INDEX, BeamCorrection, Calibration, RangeOffset, nominal
 
 SIGMAS = np.radians([0.001, 0.001, 0.002])

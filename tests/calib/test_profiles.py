@@ -28,8 +28,7 @@ from swath.calib.profiles.stepwise import (
     stepwise,
     survey,
 )
-from swath.daemon.processing.calibration.report.profile_picture import draw, svg
-from swath.daemon.processing.calibration.report.profiles import pictures
+from swath.daemon.processing.calibration.report.profiles import draw, pictures, svg
 from swath.georef.arrays import FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables, only, retold, truth_of
 

@@ -25,7 +25,7 @@ from swath.daemon.processing.calibration import run as calibrate_run
 from swath.daemon.processing.calibration.model import model_of
 from swath.daemon.processing.calibration.plan import PlanWish, plan_calibration
 from swath.daemon.processing.calibration.run import refuse_no_planes
-from swath.daemon.processing.warm_calibration import warm_calibration
+from swath.daemon.processing.warm_up import warm_calibration
 from swath.georef.mapping.frame import Mapping
 from swath.georef.scanner.calibration import Calibration, read_calibration
 from swath.sim.plan.plan import parse_plan

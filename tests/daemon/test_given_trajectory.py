@@ -14,7 +14,7 @@ from pyproj import Transformer
 from swath.daemon.config import Config
 from swath.daemon.config.tables import GnssConfig
 from swath.daemon.processing.given_trajectory import Belonging, Given, _nearest, judge_given, points_of
-from swath.daemon.processing.points.feed import LogClocks, read_clocks
+from swath.daemon.processing.points.clocks import LogClocks, read_clocks
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.agreement import Apart
 from swath.georef.geodesy.earth import geodetic_from_e

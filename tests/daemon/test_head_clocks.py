@@ -20,7 +20,7 @@ from swath.daemon.exchange.routes import Routes
 from swath.daemon.log.chunk_index import index_log
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
-from swath.daemon.processing.points.feed import read_clocks
+from swath.daemon.processing.points.clocks import read_clocks
 from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.scanner.hesai.gps import encode_gps_packet

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swath.daemon.processing.mapped_storage import MappedStorage
+from swath.daemon.processing.navigation.navigate import MappedStorage
 from swath.georef.navigation.filter import filter as filter_module
 from swath.georef.navigation.filter import smoother as smoother_module
 from swath.georef.navigation.filter.stores import IN_MEMORY, Storage

@@ -23,7 +23,8 @@ from swath.daemon.log.mcap import scan as scan_module
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.points import feed as feed_module
-from swath.daemon.processing.points.feed import LogClocks, LogFeed, Placed, read_clocks
+from swath.daemon.processing.points.clocks import LogClocks, read_clocks
+from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.models import TerrainRanges
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.simulate.into_log import fly_into_log

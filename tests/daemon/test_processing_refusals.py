@@ -23,7 +23,7 @@ from swath.daemon.processing.flights.read import (
 from swath.daemon.processing.flights.trajectory_choice import attitude_doubts, refuse_other_motion
 from swath.daemon.processing.georeferencing.run import refuse_nothing
 from swath.daemon.processing.georeferencing.sidecar import unit_doubts
-from swath.daemon.processing.points.feed import LogClocks
+from swath.daemon.processing.points.clocks import LogClocks
 from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.unread import Unread, unread_lines

@@ -20,10 +20,10 @@ from swath.calib.verdict import overall_rms_m
 from swath.daemon.cli import strips
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.products import level_words, strips_entry
+from swath.daemon.processing.calibration.returns import refuse_installations
 from swath.daemon.processing.quicklook.run import look_at, numbers_of
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.strip_agreement import before_and_after, difference_map
-from swath.daemon.processing.strips.compare import refuse_installations
 from swath.daemon.processing.strips.inputs import strips_of_files, strips_of_flight
 from swath.georef.formats.trajectory_csv import csv_text
 from swath.georef.mapping.frame import Mapping

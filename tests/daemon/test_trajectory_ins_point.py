@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swath.daemon.processing.flights.trajectory_choice import _from_device
-from swath.daemon.processing.ins_point import offset_in_b, point_doubts
+from swath.daemon.processing.navigation.navigate import offset_in_b, point_doubts
 from swath.georef.records import INS_DTYPE
 from swath.georef.trajectory.trajectory import Trajectory
 

@@ -29,9 +29,9 @@ from swath.calib.record.values import Matrix, Value
 from swath.calib.ties.picked import PickedError, read_picked
 from swath.calib.validation.history import HistoryError, history
 from swath.daemon.processing.calibration.inputs import PolygonError, read_polygons
+from swath.daemon.processing.calibration.model import read_model
 from swath.daemon.processing.calibration.record import facts_of
 from swath.daemon.processing.flights.read import _given_strips
-from swath.daemon.processing.model_file import read_model
 from swath.daemon.processing.validation.run import _entry, read_file
 from swath.daemon.simulate.plans import Wish
 from swath.daemon.text_files import text_of

@@ -35,9 +35,9 @@ from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, Calibra
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
-from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after, difference_map
 from swath.daemon.processing.trajectory.verdict import Level
+from swath.daemon.processing.user_errors import finite
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
 Steps = Callable[[str, int, int], None]  # what is done, how much, of how much

@@ -318,3 +318,13 @@ def keep_job(plan: KeepPlan, job: Job, tell: Tell) -> JobResult:
         for file in opened:
             file.close()
     return result
+
+
+def refuse_installations(logged: Sequence[Any]) -> None:
+    """UserError where flights as logged are not of one installation."""
+    places = [flight.setup.config.profile.installation for flight in logged]
+    for flight, place in zip(logged, places, strict=True):
+        if place != places[0]:
+            raise UserError(
+                f'{flight.log}: is of installation "{place}", {logged[0].log} of "{places[0]}"; want logs of one'
+            )

@@ -44,13 +44,13 @@ from swath.daemon.processing.calibration.inputs import PolygonError, rings_of, t
 from swath.daemon.processing.calibration.returns import (
     KeptFlight,
     read_flight,
+    refuse_installations,
     refuse_without_noise,
     replaced,
     smoothed_prior,
 )
 from swath.daemon.processing.carried_verdict import told_before
 from swath.daemon.processing.flights.read import Wish, trajectory_verdicts_of
-from swath.daemon.processing.strips.compare import refuse_installations
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError

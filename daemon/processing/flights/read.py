@@ -25,7 +25,7 @@ from swath.daemon.processing.carried_verdict import (
 from swath.daemon.processing.files import refuse_no_name
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, choose_trajectory
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
-from swath.daemon.processing.points.feed import LogClocks, read_clocks
+from swath.daemon.processing.points.clocks import LogClocks, read_clocks
 from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
 from swath.daemon.processing.points.workers import refuse_in_import
 from swath.daemon.processing.setup.setup import Options, Setup
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from swath.georef.timescales import ClockStatus
 
     Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
-    from swath.daemon.config.config import Config
     from swath.daemon.processing.setup.setup import Options
 
 

@@ -21,7 +21,7 @@ from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_
 if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
     from swath.daemon.processing.navigation.navigate import Navigated
-    from swath.daemon.processing.points.feed import LogClocks
+    from swath.daemon.processing.points.clocks import LogClocks
     from swath.daemon.processing.setup.setup import Setup
     from swath.georef.trajectory.trajectory import Trajectory
 

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
+import mmap
+import os
+import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session
-from swath.daemon.processing.ins_point import point_doubts
-from swath.daemon.processing.mapped_storage import MappedStorage
 from swath.daemon.processing.navigation.inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
 from swath.daemon.processing.navigation.sources import noise_of
 from swath.daemon.processing.navigation.times import Stretch
 from swath.georef.arrays import FloatArray
+from swath.georef.geodesy.quaternions import conjugate, rotated
 from swath.georef.navigation.filter.stores import IN_MEMORY, Storage
 from swath.georef.navigation.inputs import (
     GRADES,
@@ -26,6 +32,7 @@ from swath.georef.navigation.inputs import (
     Solution,
     sort_observations,
 )
+from swath.georef.points import Fate
 from swath.georef.records import FixType, StructArray
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, Trajectory
@@ -34,6 +41,14 @@ if TYPE_CHECKING:
     from swath.georef.navigation.diagnosis.diagnose import Finding
     from swath.georef.navigation.inputs import Setup, Start
     from swath.georef.navigation.solve import Solved
+
+FEWEST = 20  # solutions to compare
+STEP_NS = 1_000_000_000
+APART_M = 0.2  # from where on another point is meant
+STEADY = 0.5  # scatter of the offset in b, over its length, beyond which it is no point of the body
+NEAR = 0.3  # of the lever arm: so near to the antenna it is the antenna
+
+SMALLEST_BYTES = 1 << 20  # smaller arrays are kept in memory
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 UNTIL_A_FIX_NS = 1_000_000_000  # a shorter wait for a position is that of a receiver's rate
@@ -286,3 +301,72 @@ def attitude_of_text(text: str) -> tuple[float, float, float]:
     if not (abs(roll) <= 180.0 and abs(pitch) <= 90.0 and abs(heading) <= 360.0):
         raise UserError(f'--start: got "{text}", want roll,pitch,heading in degrees, as 0.5,-1.2,273', ExitCode.USAGE)
     return math.radians(roll), math.radians(pitch), math.radians(heading)
+
+
+class MappedStorage(Storage):
+    """Large arrays stand in files without a name, which go with the arrays; `rest` takes them out of memory.
+
+    Space is taken when an array is made, so that a full disk is met there; such an array is kept in memory.
+
+    Args:
+        folder: of the files; None: that of temporary files.
+        smallest_bytes: arrays from this size on are mapped.
+    """
+
+    def __init__(self, folder: Path | None = None, smallest_bytes: int = SMALLEST_BYTES) -> None:
+        self._folder, self._smallest_bytes = folder, smallest_bytes
+        self._mapped: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+
+    def empty(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        """An array of zeros, mapped where it is large."""
+        size = prod(shape) * np.dtype(dtype).itemsize
+        if size < max(self._smallest_bytes, 1):
+            return np.empty(shape, dtype)
+        try:
+            with tempfile.TemporaryFile(dir=self._folder) as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+                mapping = mmap.mmap(file.fileno(), size)
+        except OSError:
+            return np.empty(shape, dtype)
+        self._mapped.add(mapping)
+        return np.frombuffer(mapping, dtype).reshape(shape)
+
+    def rest(self) -> None:
+        """Take what is mapped out of memory; it comes back from its file where it is asked for."""
+        for mapping in self._mapped:
+            mapping.madvise(mmap.MADV_DONTNEED)
+
+
+def offset_in_b(ins: Trajectory, navigated: Trajectory) -> tuple[FloatArray, FloatArray] | None:
+    """Median and scatter (3,) of where an INS's point is, from the body's origin in b, m; None: too few to tell."""
+    _, first = np.unique(ins.time_ns // STEP_NS, return_index=True)
+    first = first[navigated.fates(ins.time_ns[first]) == Fate.GEOREFERENCED]
+    if len(first) < FEWEST:
+        return None
+    poses = navigated.poses(ins.time_ns[first])
+    apart_b = rotated(conjugate(poses.q_e_from_b), ins.position_e[first] - poses.position_e)
+    middle: FloatArray = np.median(apart_b, axis=0)
+    scatter: FloatArray = 1.4826 * np.median(np.abs(apart_b - middle), axis=0)
+    return middle, scatter
+
+
+def point_doubts(ins: Trajectory, navigated: Trajectory, lever_arms_b: Sequence[FloatArray], source: str) -> list[str]:
+    """A line where the INS's point is not the body's origin, and which it seems to be."""
+    found = offset_in_b(ins, navigated)
+    if found is None:
+        return []
+    offset, scatter = found
+    length_m = float(np.linalg.norm(offset))
+    if length_m < APART_M or float(np.linalg.norm(scatter)) > STEADY * length_m:
+        return []
+    place = ", ".join(f"{value:.2f}" for value in offset)
+    what, point = "another point than the IMU", place.replace(" ", "")
+    for arm in lever_arms_b:
+        length = float(np.linalg.norm(arm))
+        if length > APART_M and float(np.linalg.norm(offset - arm)) < NEAR * length:
+            what, point = "its antenna", "antenna"
+            break
+    return [
+        f"{source}: its own INS tells the way of {what}, {length_m:.2f} m from the body's origin ({place} m in b); "
+        f"with that solution want --trajectory-at {point}, or the receiver set to give it at the IMU"
+    ]

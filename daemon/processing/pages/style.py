@@ -1,8 +1,33 @@
-"""The look of a report's page: light, readable at any width, and on paper."""
+"""The look of pages: light or dark, readable at any width, and on paper."""
 
 from __future__ import annotations
 
-STYLE = """
+REPORT_STYLE = """
+:root { color-scheme: light dark; --ink: #1d242b; --muted: #5d6770; --paper: #fbfbf9; --card: #fff; --line: #d9dcd7;
+  --good: #1d7a38; --bad: #b3261e; --note: #fff4d6; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6e8e6; --muted: #a3abb1; --paper: #16191c; --card: #1f2428;
+  --line: #384046; --good: #6fcf8a; --bad: #ff8a80; --note: #3a3115; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem 1.25rem 4rem; max-width: 78rem; background: var(--paper); color: var(--ink);
+  font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.7rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.4rem 0 .6rem; }
+p { margin: .4rem 0; } .muted, figcaption, small { color: var(--muted); }
+.figures { display: flex; flex-wrap: wrap; gap: .8rem; margin: 1.4rem 0; }
+.figures div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .6rem .9rem;
+  min-width: 9rem; }
+.figures b { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }
+.notes { background: var(--note); border-radius: 8px; padding: .6rem 1rem .6rem 2rem; margin: 1rem 0; }
+figure { margin: 1.2rem 0; } figure img { width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
+  border-radius: 8px; display: block; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .28rem .8rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap;
+  vertical-align: top; }
+th { color: var(--muted); font-weight: 600; } th:first-child, td:first-child, .left { text-align: left; }
+td.left { white-space: normal; min-width: 12rem; } .ok { color: var(--good); } .no { color: var(--bad); }
+"""
+
+QUICKLOOK_STYLE = """
 :root { color-scheme: light; --ink: #1d242b; --muted: #5d6770; --paper: #fbfbf9; --card: #fff; --line: #d9dcd7;
   --good: #1d7a38; --care: #e0a100; --bad: #b3261e; --note: #fff4d6; --accent: #0b5e8a; }
 * { box-sizing: border-box; }

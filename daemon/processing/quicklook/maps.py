@@ -18,14 +18,13 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from swath.daemon.processing.pages.words import DPI, EMPTY, INK, MUTED, shortened, thousands
 from swath.daemon.processing.quicklook.grids import COUNT, HEIGHT, INTENSITY, SIGMA_HEIGHT, Frame, filled, round_up
 from swath.daemon.processing.quicklook.profile import axis_of
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import HISTOGRAM_HALF, HISTOGRAM_STEP_M
 from swath.georef.arrays import FloatArray
 
-DPI = 140
-INK, MUTED, EMPTY = "#1d242b", "#5d6770", "#f3f4f2"
 LARGEST_MAP_IN, SMALLEST_MAP_IN = (10.0, 7.6), (3.0, 1.3)
 NARROW_SIDE_IN, WIDE_SIDE_IN = 1.55, 2.75
 LEFT_IN, TOP_IN, BOTTOM_IN, LOWEST_PAGE_IN = 1.0, 0.8, 0.62, 4.9
@@ -41,11 +40,6 @@ DZ_WORDS = ("≤ 3 cm", "3–5 cm", "5–10 cm", "> 10 cm")
 def strip_colour(number: int) -> str:
     """The same one for a strip in every picture."""
     return STRIP_COLOURS[number % len(STRIP_COLOURS)]
-
-
-def thousands(value: float, digits: int = 0) -> str:
-    """A number whose thousands stand apart, with a real minus."""
-    return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
 class MapPage:
@@ -350,11 +344,6 @@ def _worst_pairs(look: Look) -> str:
     names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
     told = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
     return "\n".join(["medians" if len(rows) == len(look.overlap.rows) else "largest medians", *told])
-
-
-def shortened(name: str, most: int) -> str:
-    """A name of so many letters at most."""
-    return name if len(name) <= most else f"{name[: most - 1]}…"
 
 
 def _pale_ground(page: MapPage) -> None:

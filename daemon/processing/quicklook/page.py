@@ -9,13 +9,14 @@ from html import escape
 from pathlib import Path
 
 from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from swath.daemon.processing.pages.style import QUICKLOOK_STYLE
+from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.quicklook.maps import (
     draw_density,
     draw_differences,
     draw_height,
     draw_intensity,
     draw_sigma,
-    thousands,
 )
 from swath.daemon.processing.quicklook.product_facts import calibrations_in, rows_of, warnings_in
 from swath.daemon.processing.quicklook.profile_picture import draw_profile
@@ -33,30 +34,6 @@ PICTURES: tuple[tuple[str, str, Callable[[Look, Path], None], Callable[[Look], b
     ("intensity", "Intensity", draw_intensity, lambda look: True),
     ("sigma", "Sigma of height", draw_sigma, lambda look: look.surface.with_sigma > 0),
 )
-STYLE = """
-:root { color-scheme: light dark; --ink: #1d242b; --muted: #5d6770; --paper: #fbfbf9; --card: #fff; --line: #d9dcd7;
-  --good: #1d7a38; --bad: #b3261e; --note: #fff4d6; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e8e6; --muted: #a3abb1; --paper: #16191c; --card: #1f2428;
-  --line: #384046; --good: #6fcf8a; --bad: #ff8a80; --note: #3a3115; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.25rem 4rem; max-width: 78rem; background: var(--paper); color: var(--ink);
-  font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.7rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2.4rem 0 .6rem; }
-p { margin: .4rem 0; } .muted, figcaption, small { color: var(--muted); }
-.figures { display: flex; flex-wrap: wrap; gap: .8rem; margin: 1.4rem 0; }
-.figures div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .6rem .9rem;
-  min-width: 9rem; }
-.figures b { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }
-.notes { background: var(--note); border-radius: 8px; padding: .6rem 1rem .6rem 2rem; margin: 1rem 0; }
-figure { margin: 1.2rem 0; } figure img { width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
-  border-radius: 8px; display: block; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .8rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap;
-  vertical-align: top; }
-th { color: var(--muted); font-weight: 600; } th:first-child, td:first-child, .left { text-align: left; }
-td.left { white-space: normal; min-width: 12rem; } .ok { color: var(--good); } .no { color: var(--bad); }
-"""
 
 
 def make_page(look: Look, folder: Path, title: str) -> Path:
@@ -83,7 +60,7 @@ def page_of(look: Look, title: str, pictures: Sequence[tuple[str, Path]]) -> str
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}: quick look</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{STYLE}</style></head><body>",
+        f"<style>{QUICKLOOK_STYLE}</style></head><body>",
         f"<h1>{escape(title)}</h1>",
         f"<p class='muted'>{escape(_crs_words(look))}</p>",
         _figures(look),

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from swath.daemon.processing.quicklook.maps import DPI, INK, MUTED, shortened, strip_colour, thousands
+from swath.daemon.processing.pages.words import DPI, INK, MUTED, shortened, thousands
+from swath.daemon.processing.quicklook.maps import strip_colour
 from swath.daemon.processing.quicklook.profile import Profile, steps_of
 from swath.daemon.processing.quicklook.run import Look
 

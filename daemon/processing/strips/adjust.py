@@ -32,6 +32,7 @@ from swath.daemon.processing.calibration.inputs import control_of
 from swath.daemon.processing.calibration.returns import (
     KeptFlight,
     read_flight,
+    refuse_installations,
     refuse_without_noise,
     replaced,
     smoothed_prior,
@@ -41,7 +42,7 @@ from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import Wish, verdicts_of
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
-from swath.daemon.processing.strips.compare import is_of_logs, refuse_installations
+from swath.daemon.processing.strips.compare import is_of_logs
 from swath.daemon.processing.trajectory.files import TrajectoryFiles
 from swath.daemon.processing.user_errors import told_in_a_line
 from swath.georef.mapping.frame import MappingError

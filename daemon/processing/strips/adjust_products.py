@@ -20,10 +20,10 @@ from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, tra
 from swath.daemon.processing.files import gone_on_failure, put_in_place, sha256_of, write_aside
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import verdict_of
-from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, files_of
 from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
+from swath.daemon.processing.user_errors import finite
 from swath.georef.arrays import FloatArray
 from swath.georef.trajectory.trajectory import Trajectory
 

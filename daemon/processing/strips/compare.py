@@ -14,13 +14,12 @@ from swath.calib.strips.cells import StripRules
 from swath.calib.strips.differences import Numbers, PairReport, StripReport, report_of
 from swath.calib.strips.signatures import Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibration.returns import read_flight, smoothed_prior
+from swath.daemon.processing.calibration.returns import read_flight, refuse_installations, smoothed_prior
 from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
 from swath.daemon.processing.flights.read import Wish, verdicts_of
-from swath.daemon.processing.json_values import finite
 from swath.daemon.processing.strip_agreement import Agreement, difference_of
 from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.user_errors import finite, told_in_a_line
 from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError
 
@@ -130,16 +129,6 @@ def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> 
     strips.notes.extend(kept.notes)
     strips.carried.extend(carried)
     return strips
-
-
-def refuse_installations(logged: Sequence[Any]) -> None:
-    """UserError where flights as logged are not of one installation."""
-    places = [flight.setup.config.profile.installation for flight in logged]
-    for flight, place in zip(logged, places, strict=True):
-        if place != places[0]:
-            raise UserError(
-                f'{flight.log}: is of installation "{place}", {logged[0].log} of "{places[0]}"; want logs of one'
-            )
 
 
 # ---------------------------------------------------------------------- what is made of it

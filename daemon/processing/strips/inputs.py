@@ -31,10 +31,17 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.point_times import PointClock
 from swath.daemon.processing.quicklook.grids import Surface, cell_for, frame_of
-from swath.daemon.processing.quicklook.read import NOISE_CLASSES, QuickLookError, StripBook, Units
+from swath.daemon.processing.quicklook.read import (
+    NOISE_CLASSES,
+    UNREADABLE,
+    PointReader,
+    QuickLookError,
+    Selection,
+    StripBook,
+    Units,
+)
 from swath.daemon.processing.quicklook.run import Look, StripFacts, look_at
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, TILE
-from swath.daemon.processing.quicklook_points import UNREADABLE, PointReader, Selection
 from swath.daemon.processing.strip_agreement import compare_flight, corners_of
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.trajectory_columns import LATEST_NS

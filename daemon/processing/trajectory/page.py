@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from swath.daemon.processing.quicklook.maps import thousands
-from swath.daemon.processing.quicklook.page import STYLE
+from swath.daemon.processing.pages.style import QUICKLOOK_STYLE
+from swath.daemon.processing.pages.words import thousands
 from swath.daemon.processing.trajectory.figures import ANGLES, AXES_B, AXES_L, Figures, figures_of
 from swath.daemon.processing.trajectory.panels import NARROW, WIDE, Drawn, Format
 from swath.daemon.processing.trajectory.pictures import (
@@ -150,7 +150,7 @@ def page_of(
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(flight.title)}: trajectory</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{STYLE}{OWN_STYLE}</style></head><body>",
+        f"<style>{QUICKLOOK_STYLE}{OWN_STYLE}</style></head><body>",
         f"<h1>{escape(flight.title)}</h1>",
         f"<p class='muted'>{escape(_span_words(figures))}</p>",
         f"<p class='verdict {verdict.level.name.lower()}'>{escape(verdict.sentence)}</p>",

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
 
-from swath.daemon.processing.quicklook.maps import INK, MUTED
+from swath.daemon.processing.pages.words import INK, MUTED
 from swath.daemon.processing.trajectory.series import Course, Flight, Pixels, Separation, bridged_spans, outages_of
 from swath.georef.arrays import FloatArray
 from swath.georef.navigation.inputs import Solution

@@ -14,7 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
 from scipy.stats import chi2
 
-from swath.daemon.processing.quicklook.maps import INK, MUTED, round_down
+from swath.daemon.processing.pages.words import INK, MUTED
+from swath.daemon.processing.quicklook.maps import round_down
 from swath.daemon.processing.trajectory.figures import AXES_B, AXES_L
 from swath.daemon.processing.trajectory.panels import NARROW, Drawn, Format, Sheet, dress, picture_of
 from swath.daemon.processing.trajectory.series import COLUMNS, Pixels, fix_types_at

@@ -2,52 +2,40 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.files import put_in_place, refuse_no_name, remove, write_aside
-from swath.daemon.processing.ins_as_is import ins_as_is
 from swath.daemon.processing.navigation.inputs import Mark
-from swath.daemon.processing.navigation.navigate import Navigated, NavigateWish, joined_trajectory, navigate_session
+from swath.daemon.processing.navigation.log import session_holes
+from swath.daemon.processing.navigation.navigate import Navigated, joined_trajectory, navigate_session
+from swath.daemon.processing.navigation.sources import config_of_log, files_of, without_scanners
+from swath.daemon.processing.points.clocks import read_clocks
+from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.trajectory.event_marks import EventTable, event_table
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
+from swath.daemon.processing.trajectory.request import TrajectoryWish
 from swath.daemon.processing.trajectory.summary import pages_of, summary_head, summary_of_run, write_json
 from swath.daemon.processing.user_errors import told_in_a_line
+from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
+
+if TYPE_CHECKING:
+    from swath.daemon.config.config import Config
+    from swath.daemon.log.reader import Session
 
 Tell = Callable[[str, int, int], None]  # what is done, how much, of how much
 Written = list[tuple[Path, Path]]
 AS_IS = "as-is"
-
-
-@dataclass(frozen=True, slots=True)
-class TrajectoryWish:
-    """What the command line asks for.
-
-    Attributes:
-        logs, output: where from, where to.
-        navigate: how.
-        csv: a CSV file too.
-        events: event marks go there; None: nowhere.
-        page: the page of plots is made.
-        overwrite: files of an earlier run are replaced.
-    """
-
-    logs: Sequence[Path]
-    output: Path
-    navigate: NavigateWish = field(default_factory=NavigateWish)
-    csv: bool = False
-    events: Path | None = None
-    page: bool = True
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -184,3 +172,45 @@ def _write_pages(
         verdicts.append(verdict)
         figures.append(own)
     return verdicts, figures
+
+
+@dataclass(frozen=True, eq=False)
+class AsIs:
+    """A session's INS.
+
+    Attributes:
+        source: whose.
+        trajectory: attitude of b.
+        solutions: by what became of them.
+        holes: what is missing, a line each.
+    """
+
+    source: str
+    trajectory: Trajectory
+    solutions: Counter[str]
+    holes: list[str]
+
+
+def ins_as_is(session: Session, config: Config | None) -> AsIs:
+    """Read it.
+
+    Raises:
+        UserError: there is none.
+        LogError, OSError: the log cannot be read.
+    """
+    log = session.parts[0].path
+    files = files_of(session, config)
+    try:
+        setup = Setup(without_scanners(config or config_of_log(files)), files, Options(uncertainty=False))
+    except UserError as error:
+        lines = [f"{log}: {line}" for line in error.message.splitlines()]
+        raise UserError("\n".join(lines), error.exit_code) from error
+    clocks = read_clocks(session, setup)
+    if setup.ins_source is None or not len(clocks.ins_rows):
+        raise UserError(f"{log}: no INS solution in the log; without --ins as-is its IMU and GNSS are navigated")
+    buffer = TrajectoryBuffer(setup.ins_protocol, name=session.session_id)
+    buffer.append(clocks.ins_rows)
+    trajectory = buffer.snapshot().with_velocities()
+    if len(trajectory) < 2:
+        raise UserError(f"{log}: {setup.ins_source}: its INS had no solution")
+    return AsIs(setup.ins_source, trajectory, +Counter(buffer.counts), session_holes(session))

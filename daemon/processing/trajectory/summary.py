@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
     from swath.daemon.processing.navigation.navigate import Navigated, NavigatedLeg
     from swath.daemon.processing.trajectory.event_marks import EventTable
-    from swath.daemon.processing.trajectory.run import TrajectoryWish
+    from swath.daemon.processing.trajectory.request import TrajectoryWish
     from swath.georef.navigation.diagnosis.diagnose import Finding
     from swath.georef.navigation.inputs import Setup, Start
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import datetime as dt
+import io
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from swath.calib.adjust import adjust
 from swath.calib.control.points import ControlError, control_planes
@@ -20,7 +25,7 @@ from swath.calib.parameters import Wish as Model
 from swath.calib.planes.fit import PlaneError
 from swath.calib.planes.search import find_planes
 from swath.calib.record.record import Document
-from swath.calib.validation.history import History, HistoryError, history
+from swath.calib.validation.history import BORESIGHT, History, HistoryError, history
 from swath.calib.validation.methods import (
     SIGMAS_DEG,
     SIGMAS_M,
@@ -33,20 +38,21 @@ from swath.calib.validation.methods import (
 )
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.inputs import control_of
-from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, replaced
+from swath.daemon.processing.calibration.returns import KeptFlight, read_flight, refuse_installations, replaced
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import Wish, verdicts_of
-from swath.daemon.processing.json_values import finite
-from swath.daemon.processing.strips.compare import refuse_installations
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.user_errors import finite, told_in_a_line
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
 from swath.georef.scanner.calibration import Calibration, CalibrationError, read_calibration
 from swath.georef.strips import StripError
 from swath.georef.text_encoding import decoded
+
+INK, MUTED, COLOURS = "#1d242b", "#5d6770", ("#0072b2", "#d55e00", "#009e73")
+DPI, DAY_S = 140, 86_400.0
 
 Told = Callable[[str, int, int], None]
 RECORD, PICTURE = "validation.json", "history.png"
@@ -315,8 +321,6 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
     if found.validation is not None and found.validation.passed is not None:
         files |= record_files(output, found.documents, found.validation, found.logs)
     if found.histories:
-        from swath.daemon.processing.calibration.report.history_picture import history_png
-
         files[output / PICTURE] = history_png(found.histories)
     files[output / RECORD] = (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
     try:
@@ -324,3 +328,44 @@ def _write(output: Path, record: dict[str, Any], found: _Found) -> list[str]:
     except OSError as error:
         raise UserError(f"{output}: cannot be written to ({error.strerror or error})", ExitCode.IO) from error
     return [str(path) for path in files]
+
+
+def history_png(histories: Sequence[History]) -> bytes:
+    """Boresight angles with one sigma over time, a column a history."""
+    figure = Figure(figsize=(1.0 + 5.0 * max(len(histories), 1), 6.6), facecolor="white", layout="constrained")
+    axes = figure.subplots(len(BORESIGHT), max(len(histories), 1), squeeze=False, sharex="col")
+    for column, one in enumerate(histories):
+        axes[0, column].set_title(f"{one.scanner}, {one.installation}", fontsize=10, color=INK)
+        for row, name in enumerate(BORESIGHT):
+            _draw(axes[row, column], one, row, name)
+    made = io.BytesIO()
+    figure.savefig(made, dpi=DPI)
+    return made.getvalue()
+
+
+def _draw(axes: Axes, one: History, row: int, name: str) -> None:
+    days = np.array(one.times) / DAY_S  # matplotlib's dates: days since 1970
+    key = name.replace("_rad", "_deg")
+    table = one.table()
+    known = [number for number, entry in enumerate(table) if entry[f"{key}_sigma"]]
+    axes.errorbar(
+        days[known],
+        [table[number][key] for number in known],
+        [table[number][f"{key}_sigma"] for number in known],
+        fmt="o-",
+        color=COLOURS[row],
+        ecolor=MUTED,
+        capsize=3,
+        lw=1.0,
+        ms=4.5,
+    )
+    for trend in one.trends:
+        if trend.name == name:
+            text = f"{math.degrees(trend.per_year):+.4f} ± {math.degrees(trend.sigma):.4f}° a year"
+            axes.text(0.98, 0.04, text, transform=axes.transAxes, ha="right", fontsize=8, color=MUTED)
+    axes.set_ylabel(f"{key.removesuffix('_deg')} (°)", fontsize=9, color=INK)
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.tick_params(labelsize=8, colors=MUTED)
+    axes.xaxis_date(dt.UTC)
+    axes.grid(color="#c9cecb", lw=0.4)
+    axes.spines[["top", "right"]].set_visible(False)

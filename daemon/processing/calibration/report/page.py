@@ -12,7 +12,7 @@ from swath.daemon.processing.calibration.report.contents import Block, Notes, Wo
 from swath.daemon.processing.calibration.report.pdf import pdf_of
 from swath.daemon.processing.calibration.report.tables import Table
 from swath.daemon.processing.pages.canvas import NARROW, WIDE, Picture
-from swath.daemon.processing.pages.style import STYLE
+from swath.daemon.processing.pages.style import REPORT_STYLE
 
 __all__ = ["Difference", "DifferenceMap", "PairDifference", "Profile", "ReportInput", "html", "judge", "pdf"]
 
@@ -25,7 +25,7 @@ def html(report: ReportInput) -> str:
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(report.heading)}</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{STYLE}</style></head><body>",
+        f"<style>{REPORT_STYLE}</style></head><body>",
         f"<header><p class='kind'>Calibration report</p><h1>{escape(report.heading)}</h1></header>",
         _verdict(verdict),
         _cards(cards_of(report)),

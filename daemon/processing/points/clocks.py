@@ -1,0 +1,164 @@
+"""Reads a log's clocks, before its returns are placed in time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from swath.daemon.log.format import source_of_topic
+from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.reader import Session
+from swath.daemon.processing.points.runs import Run
+from swath.daemon.processing.setup.setup import Setup
+from swath.georef.records import (
+    IMU_DTYPE,
+    INS_DTYPE,
+    ChunkBatch,
+    GnssFix,
+    ImuSamples,
+    InsSolution,
+    Record,
+    StructArray,
+    TimeMessage,
+)
+from swath.georef.scanner.mount import AngleSeries, MountError
+from swath.georef.stream.clocks import FrozenClocks, HostClocks
+from swath.georef.stream.stream import StreamSettings
+from swath.georef.trajectory.buffer import SOLUTION_STATUS
+
+
+@dataclass(slots=True)
+class LogClocks:
+    """What all of a log says of time and motion, but for its scanners; pickles.
+
+    Attributes:
+        clocks: the host's clock by source, complete.
+        ins_rows: solutions of the device's INS, `INS_DTYPE`, attitude of b.
+        imu_gps_ns: (n,) GPS time of the samples' arrival; imu_rate_b: (n, 3) rad/s, axes of b. To check that a
+            trajectory's motion is this flight's.
+        angles: of gimbals, by the source that told them.
+        counts: records by source.
+        imu_force_b: (n, 3) m/s², axes of b, and fixes: of receivers, by source. To check that a trajectory is of this
+            flight; empty unless asked for.
+        remarks: lines for the user, of parsers.
+    """
+
+    clocks: FrozenClocks
+    ins_rows: StructArray
+    imu_gps_ns: np.ndarray[Any, np.dtype[np.int64]]
+    imu_rate_b: np.ndarray[Any, np.dtype[np.float64]]
+    angles: dict[str, AngleSeries] = field(default_factory=dict)
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    imu_force_b: np.ndarray[Any, np.dtype[np.float64]] = field(default_factory=lambda: np.empty((0, 3)))
+    fixes: dict[str, list[GnssFix]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+class _ClockReader:
+    """Collects what all but the scanners say."""
+
+    def __init__(self, setup: Setup, session: Session, *, positions: bool) -> None:
+        self.host = HostClocks(setup.clock_plan(session.info), keep_history=True)
+        self.fixes: dict[str, list[GnssFix]] = {}
+        self._positions = positions
+        self.ins: list[StructArray] = []
+        self.imu: list[StructArray] = []
+        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.gimbal_sources}
+        self.counts: dict[str, Counter[str]] = {}
+        self.remarks: list[str] = []
+        self._setup = setup
+        self._parsers = setup.parsers(("gnss", "imu"), whole=positions)
+        self._runs: dict[str, Run] = {}
+
+    def take(self, batch: LogBatch) -> None:
+        """The next messages."""
+        topic = batch.channel.topic
+        source = source_of_topic(topic)
+        if topic == "/clock":
+            for reading in readings_of(batch):
+                self.host.add_reading(*reading)
+        elif source is not None and source.startswith("pps/"):
+            edge = self._setup.edge_of(source)
+            for found in edges_of(batch, edge) if edge is not None else ():
+                if found is not None:
+                    self.host.add_edge(source, found)
+        elif source is not None:  # its own order is enough: times are taken all at once
+            run = self._runs.setdefault(source, Run(partial(self._parse, self._setup.inside(source))))
+            run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
+
+    def _parse(self, names: Iterable[str], batches: list[ChunkBatch]) -> None:
+        for name in names:
+            if name in self._parsers:
+                self.take_records(name, self._parsers[name].feed_batches(batches))
+
+    def close(self) -> None:
+        """Tails of the streams, and all times at once."""
+        for run in self._runs.values():
+            run.flush()
+        for name, parser in self._parsers.items():
+            self.take_records(name, parser.close())
+            self.remarks += parser.remarks()
+        self.host.update()
+        self.remarks += self.host.settle()
+
+    def angles(self) -> dict[str, AngleSeries]:
+        """Of gimbals, from the sources that told some."""
+        found: dict[str, AngleSeries] = {}
+        for source, pieces in sorted(self.gimbals.items()):
+            rows = np.concatenate(pieces) if pieces else np.empty(0, INS_DTYPE)
+            is_solution = SOLUTION_STATUS.get(self._setup.protocol(source))
+            with suppress(MountError):  # fewer than two: who needs them says so
+                found[source] = AngleSeries.of_solutions(
+                    rows if is_solution is None else rows[is_solution(rows["status"])]
+                )
+        return found
+
+    def take_records(self, source: str, records: list[Record]) -> None:
+        """Of a parser."""
+        counts = self.counts.setdefault(source, Counter())
+        for record in records:
+            rows = getattr(record, "rows", None)
+            counts[type(record).__name__] += 1 if rows is None else len(rows)
+            if isinstance(record, TimeMessage) and source in self.host.plan.gnss:
+                self.host.add_message(source, record)
+            elif isinstance(record, InsSolution) and source == self._setup.ins_source:
+                self.ins.append(record.rows)
+            elif isinstance(record, InsSolution) and source in self.gimbals:
+                self.gimbals[source].append(record.rows)
+            elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
+                self.imu.append(record.rows)
+            elif isinstance(record, GnssFix) and self._positions:
+                self.fixes.setdefault(source, []).append(record)
+
+
+def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> LogClocks:
+    """Read all but the scanners' messages of a session, a first pass before its returns are georeferenced.
+
+    What belongs to scanners is passed over chunk by chunk: a chunk holds one class of channels. With ``positions``
+    the receivers' fixes and the IMU's specific forces are kept too.
+    """
+    reader = _ClockReader(setup, session, positions=positions)
+    for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
+        reader.take(batch)
+    reader.close()
+    ins = setup.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
+    imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
+    gps_ns, rate_b, force_b = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
+    clock = setup.clock_of_imu
+    if len(imu) and clock is not None:
+        gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
+        known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock says nothing of a trajectory's
+        gps_ns, rate_b = gps_ns[known], setup.in_b(imu["angular_rate_b"][known])
+        if positions:
+            force_b = setup.in_b(imu["specific_force_b"][known])
+    host = FrozenClocks(reader.host)
+    found = LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)
+    found.remarks = reader.remarks
+    return found
