@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from laspy.header import GpsTimeType
 
-from swath.daemon.processing.quicklook.read import UNREADABLE, PointReader, Selection, open_points
+from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Selection, open_points
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.timescales.gps_time import (

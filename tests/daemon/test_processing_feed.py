@@ -25,6 +25,7 @@ from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.points import feed as feed_module
 from swath.daemon.processing.points.clocks import LogClocks, read_clocks
 from swath.daemon.processing.points.feed import LogFeed, Placed
+from swath.daemon.processing.points.runs import JOINED_BYTES
 from swath.daemon.processing.setup.models import TerrainRanges
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.simulate.into_log import fly_into_log
@@ -330,8 +331,8 @@ def test_a_scanners_units_of_any_lengths_are_decoded_together(
     take(left.channel, 100, 1492)
     take(left.channel, 1, 1000)
     assert seen[1:] == [[(1, 52)]]
-    take(left.channel, 1, feed_module.JOINED_BYTES - 150_200)
-    assert seen[2:] == [[(100, 1492), (1, 1000), (1, feed_module.JOINED_BYTES - 150_200)]]
+    take(left.channel, 1, JOINED_BYTES - 150_200)
+    assert seen[2:] == [[(100, 1492), (1, 1000), (1, JOINED_BYTES - 150_200)]]
     take(left.channel, 4, 52)
     take(left.channel, 4, 60, after_ns=200_000_000)
     assert seen[3:] == [[(4, 52)]]

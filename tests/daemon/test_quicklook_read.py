@@ -12,15 +12,8 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from swath.daemon.processing.quicklook.read import (
-    UNREADABLE,
-    PointReader,
-    Selection,
-    Units,
-    density_near,
-    has_varying_chunks,
-    open_source,
-)
+from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Selection, has_varying_chunks
+from swath.daemon.processing.quicklook.read import Units, density_near, open_source
 from swath.daemon.processing.quicklook.run import Look, look_at
 from swath.georef.formats.copc import CopcWriter
 from swath.georef.formats.las import LasSettings

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any
 
 import laspy
-import lazrs
 import numpy as np
 from laspy.errors import LaspyException
 from numpy.typing import NDArray
@@ -20,27 +17,17 @@ from pyproj import CRS, Proj
 from pyproj.exceptions import CRSError
 
 from swath.daemon.processing.point_times import PointTimes, point_times_of
+from swath.daemon.processing.quicklook.point_files import (
+    UNREADABLE,
+    PointReader,
+    Points,
+    Selection,
+    open_points,
+    sample_of,
+)
 from swath.daemon.processing.quicklook.product_facts import height_unit_in, sessions_in, sidecar_of
 from swath.georef.arrays import FloatArray
 from swath.georef.map_fit import misfit_of, scales_at
-
-SKIPPED_POINTS = 200_000
-Points: TypeAlias = laspy.ScaleAwarePointRecord
-Selection: TypeAlias = laspy.DecompressionSelection
-UNREADABLE = (
-    *(LaspyException, lazrs.LazrsError, ValueError, KeyError, IndexError, EOFError, OSError, struct.error),
-    *(TypeError, AttributeError, OverflowError, MemoryError),  # of laspy, where a record is none of its kind
-)
-_HEADER_BYTES, _VLR_BYTES, _EVLR_BYTES = 375, 54, 60  # LAS 1.4-R15
-_SIZES = struct.Struct("<HII")  # of the header, offset of the points, number of records between
-_EXTENDED = struct.Struct("<QI")  # where extended records begin, and how many
-_SIZES_AT, _MINOR_AT, _EXTENDED_AT = 94, 25, 235
-_POINT, _POINT_AT = struct.Struct("<BH"), 104  # format with the bit of LAZ, bytes of a point
-_COMPRESSED, _MOST_POINT_BYTES = 0x80, 2048
-_VLR = struct.Struct("<2x16sHH32x")  # user, number and length of a record before the points
-_LASZIP = (b"laszip encoded", 22204)
-_CHUNK_POINTS, _CHUNK_POINTS_AT, _VARYING = struct.Struct("<I"), 12, 0xFFFF_FFFF  # in that record
-_MOST_CHUNK_BYTES = 1 << 30  # of points as read; lazrs has room made for a whole chunk. LASzip's own have 50,000 points
 
 SUFFIXES = (".las", ".laz")
 BLOCK_POINTS = 200_000
@@ -451,138 +438,3 @@ def _block(points: Points, source: Source, units: Units, book: StripBook) -> Blo
         sigma_m=sigma_m,
         skipped=skipped,
     )
-
-
-def open_points(path: Path, selection: Selection | None = None) -> laspy.LasReader:
-    """A reader of a file whose header names no more records than the file has room for: laspy would read on for hours.
-
-    Raises one of UNREADABLE.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
-        _refuse_records(head, size)
-        _refuse_chunks(file, head, size)
-    with _panics_told():
-        return laspy.open(path) if selection is None else laspy.open(path, decompression_selection=selection)
-
-
-def _refuse_records(head: bytes, size: int) -> None:
-    if len(head) >= _SIZES_AT + _SIZES.size:
-        header_bytes, points_at, count = _SIZES.unpack_from(head, _SIZES_AT)
-        if points_at > size or header_bytes + count * _VLR_BYTES > points_at:
-            raise ValueError(f"{count} records before the points at byte {points_at} of {size}")
-    if len(head) == _HEADER_BYTES and head[_MINOR_AT] >= 4:
-        begin, count = _EXTENDED.unpack_from(head, _EXTENDED_AT)
-        if count and begin + count * _EVLR_BYTES > size:
-            raise ValueError(f"{count} records from byte {begin} of {size} on")
-
-
-def _refuse_chunks(file: BinaryIO, head: bytes, size: int) -> None:
-    """Points or chunks of a size that none has, or more chunks than there are bytes: lazrs would end the process."""
-    if len(head) < _POINT_AT + _POINT.size:
-        return
-    kind, point_bytes = _POINT.unpack_from(head, _POINT_AT)
-    if point_bytes > _MOST_POINT_BYTES:
-        raise ValueError(f"points of {point_bytes} bytes")
-    if not kind & _COMPRESSED:
-        return
-    (chunk_points,) = _CHUNK_POINTS.unpack(_laszip_record(file, head)[_CHUNK_POINTS_AT:][:4].ljust(4, b"\0"))
-    if chunk_points != _VARYING and chunk_points * point_bytes > _MOST_CHUNK_BYTES:
-        raise ValueError(f"chunks of {chunk_points} points")
-    points_at = _SIZES.unpack_from(head, _SIZES_AT)[1]
-    if points_at > size - 8:
-        return
-    file.seek(points_at)
-    (table_at,) = struct.unpack("<q", file.read(8))
-    if table_at == -1:  # written to a pipe: it stands at the end
-        file.seek(size - 8)
-        (table_at,) = struct.unpack("<q", file.read(8))
-    if not 0 <= table_at <= size - 8:
-        return  # a file cut off, whose first points can be read
-    file.seek(table_at)
-    _, count = struct.unpack("<II", file.read(8))
-    if count > size:
-        raise ValueError(f"{count} chunks in {size} bytes")
-
-
-def _laszip_record(file: BinaryIO, head: bytes) -> bytes:
-    """The record that says how points were compressed; empty: there is none."""
-    at, _, count = _SIZES.unpack_from(head, _SIZES_AT)
-    for _ in range(count):
-        file.seek(at)
-        user, number, length = _VLR.unpack(file.read(_VLR_BYTES).ljust(_VLR_BYTES, b"\0"))
-        if (user.rstrip(b"\0"), number) == _LASZIP:
-            return file.read(length)
-        at += _VLR_BYTES + length
-    return b""
-
-
-@contextmanager
-def _panics_told() -> Iterator[None]:
-    """A panic of lazrs, which is no Exception, as the ValueError that it should be."""
-    try:
-        yield
-    except BaseException as error:
-        if type(error).__name__ == "PanicException":  # of pyo3, which lets nobody import it
-            raise ValueError(f"lazrs: {error}") from error
-        raise
-
-
-class PointReader:
-    """Reads a file's points forward.
-
-    Where chunks of LAZ vary in size, as in COPC, lazrs finds none but the first: from there on it gives points that are
-    none, without a word. In such files what lies before is read and left.
-    """
-
-    def __init__(self, path: Path, selection: Selection) -> None:
-        """Raises one of UNREADABLE."""
-        self._reader = open_points(path, selection)
-        self._at = 0
-        self._can_seek = not has_varying_chunks(self._reader.header)
-
-    def __enter__(self) -> PointReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._reader.close()
-
-    def go_to(self, number: int) -> None:
-        """The next point to be read is this one, which has not been read yet."""
-        if number != self._at and self._can_seek:
-            with _panics_told():
-                self._reader.seek(number)
-            self._at = number
-        while self._at < number:
-            if not len(self.read(min(SKIPPED_POINTS, number - self._at))):
-                raise EOFError("the file ends too early")
-
-    def read(self, count: int) -> Points:
-        """So many points, or as many as there are."""
-        with _panics_told():
-            points = self._reader.read_points(count)
-        self._at += len(points)
-        return points
-
-
-def has_varying_chunks(header: laspy.LasHeader) -> bool:
-    """Whether a LAZ file's chunks vary in size."""
-    found = header.vlrs.get("LasZipVlr")
-    with _panics_told():
-        return bool(found) and bool(lazrs.LazVlr(found[0].record_data).uses_variable_size_chunks())
-
-
-def sample_of(path: Path, size: int) -> Points:
-    """Places of some points that follow each other: from the middle, or the first ones where that cannot be found.
-
-    Raises one of UNREADABLE.
-    """
-    with open_points(path) as reader:
-        header = reader.header
-    with PointReader(path, Selection.XY_RETURNS_CHANNEL) as points:
-        if not has_varying_chunks(header):
-            points.go_to((header.point_count - min(size, header.point_count)) // 2)
-        return points.read(size)

@@ -31,15 +31,8 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import Carried
 from swath.daemon.processing.point_times import PointClock
 from swath.daemon.processing.quicklook.grids import Surface, cell_for, frame_of
-from swath.daemon.processing.quicklook.read import (
-    NOISE_CLASSES,
-    UNREADABLE,
-    PointReader,
-    QuickLookError,
-    Selection,
-    StripBook,
-    Units,
-)
+from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Selection
+from swath.daemon.processing.quicklook.read import NOISE_CLASSES, QuickLookError, StripBook, Units
 from swath.daemon.processing.quicklook.run import Look, StripFacts, look_at
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, TILE
 from swath.daemon.processing.strip_agreement import compare_flight, corners_of

@@ -43,6 +43,7 @@ from swath.georef.records import (
     Record,
     TimeMessage,
 )
+from swath.georef.timescales.gps_time import SECOND_NS
 
 Items: TypeAlias = list[Record | Row]
 
@@ -203,7 +204,7 @@ class SbfParser(StreamParser):
     def _named_second(self, stamp: Stamp, computed: bool) -> Items:
         """The whole second a solution names, once for all blocks of an epoch."""
         tag = stamp.tag()
-        if tag is None or tag.time_ns % records.NS_PER_S or stamp.epoch == self._last_named:
+        if tag is None or tag.time_ns % SECOND_NS or stamp.epoch == self._last_named:
             return []
         self._last_named, self._has_solutions = stamp.epoch, True
         valid = computed and self._trusted(stamp)
@@ -212,7 +213,7 @@ class SbfParser(StreamParser):
     def _meas_epoch(self, stamp: Stamp, frame: bytes) -> Items:
         """Name the whole second of raw measurements, in a stream for post-processing that holds no solution."""
         tag = stamp.tag()
-        if self._has_solutions or tag is None or tag.time_ns % records.NS_PER_S:
+        if self._has_solutions or tag is None or tag.time_ns % SECOND_NS:
             return []
         return [
             TimeMessage(stamp.host_time_ns, tag, NamesEdge.PREVIOUS, valid=stamp.week is not None, message=stamp.name)
