@@ -117,7 +117,7 @@ class Bench:
         self.session: Session = open_logs([log])[0]
         self.setup = Setup.of_log(self.session.attachments(), Options(crs=CRS, uncertainty=sigmas))
         self.clocks = read_clocks(self.session, self.setup)
-        buffer = TrajectoryBuffer(self.setup.ins_protocol, name="ins")
+        buffer = TrajectoryBuffer(self.setup.sources.ins_protocol, name="ins")
         buffer.append(self.clocks.ins_rows)
         self.trajectory = buffer.snapshot()
         assert self.setup.mapping is not None
@@ -140,7 +140,7 @@ class Bench:
 
     def decode(self) -> int:
         """All returns; how many."""
-        parsers, count = self.setup.parsers(("scanner",)), 0
+        parsers, count = self.setup.sources.parsers(("scanner",)), 0
         for batch in self.batches():
             parser = parsers[source_of_topic(batch.channel.topic) or ""]
             records = parser.feed_batch(ChunkBatch("bench", batch.log_time_ns, batch.units))

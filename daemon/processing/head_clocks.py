@@ -98,7 +98,9 @@ class _Reader:
         self.messages: dict[str, list[TimeMessage]] = {source: [] for source in plans}
         self.statuses: dict[str, list[DeviceStatus]] = {source: [] for source in plans}
         self._rows: dict[str, list[StructArray]] = {source: [] for source in plans}
-        self._parsers = {source: parser for source, parser in setup.scanner_time_parsers().items() if source in plans}
+        self._parsers = {
+            source: parser for source, parser in setup.sources.scanner_time_parsers().items() if source in plans
+        }
 
     def take(self, index: LogIndex, places: Sequence[ChunkPlace]) -> None:
         """Read chunks; what is damaged is told when the returns are read."""

@@ -218,7 +218,7 @@ def get_ready(setup: Setup) -> None:
 
 def warm_setup(setup: Setup) -> None:
     """Run once what one configuration needs; the setup itself is left as it is."""
-    if setup.imu_source is not None and setup.config.gnss:
+    if setup.sources.imu_source is not None and setup.config.gnss:
         warm_navigation()
     copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
     parsers = copy.parsers(("scanner",))
@@ -275,7 +275,7 @@ def _placed(setup: Setup) -> tuple[list[tuple[str, Points]], Trajectory | None]:
             clocks.add_message(source, TimeMessage(host_ns + 50_000_000, said, NamesEdge.PREVIOUS, bound=True))
         for source in clocks.host.plan.devices:
             clocks.add_samples(source, _device_clock(host_ns, passed_ns, second))
-        stream.path.add(setup.ins_rows(_solutions(setup, START_NS + passed_ns)))
+        stream.path.add(setup.sources.ins_rows(_solutions(setup, START_NS + passed_ns)))
         for name in stream.scanners:
             stream.add_returns(name, _returns(host_ns, passed_ns))
         placed += stream.advance(host_ns + SECOND_NS)

@@ -356,7 +356,7 @@ class TestStatus:
     ) -> None:
         """The receiver's own INS is what points come from here."""
         setup = flown.setup()
-        assert setup.ins_source is not None
+        assert setup.sources.ins_source is not None
         for name, one in setup.calibrations.items():
             setup.calibrations[name] = replaced(one, method="planes", header={"trajectory": made_with})
         session = LiveSession(setup, flown.session().info, tmp_path, LiveConfig(), None)

@@ -71,7 +71,7 @@ def test_each_scanner_has_its_geometry_calibration_and_gate(setup: Setup) -> Non
 
 
 def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
-    plan = setup.clock_plan(INFO)
+    plan = setup.sources.clock_plan(INFO)
     assert plan.host_minus_monotonic_ns == 3_000
     assert plan.pps == {"pps/main": PpsPlan(18, 0)}
     assert plan.gnss == {"gnss/rover": GnssPlan("pps/main", None, 18)}
@@ -90,11 +90,11 @@ def test_an_edge_named_by_hand_and_a_delay_reach_the_clocks(tmp_path: Path) -> N
 
 
 def test_sources_and_what_stands_inside_them(tmp_path: Path, setup: Setup) -> None:
-    assert setup.ins_source == "gnss/rover"
-    assert setup.ins_protocol == "novatel"
-    assert setup.inside("gnss/rover") == ["gnss/rover"]
-    assert setup.edge_of("pps/main") == "assert"
-    assert setup.edge_of("pps/other") is None
+    assert setup.sources.ins_source == "gnss/rover"
+    assert setup.sources.ins_protocol == "novatel"
+    assert setup.sources.inside("gnss/rover") == ["gnss/rover"]
+    assert setup.sources.edge_of("pps/main") == "assert"
+    assert setup.sources.edge_of("pps/other") is None
     text = AIRCRAFT.read_text()
     imu = text[text.index("[imu.main]") : text.index("[imu.main.noise]")]
     within = (
@@ -110,13 +110,13 @@ def test_the_attitude_of_an_ins_is_that_of_the_body(tmp_path: Path) -> None:
     setup = setup_of(config(tmp_path, **inside_the_receiver()))
     row = np.zeros(1, INS_DTYPE)
     row["roll_rad"], row["pitch_rad"], row["heading_rad"] = 0.1, -0.2, 1.0
-    turned = setup.ins_rows(row)[0]
+    turned = setup.sources.ins_rows(row)[0]
     told = Rotation.from_euler("ZYX", [1.0, -0.2, 0.1])
     got = Rotation.from_euler("ZYX", [turned["heading_rad"], turned["pitch_rad"], turned["roll_rad"]])
     rot_b_from_imu = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert (got.inv() * told * rot_b_from_imu.inv()).magnitude() < 1e-12
     # the same turn of the aircraft, seen by gyroscopes along the IMU's axes
-    assert setup.in_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
+    assert setup.sources.in_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
     assert row["roll_rad"][0] == 0.1
 
 
@@ -138,7 +138,7 @@ def test_a_setup_pickles(setup: Setup) -> None:
 def test_only_the_scanners_that_are_asked_for(tmp_path: Path) -> None:
     setup = setup_of(config(tmp_path), scanners=("top",))
     assert setup.scanners == ["top"]
-    assert list(setup.parsers(("scanner",))) == ["scanner/top"]
+    assert list(setup.sources.parsers(("scanner",))) == ["scanner/top"]
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def choose_trajectory(
     doubts: list[str] = []
     solutions: dict[str, int] = {}
     navigated: Navigated | None = None
-    both = setup.imu_source is not None and bool(setup.config.gnss)
+    both = setup.sources.imu_source is not None and bool(setup.config.gnss)
     offset = offset_of(wish.at, setup)
     try:
         if wish.file is None:
@@ -155,7 +155,7 @@ def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_sec
 
 def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str, int]]:
     """What the device's own INS said, and what became of its solutions."""
-    buffer = TrajectoryBuffer(setup.protocol(setup.ins_source), name=FROM_LOG)
+    buffer = TrajectoryBuffer(setup.sources.protocol(setup.sources.ins_source), name=FROM_LOG)
     buffer.append(clocks.ins_rows)
     solutions = buffer.snapshot().with_velocities()
     return solutions, {what: count for what, count in sorted(buffer.counts.items()) if count}
@@ -167,9 +167,9 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
     from swath.daemon.processing.navigation.navigate import NavigateWish, navigate_session
 
     log = session.parts[0].path
-    if setup.imu_source is None or not setup.config.gnss:
-        told = f"{setup.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"
-        missing = "no receiver" if setup.imu_source is not None else "no IMU"
+    if setup.sources.imu_source is None or not setup.config.gnss:
+        told = f"{setup.sources.ins_source}: its INS had no solution" if solutions else "no INS solution in the log"
+        missing = "no receiver" if setup.sources.imu_source is not None else "no IMU"
         raise UserError(f"{log}: {told}, and {missing} to make one; want --trajectory FILE", ExitCode.USAGE)
     try:
         return navigate_session(session, NavigateWish(InputWish(config=setup.config)))

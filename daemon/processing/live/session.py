@@ -77,14 +77,14 @@ class LiveSession:
     ) -> None:
         """``points``: where all points go, for comparisons; None: nowhere. Raises OSError, UserError."""
         self.info = info
-        source = "navigated" if setup.ins_source is None else "ins"
+        source = "navigated" if setup.sources.ins_source is None else "ins"
         self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
         self.now_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
         self._feed = LogFeed(setup, self._stream)
-        if setup.ins_source is None and self._feed.navigator is None:
+        if setup.sources.ins_source is None and self._feed.navigator is None:
             raise UserError(
                 f"{info.session_id}: no configured device tells its own INS solution, nor are there both an IMU and a "
                 "receiver to navigate by, and without a trajectory nothing is made while it is recorded; add them, or "

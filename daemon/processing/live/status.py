@@ -163,7 +163,7 @@ class LiveStatus:
     @property
     def _trajectory_source(self) -> str | None:
         """A receiver that could tell an INS solution and tells none is not whose it is."""
-        return self._setup.ins_source if self.navigation is None else "navigated"
+        return self._setup.sources.ins_source if self.navigation is None else "navigated"
 
     def _clock_states(self, now_ns: int) -> dict[str, Any]:
         host = self._stream.clocks.host

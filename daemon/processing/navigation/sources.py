@@ -16,8 +16,7 @@ from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.format import LogError, SessionInfo
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.setup.models import gimbal_sources
-from swath.daemon.processing.setup.setup import Options
-from swath.daemon.processing.setup.setup import Setup as PointSetup
+from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.driver import UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray
@@ -74,9 +73,9 @@ class NavigationSources:
         if receivers or gnss is not None or not outside:
             self.gnss_name = _chosen("gnss", gnss, list(config.gnss), receivers)
         table = {self.imu_name: config.imu[self.imu_name]}
-        self._points = PointSetup(without_scanners(config, imu=table), attachments, Options(uncertainty=False))
-        self.clock = self._points.clock_of_imu
-        self.ins_source = self._points.ins_source
+        self._devices = Sources(without_scanners(config, imu=table), attachments)
+        self.clock = self._devices.clock_of_imu
+        self.ins_source = self._devices.ins_source
 
     @property
     def imu(self) -> ImuConfig:
@@ -159,15 +158,15 @@ class NavigationSources:
 
     def inside(self, source: str) -> list[str]:
         """Sources whose messages stand in a wire's bytes."""
-        return self._points.inside(source)
+        return self._devices.inside(source)
 
     def edge_of(self, source: str) -> str | None:
         """Polarity of the edges of ``pps/name``; None: no such source."""
-        return self._points.edge_of(source)
+        return self._devices.edge_of(source)
 
     def clock_plan(self, info: SessionInfo) -> ClockPlan:
         """The clocks of a session; the IMU's own is kept beside them."""
-        plan = self._points.clock_plan(info)
+        plan = self._devices.clock_plan(info)
         devices = {} if self.clock is None else {self.imu_source: DevicePlan(self.clock)}
         return replace(plan, devices=devices)
 
@@ -180,7 +179,7 @@ class NavigationSources:
 
     def ins_rows_in_b(self, rows: NDArray[np.void]) -> NDArray[np.void]:
         """Solutions of the device's INS with the attitude of b."""
-        return self._points.ins_rows(rows)
+        return self._devices.ins_rows(rows)
 
     def setup(self, *, time_sigma_s: float = 0.0) -> Setup:
         """Lever arms, baseline and noise; ``time_sigma_s`` of the IMU's times, where an offset is to be found."""

@@ -65,16 +65,16 @@ class _ClockReader:
     """Collects what all but the scanners say."""
 
     def __init__(self, setup: Setup, session: Session, *, positions: bool) -> None:
-        self.host = HostClocks(setup.clock_plan(session.info), keep_history=True)
+        self.host = HostClocks(setup.sources.clock_plan(session.info), keep_history=True)
         self.fixes: dict[str, list[GnssFix]] = {}
         self._positions = positions
         self.ins: list[StructArray] = []
         self.imu: list[StructArray] = []
-        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.gimbal_sources}
+        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.sources.gimbal_sources}
         self.counts: dict[str, Counter[str]] = {}
         self.remarks: list[str] = []
         self._setup = setup
-        self._parsers = setup.parsers(("gnss", "imu"), whole=positions)
+        self._parsers = setup.sources.parsers(("gnss", "imu"), whole=positions)
         self._runs: dict[str, Run] = {}
 
     def take(self, batch: LogBatch) -> None:
@@ -85,12 +85,12 @@ class _ClockReader:
             for reading in readings_of(batch):
                 self.host.add_reading(*reading)
         elif source is not None and source.startswith("pps/"):
-            edge = self._setup.edge_of(source)
+            edge = self._setup.sources.edge_of(source)
             for found in edges_of(batch, edge) if edge is not None else ():
                 if found is not None:
                     self.host.add_edge(source, found)
         elif source is not None:  # its own order is enough: times are taken all at once
-            run = self._runs.setdefault(source, Run(partial(self._parse, self._setup.inside(source))))
+            run = self._runs.setdefault(source, Run(partial(self._parse, self._setup.sources.inside(source))))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
 
     def _parse(self, names: Iterable[str], batches: list[ChunkBatch]) -> None:
@@ -113,7 +113,7 @@ class _ClockReader:
         found: dict[str, AngleSeries] = {}
         for source, pieces in sorted(self.gimbals.items()):
             rows = np.concatenate(pieces) if pieces else np.empty(0, INS_DTYPE)
-            is_solution = SOLUTION_STATUS.get(self._setup.protocol(source))
+            is_solution = SOLUTION_STATUS.get(self._setup.sources.protocol(source))
             with suppress(MountError):  # fewer than two: who needs them says so
                 found[source] = AngleSeries.of_solutions(
                     rows if is_solution is None else rows[is_solution(rows["status"])]
@@ -128,11 +128,11 @@ class _ClockReader:
             counts[type(record).__name__] += 1 if rows is None else len(rows)
             if isinstance(record, TimeMessage) and source in self.host.plan.gnss:
                 self.host.add_message(source, record)
-            elif isinstance(record, InsSolution) and source == self._setup.ins_source:
+            elif isinstance(record, InsSolution) and source == self._setup.sources.ins_source:
                 self.ins.append(record.rows)
             elif isinstance(record, InsSolution) and source in self.gimbals:
                 self.gimbals[source].append(record.rows)
-            elif isinstance(record, ImuSamples) and source == self._setup.imu_source:
+            elif isinstance(record, ImuSamples) and source == self._setup.sources.imu_source:
                 self.imu.append(record.rows)
             elif isinstance(record, GnssFix) and self._positions:
                 self.fixes.setdefault(source, []).append(record)
@@ -148,16 +148,16 @@ def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> L
     for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
         reader.take(batch)
     reader.close()
-    ins = setup.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
+    ins = setup.sources.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
     imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
     gps_ns, rate_b, force_b = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
-    clock = setup.clock_of_imu
+    clock = setup.sources.clock_of_imu
     if len(imu) and clock is not None:
         gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
         known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock says nothing of a trajectory's
-        gps_ns, rate_b = gps_ns[known], setup.in_b(imu["angular_rate_b"][known])
+        gps_ns, rate_b = gps_ns[known], setup.sources.in_b(imu["angular_rate_b"][known])
         if positions:
-            force_b = setup.in_b(imu["specific_force_b"][known])
+            force_b = setup.sources.in_b(imu["specific_force_b"][known])
     host = FrozenClocks(reader.host)
     found = LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)
     found.remarks = reader.remarks

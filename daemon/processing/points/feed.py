@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.processing.navigation.live import Navigator, navigator_of
 from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.setup.models import connect
 from swath.daemon.processing.setup.setup import Setup
@@ -33,9 +33,6 @@ from swath.georef.records import (
 )
 from swath.georef.stream.stream import CONTEXT_FLAG, Stream
 from swath.georef.trajectory.buffer import SOLUTION_STATUS
-
-if TYPE_CHECKING:
-    from swath.daemon.processing.navigation.live import Navigator
 
 TICK_NS = 200_000_000
 TICK_BYTES = 32 << 20
@@ -62,10 +59,12 @@ class LogFeed:
         self.stream = stream
         self.counts: dict[str, Counter[str]] = {}
         self._setup = setup
-        self._parsers = setup.parsers(("gnss", "scanner")) | setup.ins_parser()
+        self._parsers = setup.sources.parsers(("gnss", "scanner")) | setup.sources.ins_parser()
         # of a growing log; until the device's own INS has a solution
-        self.navigator: Navigator | None = None if stream.clocks.frozen else setup.navigator(stream.clocks)
-        self._is_solution = SOLUTION_STATUS.get(setup.ins_protocol, _any_status)
+        self.navigator: Navigator | None = None
+        if not stream.clocks.frozen:
+            self.navigator = navigator_of(setup.config, setup.sources.attachments, stream.clocks)
+        self._is_solution = SOLUTION_STATUS.get(setup.sources.ins_protocol, _any_status)
         if self.navigator is not None:
             self._parsers |= self.navigator.parsers
         for name in stream.scanners:
@@ -164,9 +163,9 @@ class LogFeed:
         if source is None:
             return None
         if source.startswith("pps/"):
-            edge = self._setup.edge_of(source)
+            edge = self._setup.sources.edge_of(source)
             return None if edge is None else lambda batch: self._take_edges(source, edge, batch)
-        inside = [name for name in self._setup.inside(source.removesuffix("/aux")) if name in self._parsers]
+        inside = [name for name in self._setup.sources.inside(source.removesuffix("/aux")) if name in self._parsers]
         if not inside:
             return None
 
@@ -209,8 +208,8 @@ class LogFeed:
             elif isinstance(record, DeviceClockSamples) and source.removeprefix("scanner/") in self.stream.scanners:
                 if source in clocks.host.plan.devices:
                     clocks.add_samples(source, record.rows)
-            elif isinstance(record, InsSolution) and source == self._setup.ins_source:
-                self.stream.path.add(self._setup.ins_rows(record.rows))
+            elif isinstance(record, InsSolution) and source == self._setup.sources.ins_source:
+                self.stream.path.add(self._setup.sources.ins_rows(record.rows))
                 if self.navigator is not None and self._is_solution(record.rows["status"]).any():
                     self.navigator = None
             elif self.navigator is not None:

@@ -295,7 +295,7 @@ def _note_edge(result: JobResult, name: str, points: Points, setup: Setup, traje
 
 def _count(plan: SessionPlan, job: Job, result: JobResult, tell: Tell) -> None:
     """Returns between strips: decoded and counted, no more."""
-    parsers = plan.setup.parsers(("scanner",))
+    parsers = plan.setup.sources.parsers(("scanner",))
     counts = dict.fromkeys(parsers, 0)
     start_ns, end_ns = job.segment.start_ns, job.segment.end_ns
 

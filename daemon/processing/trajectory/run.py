@@ -206,11 +206,11 @@ def ins_as_is(session: Session, config: Config | None) -> AsIs:
         lines = [f"{log}: {line}" for line in error.message.splitlines()]
         raise UserError("\n".join(lines), error.exit_code) from error
     clocks = read_clocks(session, setup)
-    if setup.ins_source is None or not len(clocks.ins_rows):
+    if setup.sources.ins_source is None or not len(clocks.ins_rows):
         raise UserError(f"{log}: no INS solution in the log; without --ins as-is its IMU and GNSS are navigated")
-    buffer = TrajectoryBuffer(setup.ins_protocol, name=session.session_id)
+    buffer = TrajectoryBuffer(setup.sources.ins_protocol, name=session.session_id)
     buffer.append(clocks.ins_rows)
     trajectory = buffer.snapshot().with_velocities()
     if len(trajectory) < 2:
-        raise UserError(f"{log}: {setup.ins_source}: its INS had no solution")
-    return AsIs(setup.ins_source, trajectory, +Counter(buffer.counts), session_holes(session))
+        raise UserError(f"{log}: {setup.sources.ins_source}: its INS had no solution")
+    return AsIs(setup.sources.ins_source, trajectory, +Counter(buffer.counts), session_holes(session))

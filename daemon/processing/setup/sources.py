@@ -1,0 +1,210 @@
+"""Which devices a configuration names: their parsers and files, their clocks, and the axes of the IMU.
+
+Georeferencing and navigation share it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name, plain_table
+from swath.daemon.config.tables import GnssConfig, ImuConfig
+from swath.daemon.errors import ConfigError
+from swath.daemon.log.format import SessionInfo
+from swath.daemon.processing.setup.models import gimbal_sources
+from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError, Parser
+from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
+from swath.georef.records import InsSolution, NamesEdge, StructArray
+from swath.georef.stream.clocks import ClockPlan, DevicePlan, GnssPlan, PpsPlan
+from swath.georef.timescales import StampScale
+
+
+class Sources:
+    """The devices of one log; pickles.
+
+    Attributes:
+        config: of the log, or another one.
+        attachments: the files that the configuration names, by their names in a log.
+        scanners: names of those that are read.
+        gimbal_sources: who tells the angles of gimbals; they do not tell where the aircraft is.
+        ins_source: whose INS gives the growing trajectory: the first IMU whose protocol tells one, else the first
+            receiver; None: nobody's.
+    """
+
+    def __init__(self, config: Config, attachments: Mapping[str, bytes], scanners: Sequence[str] = ()) -> None:
+        """Find who tells what.
+
+        Raises:
+            ConfigError: a protocol is unknown.
+        """
+        self.config = config
+        self.attachments = dict(attachments)
+        self.scanners = list(scanners)
+        self.gimbal_sources = {source for name in self.scanners for _, source in gimbal_sources(config, name)}
+        self.ins_source = self._ins_source()
+
+    def _ins_source(self) -> str | None:
+        for wanted in ("imu", "gnss"):
+            for kind, name, table in self.config.device_tables():
+                source = f"{kind}/{name}"
+                if kind != wanted or source in self.gimbal_sources:
+                    continue
+                if InsSolution in self._driver(kind, name, table).yields:
+                    return source
+        return None
+
+    @property
+    def ins_protocol(self) -> str:
+        """Of `ins_source`; empty where there is none."""
+        return self.protocol(self.ins_source)
+
+    def protocol(self, source: str | None) -> str:
+        """Of ``gnss/name`` or ``imu/name``; empty of None."""
+        kind, _, name = (source or "").partition("/")
+        tables: Mapping[str, GnssConfig | ImuConfig] = self.config.imu if kind == "imu" else self.config.gnss
+        return tables[name].protocol if name else ""
+
+    @property
+    def imu_source(self) -> str | None:
+        """The first IMU of the aircraft."""
+        return next((source for name in self.config.imu if (source := f"imu/{name}") not in self.gimbal_sources), None)
+
+    @property
+    def clock_of_imu(self) -> str | None:
+        """The source that shows the host's time beside that IMU."""
+        source = self.imu_source
+        return None if source is None else self._clock_of(self.config.imu[source.removeprefix("imu/")].pps)
+
+    def edge_of(self, source: str) -> str | None:
+        """Polarity of the edges of ``pps/name``; None: no such source."""
+        pps = self.config.pps.get(source.removeprefix("pps/"))
+        return None if pps is None else pps.edge
+
+    def inside(self, source: str) -> list[str]:
+        """Sources whose messages stand in a wire's bytes: its own, and an IMU or INS inside a receiver's stream."""
+        kind, _, name = source.partition("/")
+        within = [f"imu/{imu}" for imu, table in self.config.imu.items() if table.transport == f"gnss:{name}"]
+        return [source, *(within if kind == "gnss" else [])]
+
+    def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
+        """New parsers of these kinds of sources, by source.
+
+        A receiver's gives times only unless its INS is wanted, or all that it says (``whole``).
+
+        Raises:
+            ConfigError: a driver cannot work with its settings.
+        """
+        made: dict[str, Parser] = {}
+        for kind, name, table in self.config.device_tables():
+            if kind not in kinds or (kind == "scanner" and name not in self.scanners):
+                continue
+            source = f"{kind}/{name}"
+            driver = self._driver(kind, name, table)
+            make = driver.make_parser
+            wanted = whole or source == self.ins_source or source in self.gimbal_sources
+            if kind == "gnss" and not wanted and driver.make_time_parser is not None:
+                make = driver.make_time_parser
+            try:
+                made[source] = make(DeviceSettings(source, plain_table(table), self.files(name, table), compiled=True))
+            except DriverSettingsError as error:
+                raise ConfigError(f"{kind}.{name}: {error}") from error
+        return made
+
+    def scanner_time_parsers(self) -> dict[str, Parser]:
+        """New parsers of what the scanners say of time, without returns, by source.
+
+        Raises:
+            ConfigError: a driver cannot work with its settings.
+        """
+        made: dict[str, Parser] = {}
+        for name in self.scanners:
+            table, source = self.config.scanner[name], f"scanner/{name}"
+            make = self._driver("scanner", name, table).make_time_parser
+            try:
+                if make is not None:
+                    made[source] = make(DeviceSettings(source, plain_table(table), self.files(name, table)))
+            except DriverSettingsError as error:
+                raise ConfigError(f"scanner.{name}: {error}") from error
+        return made
+
+    def ins_parser(self) -> dict[str, Parser]:
+        """Of an IMU that is the INS too, its parser; empty where a receiver's own stream tells the solutions."""
+        source = self.ins_source or ""
+        return {source: self.parsers(("imu",))[source]} if source.startswith("imu/") else {}
+
+    def files(self, name: str, table: DeviceTable) -> dict[str, bytes]:
+        """Return the files of a device that its parser reads, by their configuration's key."""
+        found: dict[str, bytes] = {}
+        for key, path in self.config.files_of(table).items():
+            stored = self._attachments.get(attachment_name(key, name, path))
+            if key in PARSER_FILES and stored is not None:
+                found[key] = stored
+        return found
+
+    def _driver(self, kind: DeviceKind, name: str, table: DeviceTable) -> Driver:
+        try:
+            return find_driver(kind, table.protocol)
+        except UnknownProtocolError as error:
+            raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
+
+    def clock_plan(self, info: SessionInfo) -> ClockPlan:
+        """The clocks of a session."""
+        config = self.config
+        said = {
+            gnss.pps: gnss.leap_seconds for gnss in config.gnss.values() if gnss.pps and gnss.leap_seconds is not None
+        }
+        devices: dict[str, DevicePlan] = {}
+        heads: dict[str, GnssPlan] = {}  # that say the time themselves, where nobody else does
+        for name in self.scanners:
+            table, source = config.scanner[name], f"scanner/{name}"
+            driver = find_driver("scanner", table.protocol)
+            clock = self._clock_of(table.pps)
+            if clock is None:
+                heads[source] = GnssPlan()
+            wanted = StampScale(table.clock) if driver.past_hour or not driver.line_scanner else None
+            devices[source] = DevicePlan(clock or source, driver.past_hour, wanted)
+        return ClockPlan(
+            host_minus_monotonic_ns=info.realtime_ns - info.monotonic_ns,
+            pps={f"pps/{name}": PpsPlan(said.get(name), pps.delay_ns) for name, pps in config.pps.items()},
+            gnss={
+                f"gnss/{name}": GnssPlan(
+                    f"pps/{gnss.pps}" if gnss.pps else None,
+                    None if gnss.names_edge == "auto" else NamesEdge(gnss.names_edge),
+                    gnss.leap_seconds,
+                )
+                for name, gnss in config.gnss.items()
+            }
+            | heads,
+            devices=devices,
+        )
+
+    def _clock_of(self, pps: str | None) -> str | None:
+        """The clock of a device: its pulse's; of one that has none, the host's by the first that there is."""
+        if pps is not None:
+            return f"pps/{pps}"
+        shown = [*(f"pps/{name}" for name in self.config.pps), *(f"gnss/{name}" for name in self.config.gnss)]
+        return shown[0] if shown else None
+
+    def ins_rows(self, rows: StructArray) -> StructArray:
+        """Solutions of the device's INS with the attitude of b instead of the IMU's own axes (``rotation_b_imu``)."""
+        rot_b_from_imu = self._rotation_b_imu(self.ins_source)
+        if np.array_equal(rot_b_from_imu, np.eye(3)):
+            return rows
+        turned = rows.copy()
+        rot_l_from_imu = rot_l_from_b(rows["roll_rad"], rows["pitch_rad"], rows["heading_rad"])
+        attitude = attitude_of(rot_l_from_imu @ rot_b_from_imu.T)
+        turned["roll_rad"], turned["pitch_rad"], turned["heading_rad"] = attitude
+        return turned
+
+    def in_b(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 3) turn rates or specific forces of the IMU along the axes of b."""
+        turned: NDArray[np.float64] = measured @ self._rotation_b_imu(self.imu_source).T
+        return turned
+
+    def _rotation_b_imu(self, source: str | None) -> NDArray[np.float64]:
+        imu = self.config.imu.get((source or "").removeprefix("imu/"))
+        return np.eye(3) if imu is None else np.array(imu.rotation_b_imu, dtype=np.float64)
