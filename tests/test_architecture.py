@@ -227,8 +227,8 @@ def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
     assert light["ignore_imports"] == [
         "swath.drivers.scanner.slots_compiled -> numba",
         "swath.daemon.simulate.plans -> swath.sim.**",
-        "swath.daemon.processing.calibration.plan -> swath.sim.**",
-        "swath.daemon.processing.calibration.plan_page -> swath.sim.**",
-        "swath.daemon.processing.calibration.plan_navigation -> swath.sim.**",
+        "swath.daemon.processing.calibration.plan.run -> swath.sim.**",
+        "swath.daemon.processing.calibration.plan.page -> swath.sim.**",
+        "swath.daemon.processing.calibration.plan.navigation -> swath.sim.**",
         *(f"swath.daemon.processing.** -> {name}" for name in processing),
     ]

@@ -15,7 +15,7 @@ from swath.daemon.processing.requirements import require_installed
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from swath.daemon.processing.calibration.plan import PlannedCalibration
+    from swath.daemon.processing.calibration.plan.run import PlannedCalibration
 
 
 def command(
@@ -47,8 +47,8 @@ def command(
     from rich.console import Console
 
     from swath.daemon.processing.calibration.model import model_of
-    from swath.daemon.processing.calibration.plan import PlanWish, plan_calibration
-    from swath.daemon.processing.calibration.plan_page import draw_planned, require_picture
+    from swath.daemon.processing.calibration.plan.page import draw_planned, require_picture
+    from swath.daemon.processing.calibration.plan.run import PlanWish, plan_calibration
     from swath.daemon.simulate.plans import Wish
 
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")

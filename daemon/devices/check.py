@@ -28,7 +28,7 @@ from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
 from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
-from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.opening import open_transport, parse_pps
 from swath.drivers.transports.spec import TransportSpec
 from swath.georef.records import ChunkBatch, TimeMessage

@@ -16,7 +16,7 @@ from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import read_clock_discipline
 from swath.daemon.log.parts import read_sign
-from swath.drivers.transports.can_bitrate import interface_bitrate
+from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.spec import TransportSpec
 from swath.drivers.transports.udp_socket import DEFAULT_BUFFER_MB
 

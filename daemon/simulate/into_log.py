@@ -28,7 +28,7 @@ from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from swath.daemon.log.session import session_name
 from swath.daemon.log.wires import SILENT_AFTER_S
 from swath.daemon.recorder.assembly import make_timekeeper
-from swath.daemon.recorder.process import CLOCK_PERIOD_S
+from swath.daemon.recorder.run import CLOCK_PERIOD_S
 from swath.daemon.simulate.flight import Flight, VirtualClock, VirtualUnit
 from swath.drivers.captures.base import Address
 from swath.drivers.transports.base import UnitBlock

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from swath.drivers.transports.base import PpsSource, Transport
-from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.can.socketcan import SocketCanTransport
 from swath.drivers.transports.ntrip import NtripTransport
 from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
@@ -35,7 +35,7 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
 def _open_can(spec: TransportSpec) -> Transport:
     if spec.interface == "socketcan":
         return SocketCanTransport(spec)
-    from swath.drivers.transports.can_adapter import PythonCanTransport
+    from swath.drivers.transports.can.adapter import PythonCanTransport
 
     return PythonCanTransport(spec)
 

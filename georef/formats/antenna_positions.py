@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from swath.georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
-from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
-from swath.georef.formats.trajectory_csv import is_csv
+from swath.georef.formats.trajectory.columns import Span, TrajectoryColumns, trajectory_of
+from swath.georef.formats.trajectory.csv import is_csv
 from swath.georef.formats.waypoint import is_waypoint, read_waypoint
 from swath.georef.text_encoding import decoded
 from swath.georef.trajectory.trajectory import DEFAULT_MAX_GAP_NS, TrajectoryError

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.text_times import clock_ns, gps_days, gps_ns_of_day, leap_seconds_on, weeks_ns
-from swath.georef.formats.trajectory_columns import TrajectoryColumns, unsaid
+from swath.georef.formats.trajectory.columns import TrajectoryColumns, unsaid
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.records import FixType, Int64Array
 from swath.georef.timescales.gps_time import DAY_NS, SECOND_NS

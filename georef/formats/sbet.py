@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
-from swath.georef.formats.trajectory_columns import (
+from swath.georef.formats.trajectory.columns import (
     Span,
     TrajectoryColumns,
     continuous_of_week,

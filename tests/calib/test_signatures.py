@@ -17,8 +17,8 @@ from swath.calib.strips.differences import differences
 from swath.calib.strips.effects import NAMES, SeenFrom, effect_columns
 from swath.calib.strips.signatures import Signature, record_of, signatures
 from swath.georef.arrays import FloatArray
-from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.csv import csv_text
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.geodesy.rotations import rot_x
 from swath.georef.scanner.jacobian import parameter_columns_e
 from swath.georef.scanner.mount import Mount, Stage

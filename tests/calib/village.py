@@ -13,7 +13,7 @@ from swath.daemon.processing.calibration.returns import read_flight
 from swath.daemon.processing.flights.read import Wish
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
 from swath.daemon.processing.setup.setup import Options
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.scanner.calibration import Calibration, read_calibration
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.short_flight import Flown, fly_short

@@ -13,7 +13,7 @@ from typing import Any
 import can
 
 from swath.drivers.can_frames import CAN_FRAME_BYTES
-from swath.drivers.transports.can_adapter import unpack_frame
+from swath.drivers.transports.can.adapter import unpack_frame
 
 ENTRY_POINT = "[can.interface]\nfaulty = tests.daemon.faulty_can:FaultyBus\n"
 

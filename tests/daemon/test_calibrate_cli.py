@@ -23,7 +23,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration import run as calibrate_run
 from swath.daemon.processing.calibration.model import model_of
-from swath.daemon.processing.calibration.plan import PlanWish, plan_calibration
+from swath.daemon.processing.calibration.plan.run import PlanWish, plan_calibration
 from swath.daemon.processing.calibration.run import refuse_no_planes
 from swath.daemon.processing.warm_up import warm_calibration
 from swath.georef.mapping.frame import Mapping

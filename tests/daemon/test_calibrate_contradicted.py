@@ -15,7 +15,7 @@ from swath.daemon.processing.calibration.run import Calibrated, CalibrateWish, c
 from swath.daemon.processing.flights.read import Wish
 from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
 from swath.daemon.processing.setup.setup import Options
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.calib.village import KNOWN, Made, village

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from swath.daemon.cli.main import run_app
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.file import read_trajectory
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]

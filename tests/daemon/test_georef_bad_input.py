@@ -21,7 +21,7 @@ from swath.daemon.processing.points.workers import _held_interrupts
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.unread import refused_by
 from swath.georef.formats.sbet import sbet_bytes
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.records import ChunkBatch
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.daemon.one_line import PLAN, Flown

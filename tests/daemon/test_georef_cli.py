@@ -19,7 +19,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.log.chunk_index import index_log
 from swath.daemon.log.reader import open_logs
 from swath.georef.formats.sbet import sbet_bytes
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.timescales.gps_time import DAY_NS
 from tests.daemon.one_line import Flown, fly
 

@@ -16,7 +16,7 @@ import pytest
 from pyproj import Transformer
 
 from swath.daemon.cli.main import run_app
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from tests.daemon.one_line import Flown, fly
 
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]

@@ -12,7 +12,7 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.fly import VirtualFlight, open_truth
 from swath.sim.plan.plan import parse_plan

@@ -24,10 +24,9 @@ from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.parts import Attachment, Parts
-from swath.daemon.recorder.health import a_restart_helps_nobody, sentence, stuck_threads
-from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared
+from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared, WireTrouble
+from swath.daemon.recorder.run import a_restart_helps_nobody, sentence, stuck_threads
 from swath.daemon.recorder.service_manager import ServiceManager
-from swath.daemon.recorder.wire_trouble import WireTrouble
 from swath.daemon.recorder.writer import Recorder, RecorderSettings, WriterHealth, Writing
 from swath.drivers.session import Session
 from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters

@@ -25,7 +25,7 @@ from swath.daemon.processing.quicklook.run import look_at, numbers_of
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.strip_agreement import before_and_after, difference_map
 from swath.daemon.processing.strips.inputs import strips_of_files, strips_of_flight
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.mapping.frame import Mapping
 from swath.georef.timescales.gps_time import WEEK_NS
 from tests.calib.cast_flight import Cast, cast_flight

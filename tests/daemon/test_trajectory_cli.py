@@ -16,7 +16,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.log.reader import open_logs
 from swath.daemon.processing.navigation.navigate import NavigateWish, attitude_of_text, navigate_session
 from swath.daemon.processing.trajectory.event_marks import PLACED
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.plan.plan import Plan, parse_plan
 from tests.daemon import short_flight

@@ -12,8 +12,8 @@ from swath.daemon.processing.files import PARTIAL, put_in_place
 from swath.daemon.processing.trajectory import files as trajectory_files
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, smrmsg_beside, write_trajectory
 from swath.georef.formats.sbet import sbet_bytes
-from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.csv import csv_text
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("kernels")

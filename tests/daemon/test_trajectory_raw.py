@@ -19,7 +19,7 @@ from swath.daemon.log.channels import JsonChannel
 from swath.daemon.processing.navigation.inputs import InputWish, read_inputs
 from swath.daemon.processing.navigation.times import imu_times, stretches
 from swath.drivers.gnss.novatel.encoder import encode_frame
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
 from swath.sim.gnss.novatel import NovatelMessages
 from tests.daemon.short_flight import Flown, errors, fly_short, post_processed, two_lines

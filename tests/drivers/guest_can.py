@@ -17,8 +17,8 @@ import pytest
 
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.transports.base import Transport, TransportError
-from swath.drivers.transports.can_bitrate import interface_bitrate
-from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.can.bitrate import interface_bitrate
+from swath.drivers.transports.can.socketcan import SocketCanTransport
 from swath.drivers.transports.spec import parse_transport
 
 

@@ -318,7 +318,7 @@ def test_every_file_of_the_collection_has_a_copy_or_says_why_not() -> None:
 MF4_FRAMES = """
 import json, sys
 from can.io.mf4 import MF4Reader
-from swath.drivers.transports.can_adapter import pack_frame
+from swath.drivers.transports.can.adapter import pack_frame
 
 with MF4Reader(sys.argv[1]) as messages:
     frames = [(round(one.timestamp * 1e6) * 1000, f"can{one.channel}", pack_frame(one).hex()) for one in messages]

@@ -17,9 +17,9 @@ import pytest
 
 from swath.drivers.can_frames import CANFD_BRS, CANFD_FDF, encode_can_frame
 from swath.drivers.transports.base import Transport, TransportError, UnitBlock
-from swath.drivers.transports.can_adapter import PythonCanTransport, pack_frame, unpack_frame
-from swath.drivers.transports.can_bitrate import bitrate_of_link, interface_bitrate
-from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.can.adapter import PythonCanTransport, pack_frame, unpack_frame
+from swath.drivers.transports.can.bitrate import bitrate_of_link, interface_bitrate
+from swath.drivers.transports.can.socketcan import SocketCanTransport
 from swath.drivers.transports.datagrams import MessageReader, ask_stamps
 from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import parse_transport

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from swath.drivers.transports.can_adapter import PythonCanTransport, keyword_value
-from swath.drivers.transports.can_socketcan import SocketCanTransport
+from swath.drivers.transports.can.adapter import PythonCanTransport, keyword_value
+from swath.drivers.transports.can.socketcan import SocketCanTransport
 from swath.drivers.transports.opening import open_transport, parse_pps
 from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport

@@ -18,8 +18,8 @@ from swath.daemon.processing.navigation.outside_positions import outside_observa
 from swath.daemon.processing.quicklook.product_facts import rows_of, warnings_in
 from swath.daemon.processing.strips.inputs import strips_of_files
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from swath.georef.formats.trajectory_csv import csv_text
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.csv import csv_text
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.mapping.frame import Mapping
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.fuzz.engine import Target

@@ -10,7 +10,7 @@ import pytest
 
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import sbet_bytes, smrmsg_bytes
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.georef.flown import SECOND, START_NS, WEEK, flown
 

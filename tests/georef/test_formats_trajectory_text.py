@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from swath.georef.formats.trajectory_csv import HEADER, csv_text
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.csv import HEADER, csv_text
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.geodesy.earth import prime_vertical_radius_m
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 from tests.georef.flown import SECOND, START_NS, WEEK, flown

@@ -12,7 +12,7 @@ import numpy as np
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.given_trajectory import Given, judge_given, points_of
 from swath.daemon.processing.trajectory.files import smrmsg_beside
-from swath.georef.formats.trajectory_file import read_trajectory
+from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.stream.path import SHORTEST_TRAJECTORY
 from swath.georef.strips import Span
 from swath.georef.trajectory.buffer import COLUMNS, TrajectoryBuffer

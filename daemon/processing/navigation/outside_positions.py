@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.navigation.observations import DEFAULT_SIGMAS, Observed
 from swath.georef.formats.antenna_positions import read_antenna_positions
-from swath.georef.formats.trajectory_columns import TrajectoryColumns
+from swath.georef.formats.trajectory.columns import TrajectoryColumns
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.filter.measurements import POSITION_FLOORS_M
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Kind, sort_observations

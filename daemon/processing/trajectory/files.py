@@ -16,7 +16,7 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.files import gone_on_failure, write_aside
 from swath.georef.arrays import FloatArray
 from swath.georef.formats.sbet import SBET_DOUBLES, SMRMSG_DOUBLES, sbet_bytes, smrmsg_bytes
-from swath.georef.formats.trajectory_csv import csv_text
+from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.timescales.gps_time import SECOND_NS, WEEK_NS, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory
 

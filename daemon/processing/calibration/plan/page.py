@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.calibration.plan import PlannedCalibration
+from swath.daemon.processing.calibration.plan.run import PlannedCalibration
 from swath.sim.preview.map import INK, MUTED, draw_map
 
 FORMATS = (".pdf", ".png", ".svg")

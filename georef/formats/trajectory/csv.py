@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
-from swath.georef.formats.trajectory_columns import TrajectoryColumns, unsaid
+from swath.georef.formats.trajectory.columns import TrajectoryColumns, unsaid
 from swath.georef.geodesy.earth import meridian_radius_m, prime_vertical_radius_m
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
 

@@ -20,7 +20,7 @@ from swath.calib.parameters import ParameterError, Wish
 from swath.calib.plan import Line, Predicted, Scan, Surface, planned, predict
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import of_parameters, tables_in_words
-from swath.daemon.processing.calibration.plan_navigation import navigated
+from swath.daemon.processing.calibration.plan.navigation import navigated
 from swath.daemon.processing.calibration.run import EVERY, PLANES
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.rotations import quaternion_from_rot

@@ -1,7 +1,7 @@
 """SocketCAN: a raw AF_CAN socket with kernel stamps, drop count, CAN FD and error frames.
 
 Bit rate and state belong to the system (``ip link``, systemd-networkd), not to a socket: see
-`swath.drivers.transports.can_bitrate` for what the interface says.
+`swath.drivers.transports.can.bitrate` for what the interface says.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ import numpy as np
 
 from swath.georef.formats.rtklib_pos import is_rtklib_pos, read_rtklib_pos
 from swath.georef.formats.sbet import SBET_BYTES, SMRMSG_BYTES, Sigmas, read_sbet, read_smrmsg
-from swath.georef.formats.trajectory_columns import Span, TrajectoryColumns, trajectory_of
-from swath.georef.formats.trajectory_csv import is_csv, read_csv
+from swath.georef.formats.trajectory.columns import Span, TrajectoryColumns, trajectory_of
+from swath.georef.formats.trajectory.csv import is_csv, read_csv
 from swath.georef.formats.waypoint import is_waypoint, read_waypoint
 from swath.georef.text_encoding import decoded, encoding_of
 from swath.georef.timescales.gps_time import SECOND_NS

@@ -1,0 +1,1 @@
+"""`swath plan-calibration`."""

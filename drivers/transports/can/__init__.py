@@ -1,0 +1,1 @@
+"""CAN buses: SocketCAN, python-can's adapters, and the bit rate of an interface."""
