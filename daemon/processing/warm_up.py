@@ -221,7 +221,7 @@ def warm_setup(setup: Setup) -> None:
     if setup.sources.imu_source is not None and setup.config.gnss:
         warm_navigation()
     copy: Setup = pickle.loads(pickle.dumps(setup))  # a frame settles what it does by its first points
-    parsers = copy.parsers(("scanner",))
+    parsers = copy.sources.parsers(("scanner",))
     for name in copy.scanners:
         parser = parsers[f"scanner/{name}"]
         for packets in _packets_for(parser, copy.config.scanner[name].protocol):

@@ -116,7 +116,7 @@ def test_what_of_a_directory_is_no_log_is_passed_over(
 def refused_alone(flown: Flown) -> dict[str, int]:
     """What a parser refuses that is given all of the log's datagrams at once."""
     (session,) = open_logs([flown.log])
-    parser = Setup.of_log(session.attachments(), Options(datum="same")).parsers(("scanner",))["scanner/left"]
+    parser = Setup.of_log(session.attachments(), Options(datum="same")).sources.parsers(("scanner",))["scanner/left"]
     for batch in session.batches(lambda topic: topic.startswith("/scanner/left")):
         parser.feed_batch(ChunkBatch("scanner/left", batch.log_time_ns, batch.units))
     return dict(refused_by(parser))

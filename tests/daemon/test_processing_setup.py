@@ -84,7 +84,7 @@ def test_clocks_are_those_of_the_recorder(setup: Setup) -> None:
 
 def test_an_edge_named_by_hand_and_a_delay_reach_the_clocks(tmp_path: Path) -> None:
     changed = config(tmp_path, **{'names_edge = "auto"': 'names_edge = "next"', "delay_ns = 0": "delay_ns = 70"})
-    plan = setup_of(changed).clock_plan(INFO)
+    plan = setup_of(changed).sources.clock_plan(INFO)
     assert plan.gnss["gnss/rover"].names_edge is NamesEdge.NEXT
     assert plan.pps["pps/main"].delay_ns == 70
 
@@ -100,7 +100,7 @@ def test_sources_and_what_stands_inside_them(tmp_path: Path, setup: Setup) -> No
     within = (
         '[imu.main]\ntransport = "gnss:rover"\nprotocol = "novatel"\nrotation_b_imu = [[0,1,0],[-1,0,0],[0,0,1]]\n\n'
     )
-    span = setup_of(config(tmp_path / "span", **{imu: within}))
+    span = setup_of(config(tmp_path / "span", **{imu: within})).sources
     assert span.ins_source == "imu/main"
     assert span.inside("gnss/rover") == ["gnss/rover", "imu/main"]
     assert list(span.ins_parser()) == ["imu/main"]

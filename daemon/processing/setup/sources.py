@@ -140,7 +140,7 @@ class Sources:
         """Return the files of a device that its parser reads, by their configuration's key."""
         found: dict[str, bytes] = {}
         for key, path in self.config.files_of(table).items():
-            stored = self._attachments.get(attachment_name(key, name, path))
+            stored = self.attachments.get(attachment_name(key, name, path))
             if key in PARSER_FILES and stored is not None:
                 found[key] = stored
         return found
