@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
     found: dict[str, Driver] = {}
     for info in sorted(pkgutil.iter_modules(package.__path__), key=lambda info: info.name):
         name = f"{info.name}.parser" if info.ispkg else info.name
+        if info.ispkg and importlib.util.find_spec(f"swath.drivers.{kind}.{name}") is None:
+            continue
         module = importlib.import_module(f"swath.drivers.{kind}.{name}")
         for driver in getattr(module, "DRIVERS", ()):
             if driver.protocol in found:

@@ -225,7 +225,7 @@ def test_few_modules_take_the_virtual_aircraft_into_the_daemon() -> None:
     )
     processing = ["swath.calib.**", "swath.georef.**", "laspy", "matplotlib", "numba", "pyproj", "scipy"]
     assert light["ignore_imports"] == [
-        "swath.drivers.scanner.slots_compiled -> numba",
+        "swath.drivers.scanner.rows.compiled -> numba",
         "swath.daemon.simulate.plans -> swath.sim.**",
         "swath.daemon.processing.calibration.plan.run -> swath.sim.**",
         "swath.daemon.processing.calibration.plan.page -> swath.sim.**",

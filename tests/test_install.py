@@ -104,7 +104,7 @@ def wants_an_extra(name: str) -> bool:
     _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    return name == "swath.drivers.scanner.slots_compiled" or name.startswith(
+    return name == "swath.drivers.scanner.rows.compiled" or name.startswith(
         ("swath.sim.", "swath.calib.", "swath.daemon.processing.")
     )
 

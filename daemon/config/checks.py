@@ -60,7 +60,7 @@ def check_devices(config: Config) -> list[str]:
 
 
 def _check_pps(config: Config) -> Iterator[str]:
-    from swath.drivers.transports.opening import parse_pps
+    from swath.drivers.transports.spec import parse_pps
 
     taken: dict[tuple[str, str], str] = {}
     for name, pps in config.pps.items():

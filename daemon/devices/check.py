@@ -29,8 +29,8 @@ from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
 from swath.drivers.transports.can.bitrate import interface_bitrate
-from swath.drivers.transports.opening import open_transport, parse_pps
-from swath.drivers.transports.spec import TransportSpec
+from swath.drivers.transports.opening import open_pps, open_transport
+from swath.drivers.transports.spec import TransportSpec, parse_pps
 from swath.georef.records import ChunkBatch, TimeMessage
 from swath.georef.timescales import ahead_s, distance_text
 
@@ -242,7 +242,7 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
 
 def check_pps(report: Report, edge: str, span: Span) -> None:
     """Count the edges of the PPS source that the report's protocol names."""
-    session: Session[RawEdge] = Session(lambda: parse_pps(report.protocol, edge=edge))
+    session: Session[RawEdge] = Session(lambda: open_pps(parse_pps(report.protocol, edge=edge)))
     edges: list[RawEdge] = []
     for got in span.listen(session):
         edges += got

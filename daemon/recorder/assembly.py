@@ -22,7 +22,8 @@ from swath.daemon.recorder.writer import Recorder, RecorderSettings
 from swath.drivers.driver import find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock
-from swath.drivers.transports.opening import open_transport, parse_pps
+from swath.drivers.transports.opening import open_pps, open_transport
+from swath.drivers.transports.spec import parse_pps
 from swath.georef.records import NamesEdge
 
 QUEUE_BYTES = 64 * 1024 * 1024  # 2.6 s of 20 000 datagrams of 1206 bytes: longer than a consumer SSD stalls
@@ -111,7 +112,7 @@ def _add_gnss_time(keeper: TimeKeeper, device: DeviceEntry, gnss: GnssConfig) ->
 def _add_pps(assembly: Assembly) -> None:
     for name, pps in assembly.config.pps.items():
         source = f"pps/{name}"
-        session = Session(lambda pps=pps: parse_pps(pps.source, edge=pps.edge))  # type: ignore[misc]
+        session = Session(lambda pps=pps: open_pps(parse_pps(pps.source, edge=pps.edge)))  # type: ignore[misc]
         edge_seen = assembly.timekeeper.edge_seen(source)
         overwrites = not pps.source.startswith("fixed:")
         receiver = PpsReceiver(name, session, assembly.shared, edge_seen, overwrites=overwrites)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.drivers.scanner.slots import (
+from swath.drivers.scanner.rows.slots import (
     BLOCK_SLOTS,
     Chosen,
     Fill,

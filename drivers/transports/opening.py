@@ -7,12 +7,12 @@ from collections.abc import Callable
 from swath.drivers.transports.base import PpsSource, Transport
 from swath.drivers.transports.can.socketcan import SocketCanTransport
 from swath.drivers.transports.ntrip import NtripTransport
-from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
+from swath.drivers.transports.pps.fixed import FixedPps
+from swath.drivers.transports.pps.kernel import KernelPps
+from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
-from swath.drivers.transports.spec import TransportSpec, refuse_unprintable
+from swath.drivers.transports.spec import PpsSpec, TransportSpec
 from swath.drivers.transports.udp_socket import UdpTransport
-
-PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 
 
 def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: False) -> Transport:
@@ -40,20 +40,10 @@ def _open_can(spec: TransportSpec) -> Transport:
     return PythonCanTransport(spec)
 
 
-def parse_pps(text: str, edge: str = "assert") -> PpsSource:
-    """The PPS source for ``text``, not yet opened.
-
-    Raises:
-        ValueError: one line naming what is wrong and what would be right.
-    """
-    refuse_unprintable("PPS source", text)
-    if edge not in ("assert", "clear"):
-        raise ValueError(f"PPS edge {edge!r}: want assert or clear")
-    kind, colon, path = text.partition(":")
-    if text.startswith("/"):
-        return KernelPps(text, edge)
-    if kind == "serial-dcd" and path.startswith("/"):
-        return SerialDcdPps(path, edge)
-    if kind == "fixed" and colon and path:
-        return FixedPps(path, edge)
-    raise ValueError(f"PPS source {text!r}: want {PPS_FORMS}")
+def open_pps(spec: PpsSpec) -> PpsSource:
+    """Return the source of edges for ``spec``, not yet opened."""
+    if spec.kind == "device":
+        return KernelPps(spec.path, spec.edge)
+    if spec.kind == "serial-dcd":
+        return SerialDcdPps(spec.path, spec.edge)
+    return FixedPps(spec.path, spec.edge)

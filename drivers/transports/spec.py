@@ -14,6 +14,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 FORMS = "serial:<path>, udp:<host>:<port>, can:<interface>:<channel>, gnss:<name> or ntrip:<host>:<port>/<mountpoint>"
 MAX_BUFFER_MB = 1023  # the kernel keeps twice the value in an int
 MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
@@ -308,3 +309,37 @@ _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "gnss": _check_gnss,
     "ntrip": _check_ntrip,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class PpsSpec:
+    """A source of pulse-per-second edges, as the configuration names it.
+
+    Attributes:
+        kind: "device" (the kernel's PPS API), "serial-dcd" or "fixed".
+        path: of the device, the serial port, or the file of edges.
+        edge: "assert" or "clear".
+    """
+
+    kind: str
+    path: str
+    edge: str
+
+
+def parse_pps(text: str, edge: str = "assert") -> PpsSpec:
+    """Parse the text of a PPS source.
+
+    Raises:
+        ValueError: one line naming what is wrong and what would be right.
+    """
+    refuse_unprintable("PPS source", text)
+    if edge not in ("assert", "clear"):
+        raise ValueError(f"PPS edge {edge!r}: want assert or clear")
+    kind, colon, path = text.partition(":")
+    if text.startswith("/"):
+        return PpsSpec("device", text, edge)
+    if kind == "serial-dcd" and path.startswith("/"):
+        return PpsSpec(kind, path, edge)
+    if kind == "fixed" and colon and path:
+        return PpsSpec(kind, path, edge)
+    raise ValueError(f"PPS source {text!r}: want {PPS_FORMS}")

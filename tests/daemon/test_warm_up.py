@@ -58,7 +58,7 @@ import numpy as np
 from swath.daemon.processing.live.grid import CountGrid
 from swath.daemon.processing.warm_up import WarmUp, cache_folder
 from tests.drivers.test_compiled import random_slots, returns_table
-from swath.drivers.scanner.slots_compiled import fill
+from swath.drivers.scanner.rows.compiled import fill
 
 grid = CountGrid(1.0)
 grid.add(np.zeros((3, 3)))

@@ -11,9 +11,9 @@ import pytest
 
 from swath.drivers.driver import Driver, all_drivers
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
-from swath.drivers.scanner.row_writer import filler
-from swath.drivers.scanner.slots import PairRule, ReturnSlots, common_words, in_order, returns_table
-from swath.drivers.scanner.slots_compiled import fill
+from swath.drivers.scanner.rows.compiled import fill
+from swath.drivers.scanner.rows.filler import filler
+from swath.drivers.scanner.rows.slots import PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.records import Record, ScannerReturns, StructArray
@@ -119,7 +119,7 @@ def test_any_pulses_give_the_same_rows(named: tuple[bool, bool] | None, seed: in
 
 
 def test_without_numba_one_line_says_what_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "swath.drivers.scanner.slots_compiled")
+    monkeypatch.delitem(sys.modules, "swath.drivers.scanner.rows.compiled")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(DriverSettingsError, match=r"wants numba: pip install '\.\[process\]'"):
         filler(compiled=True)

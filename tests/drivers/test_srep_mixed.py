@@ -11,8 +11,8 @@ import pytest
 from fastcrc.crc32 import iso_hdlc as crc32
 
 from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.rows.slots import ReturnSlots
 from swath.drivers.scanner.sequence import LATE_DATAGRAMS
-from swath.drivers.scanner.slots import ReturnSlots
 from swath.drivers.scanner.srep import parser as srep
 from swath.drivers.scanner.srep.layout import CRC, SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser

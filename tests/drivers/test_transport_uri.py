@@ -8,10 +8,12 @@ import pytest
 
 from swath.drivers.transports.can.adapter import PythonCanTransport, keyword_value
 from swath.drivers.transports.can.socketcan import SocketCanTransport
-from swath.drivers.transports.opening import open_transport, parse_pps
-from swath.drivers.transports.pps.kernel import FixedPps, KernelPps, SerialDcdPps
+from swath.drivers.transports.opening import open_pps, open_transport
+from swath.drivers.transports.pps.fixed import FixedPps
+from swath.drivers.transports.pps.kernel import KernelPps
+from swath.drivers.transports.pps.serial_dcd import SerialDcdPps
 from swath.drivers.transports.serial_port import SerialTransport
-from swath.drivers.transports.spec import parse_transport
+from swath.drivers.transports.spec import parse_pps, parse_transport
 from swath.drivers.transports.udp_socket import UdpTransport
 
 
@@ -115,9 +117,9 @@ def test_two_texts_for_one_device_are_the_same_device(tmp_path: Path) -> None:
 
 
 def test_pps_sources() -> None:
-    assert isinstance(parse_pps("/dev/pps0"), KernelPps)
-    assert isinstance(parse_pps("serial-dcd:/dev/ttyS0", edge="clear"), SerialDcdPps)
-    assert isinstance(parse_pps("fixed:edges.txt"), FixedPps)
+    assert isinstance(open_pps(parse_pps("/dev/pps0")), KernelPps)
+    assert isinstance(open_pps(parse_pps("serial-dcd:/dev/ttyS0", edge="clear")), SerialDcdPps)
+    assert isinstance(open_pps(parse_pps("fixed:edges.txt")), FixedPps)
 
 
 @pytest.mark.parametrize("text", ["", "pps0", "fixed:", "serial-dcd:ttyS0", "gpio:4"])

@@ -21,9 +21,9 @@ from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.hesai.gps import GPS_BYTES, NS, GpsReader
 from swath.drivers.scanner.hesai.heads import QT64, XT32, HesaiHead, read_angle_file
-from swath.drivers.scanner.row_writer import filler
+from swath.drivers.scanner.rows.filler import filler
+from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
-from swath.drivers.scanner.slots import Chosen
 from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.records import (

@@ -34,9 +34,9 @@ from swath.drivers.scanner.ouster.layout import (
     LidarLayout,
     crc_holds,
 )
-from swath.drivers.scanner.row_writer import filler
+from swath.drivers.scanner.rows.filler import filler
+from swath.drivers.scanner.rows.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
-from swath.drivers.scanner.slots import BLOCK_SLOTS, PairRule, ReturnSlots, common_words, in_order, returns_table
 from swath.georef.arrays import BoolArray
 from swath.georef.records import (
     DEVICE_CLOCK_DTYPE,

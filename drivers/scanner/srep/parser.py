@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser
-from swath.drivers.scanner.row_writer import filler
+from swath.drivers.scanner.rows.filler import filler
+from swath.drivers.scanner.rows.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, returns_table
 from swath.drivers.scanner.sequence import LATE_DATAGRAMS, SampleThinner, SequenceTracker
-from swath.drivers.scanner.slots import BLOCK_SLOTS, Chosen, ReturnSlots, common_words, returns_table
 from swath.drivers.scanner.srep.datagrams import Datagrams, clock_samples
 from swath.drivers.scanner.srep.layout import (
     CRC,

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from swath.drivers.driver import Driver
 from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable
-from swath.drivers.scanner.row_writer import filler
+from swath.drivers.scanner.rows.filler import filler
+from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner
-from swath.drivers.scanner.slots import Chosen
 from swath.drivers.scanner.spinning import Firings, returns_of_packets
 from swath.drivers.scanner.velodyne.calibration import read_calibration
 from swath.drivers.scanner.velodyne.heads import BLOCKS, HDL32E, PLACES, VLP16, VLP32C, VLS128, SpinningHead

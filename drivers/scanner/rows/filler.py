@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swath.drivers.extras import how_to_install
 from swath.drivers.parser import DriverSettingsError
-from swath.drivers.scanner.slots import Fill, ReturnSlots
+from swath.drivers.scanner.rows.slots import Fill, ReturnSlots
 
 
 def filler(*, compiled: bool) -> Fill:
@@ -16,7 +16,7 @@ def filler(*, compiled: bool) -> Fill:
     if not compiled:
         return ReturnSlots.fill
     try:
-        from swath.drivers.scanner.slots_compiled import fill
+        from swath.drivers.scanner.rows.compiled import fill
     except ImportError as error:
         raise DriverSettingsError(f"compiled decoding wants numba: {how_to_install('process')} ({error})") from error
     return fill

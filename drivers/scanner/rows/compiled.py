@@ -13,7 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from swath.drivers.scanner.slots import ReturnSlots
+from swath.drivers.scanner.rows.slots import ReturnSlots
 from swath.georef.records import RETURN_DTYPE, RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST, StructArray
 
 # A row's last word is written as one number, as `slots.common_words` begins it.

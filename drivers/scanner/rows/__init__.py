@@ -1,0 +1,1 @@
+"""Slots of returns, filled by NumPy or by compiled loops."""
