@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter, defaultdict
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 import swath
 
 ROOT = Path(__file__).resolve().parent.parent
+MOST_LINES = 600
+SMALL_LINES = 80
+MOST_MODULES = 20
 PACKAGES = ("daemon", "drivers", "georef", "calib", "sim")
 LARGEST_FILE_BYTES = 2_000_000
 LARGEST_CHECKOUT_BYTES = 60_000_000
 SHARED_OF_GEOREF = {
+    "swath.georef.arrays",
     "swath.georef.records",
     "swath.georef.text_encoding",
     "swath.georef.timescales",
@@ -108,13 +117,73 @@ def test_no_file_names_a_place_on_somebodys_computer() -> None:
         assert found is None, f"{path.relative_to(ROOT)}: {found.group().decode() if found else ''}"
 
 
-def test_modules_stay_readable_in_one_sitting() -> None:
-    lines = {
-        str(path.relative_to(ROOT)): path.read_text().count("\n")
-        for path in tracked()
-        if path.suffix == ".py" and path.relative_to(ROOT).parts[0] in PACKAGES
+def modules() -> dict[str, Path]:
+    """All modules of the packages, by name."""
+    return {
+        f"swath.{path.relative_to(ROOT).with_suffix('')}".replace("/", ".").removesuffix(".__init__"): path
+        for name in PACKAGES
+        for path in (ROOT / name).rglob("*.py")
     }
-    assert {name: count for name, count in lines.items() if count > 600} == {}
+
+
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    """By module, those of the packages that it imports, anywhere in it and for whatever purpose."""
+    known, found = modules(), {}
+    for name, path in known.items():
+        taken: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                taken |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                inside = {f"{node.module}.{alias.name}" for alias in node.names}
+                taken |= (inside & set(known)) or {node.module}
+        found[name] = (taken & set(known)) - {name}
+    return found
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    """Imports for type checkers only count too."""
+    try:
+        TopologicalSorter(imports()).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_files_are_rooms() -> None:
+    lines = {name: path.read_text().count("\n") for name, path in modules().items()}
+    assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
+
+
+def test_folders_are_subjects() -> None:
+    """Commands have a file each."""
+    folders = Counter(path.parent for path in modules().values() if path.stem != "__init__")
+    crowded = {str(folder.relative_to(ROOT)): count for folder, count in folders.items() if count > MOST_MODULES}
+    assert set(crowded) <= {"daemon/cli"}, crowded
+
+
+def test_a_prefix_that_three_files_share_is_a_folder() -> None:
+    families: dict[tuple[Path, str], set[str]] = defaultdict(set)
+    for path in modules().values():
+        if path.stem != "__init__":
+            families[path.parent, path.stem.split("_")[0]].add(path.stem)
+    assert [sorted(names) for names in families.values() if len(names) > 2] == []
+
+
+def test_a_small_module_that_one_other_uses_is_part_of_that_one() -> None:
+    """Unless the two stand in different packages, whose border lies between them."""
+    users: dict[str, set[str]] = defaultdict(set)
+    for name, taken in imports().items():
+        for one in taken:
+            users[one].add(name)
+    small = {
+        name: user
+        for name, path in modules().items()
+        if path.stem != "__init__" and path.read_text().count("\n") < SMALL_LINES and len(users[name]) == 1
+        for user in users[name]
+        if user.split(".")[1] == name.split(".")[1]
+    }
+    assert small == {}
 
 
 def test_every_device_has_a_page() -> None:
@@ -210,8 +279,8 @@ def test_importing_the_command_line_loads_nothing_of_processing_or_of_the_virtua
         "swath.daemon.cli.view",
         "swath.daemon.cli.warm_up",
     } <= set(commands)
-    flying = ("sim_plans", "sim_log", "sim_wire", "sim_ahead")
-    loaded = loaded_by(f"import {', '.join([*commands, *(f'swath.daemon.{name}' for name in flying)])}")
+    flying = ("plans", "into_log", "on_wires", "ahead")
+    loaded = loaded_by(f"import {', '.join([*commands, *(f'swath.daemon.simulate.{name}' for name in flying)])}")
     assert "swath.daemon" in loaded
     assert loaded & (PROCESSING_ONLY | {"swath.sim"}) == set()
 

@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 from pydantic import BaseModel
@@ -23,11 +23,9 @@ from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerCon
 from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DriverSettingsError
 from swath.drivers.startup import StartupWish
+from swath.drivers.transports.spec import TransportSpec, parse_pps, parse_transport
 from swath.georef.text_encoding import decoded
 from swath.georef.toml_tables import TomlError, toml_tables
-
-if TYPE_CHECKING:
-    from swath.drivers.transports.spec import TransportSpec
 
 CONVENTIONS_VERSION = 1
 METHODS = ("nominal", "planes", "tie_points", "profiles", "control", "combined")
@@ -60,8 +58,6 @@ def check_devices(config: Config) -> list[str]:
 
 
 def _check_pps(config: Config) -> Iterator[str]:
-    from swath.drivers.transports.spec import parse_pps
-
     taken: dict[tuple[str, str], str] = {}
     for name, pps in config.pps.items():
         key = f"pps.{name}.source"
@@ -189,8 +185,6 @@ def _described(model: type[BaseModel], key: str) -> str | None:
 
 
 def _check_transport(config: Config, section: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
-    from swath.drivers.transports.spec import parse_transport
-
     allowed = ", ".join(driver.transports)
     try:
         spec = parse_transport(table.transport)
@@ -280,8 +274,6 @@ def _check_wires(config: Config) -> Iterator[str]:
 
 
 def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
-    from swath.drivers.transports.spec import parse_transport
-
     for kind, name, table in config.device_tables():
         for key in ("transport", "auxiliary"):
             text = getattr(table, key, None)

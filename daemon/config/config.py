@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from swath.daemon.config.tables import (
     AtmosphereConfig,
@@ -23,9 +23,7 @@ from swath.daemon.config.tables import (
     Tables,
 )
 from swath.drivers.parser import DeviceKind, DeviceSettings
-
-if TYPE_CHECKING:
-    from swath.drivers.transports.spec import TransportSpec
+from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
@@ -161,8 +159,6 @@ class Config:
 
     def devices(self) -> Iterator[DeviceEntry]:
         """Every device: GNSS, IMU, scanners, corrections, in the order of the file."""
-        from swath.drivers.transports.spec import parse_transport
-
         for kind, name, table in self.device_tables():
             auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None
             yield DeviceEntry(
