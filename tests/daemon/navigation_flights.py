@@ -15,7 +15,7 @@ from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
 from swath.georef.navigation.inputs import GRADES, INNOVATION_DTYPE, Fate, Kind, Setup, Solution
 from swath.georef.records import FixType
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.georef.navigation.vehicles import collected
+from tests.georef.navigation.vehicles import flight_arrays
 
 Array = NDArray[Any]
 WEEK, WEEK_S = 2376, 604_800
@@ -27,7 +27,7 @@ SMOOTHER_SIGMA = np.array([0.003, 0.003, 0.005]), np.array([0.004, 0.004, 0.005]
 
 def reference_truth() -> Array:
     """Rows of the survey flight's truth."""
-    truth: Array = np.load(collected("reference_flight/tactical.npz"))["truth"]
+    truth: Array = flight_arrays("tactical")["truth"]
     return truth
 
 

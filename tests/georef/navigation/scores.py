@@ -13,7 +13,7 @@ from swath.georef.geodesy.quaternions import rotated
 from swath.georef.geodesy.rotations import rot_l_from_b
 from swath.georef.navigation.inputs import Solution, Start
 from swath.georef.records import StructArray
-from tests.georef.navigation.vehicles import BEGIN_NS, collected, ns
+from tests.georef.navigation.vehicles import BEGIN_NS, NAVIGATION, flight_arrays, ns
 
 LINES_S = (100_600.0, 101_550.0)
 
@@ -32,16 +32,14 @@ OUTAGES_M = {"tactical": (1.81, 0.090), "mems": (8.4, 0.31)}
 @cache
 def truth(name: str) -> FloatArray:
     """The truth's rows."""
-    with np.load(collected(f"reference_flight/{name}.npz")) as data:
-        rows: FloatArray = data["truth"]
+    rows: FloatArray = flight_arrays(name)["truth"]
     return rows
 
 
 @cache
 def outages(name: str) -> FloatArray:
     """(10, 2) s."""
-    with np.load(collected(f"reference_flight/{name}.npz")) as data:
-        spans: FloatArray = data["outages"]
+    spans: FloatArray = flight_arrays(name)["outages"]
     return spans
 
 
@@ -54,7 +52,7 @@ def without(rows: StructArray, spans_s: FloatArray) -> StructArray:
 
 def start_of(folder: str, name: str) -> Start:
     """The start that its description gives."""
-    about = json.loads(collected(f"{folder}/{name}.json").read_text())
+    about = json.loads((NAVIGATION / f"{folder}/{name}.json").read_text())
     lat, lon = np.radians(about["initpos"][:2])
     return Start(
         int(ns(about["starttime"])),

@@ -17,7 +17,7 @@ from swath.georef.navigation.solve import solve
 from swath.georef.records import FixType
 from tests.georef.navigation.flights import Fixes, drawn_start, errors, fly, noised, setup_for, survey
 from tests.georef.navigation.scores import flight_errors, of_maxima, off_fixes, rms, start_of, without
-from tests.georef.navigation.vehicles import car, collected, ns, reference
+from tests.georef.navigation.vehicles import FIXTURES, NAVIGATION, car, ns, reference
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -62,7 +62,7 @@ def ticking(inertial: Inertial) -> Inertial:
 
     imu.txt has them stretched by 292 ppm, 0.16 s over the drive, which makes of a constant offset one that grows.
     """
-    rows = np.loadtxt(collected("gnss_imu_drive/raw/imu_1934.csv"), delimiter=",", usecols=6)
+    rows = np.loadtxt(FIXTURES / "rtklib/imu_1934.csv.gz", delimiter=",", usecols=6)
     ticks = rows.astype(np.int64)[1 : 1 + len(inertial)]
     time_ns = inertial.time_ns[0] + 125_000_000 + (ticks - ticks[0]) * 1_000_000
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 10_000_000) / 1e9
@@ -119,7 +119,7 @@ def test_the_cars_outages_are_bridged_as_by_others(raw: bool, filtered_m: float,
     The published times stretch, which looks like positions that err twenty times as much as they are said to: no noise.
     """
     drive, start = car(), start_of("gnss_imu_drive", "meta")
-    fixes, spans = np.loadtxt(collected("gnss_imu_drive/gnss.txt")), np.loadtxt(collected("gnss_imu_drive/outages.txt"))
+    fixes, spans = (np.loadtxt(NAVIGATION / f"gnss_imu_drive/{name}.txt.xz") for name in ("gnss", "outages"))
     rows = without(drive.only(Kind.POSITION), spans)
     inertial, setup = drive.inertial, drive.setup
     if raw:

@@ -10,7 +10,7 @@ from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, Kind, sort_observations
 from swath.georef.navigation.stillness import SIGMA_MPS, still_seconds, with_still_seconds
 from swath.georef.timescales import SECOND_NS
-from tests.georef.navigation.vehicles import collected
+from tests.georef.navigation.vehicles import flight_arrays
 
 EPOCH_NS = 1_447_000_000 * SECOND_NS
 RATE_HZ = 100
@@ -91,7 +91,7 @@ def test_positions_tell_it_where_no_velocity_is_said(calm: tuple[NDArray[np.floa
 
 
 def test_the_reference_flight_stands_where_its_truth_does() -> None:
-    flight = np.load(collected("reference_flight/mems.npz"))
+    flight = flight_arrays("mems")
     time_ns = np.rint(flight["imu_t"] * 1e9).astype(np.int64)
     inertial = Inertial(
         time_ns,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ from swath.georef.records import FixType, StructArray
 from swath.sim.flight.trajectory import Trajectory
 from swath.sim.imu.sensors import error_matrix, true_increments
 
-NAVIGATION = Path(__file__).parents[4] / "shared" / "fixtures" / "navigation"
+FIXTURES = Path(__file__).parents[3] / "fixtures"
+NAVIGATION = FIXTURES / "navigation"
 BEGIN_NS = 2300 * 604_800 * 10**9
 
 
@@ -74,18 +76,22 @@ class Recording:
         return kept
 
 
-def collected(place: str) -> Path:
-    """A file or a folder of the collection; says so where that is not there."""
-    path = NAVIGATION / place
-    assert path.exists(), f"{path} is not here: these tests read the recordings of ../shared/fixtures/navigation"
-    return path
+@cache
+def flight_arrays(name: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the survey flight with a "tactical" or "mems" unit, from planes of bytes (see SOURCE.md)."""
+    kinds = {"imu_dtheta": np.float32, "imu_dv": np.float32}
+    found = {}
+    with np.load(NAVIGATION / f"reference_flight/{name}.npz") as planes:
+        for key in planes.files:
+            rows = np.ascontiguousarray(planes[key].T).view(kinds.get(key, np.float64))
+            found[key] = rows[:, 0] if rows.shape[1] == 1 else rows
+    return found
 
 
 @cache
 def reference(name: str) -> Recording:
     """The survey flight with a "tactical" or "mems" unit."""
-    folder = collected("reference_flight")
-    data, about = np.load(folder / f"{name}.npz"), json.loads((folder / f"{name}.json").read_text())
+    data, about = flight_arrays(name), json.loads((NAVIGATION / f"reference_flight/{name}.json").read_text())
     time_ns = ns(data["imu_t"])
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 5_000_000) / 1e9
     fixes, speeds, truth = data["gnss"], data["gnss_velocity"], data["truth"]
@@ -113,8 +119,8 @@ def reference(name: str) -> Recording:
 @cache
 def car() -> Recording:
     """A real drive; attitude unknown."""
-    folder = collected("gnss_imu_drive")
-    imu, fixes, speeds = (np.loadtxt(folder / f"{name}.txt") for name in ("imu", "gnss", "gnssvel"))
+    folder = NAVIGATION / "gnss_imu_drive"
+    imu, fixes, speeds = (np.loadtxt(folder / f"{name}.txt.xz") for name in ("imu", "gnss", "gnssvel"))
     about = json.loads((folder / "meta.json").read_text())
     time_ns = ns(imu[:, 0])
     interval_s = np.diff(time_ns, prepend=time_ns[0] - 10_000_000) / 1e9
@@ -135,7 +141,7 @@ def uav() -> Recording:
     """A real flight of a small aeroplane with single-frequency GPS; its own filter's attitude serves as truth."""
     from scipy.io import loadmat
 
-    path = collected("umn_thor75/thor75.mat")
+    path = NAVIGATION / "umn_thor75/thor75.mat"
     data = loadmat(path, squeeze_me=True, struct_as_record=False)["flight_data"]
     new = np.flatnonzero(np.diff(data.GPS_TOW) != 0) + 1
     new = new[np.abs(data.lat[new]) > 1.0]

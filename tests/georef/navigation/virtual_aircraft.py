@@ -33,7 +33,7 @@ RATE_HZ = 200
 LIKELY = (0.005, 0.995)
 LASTING_H = 1e4  # a bias that lasts so long is constant
 
-# The sensors of ../shared/fixtures/navigation/reference_flight; accelerometers' mGal in mg
+# The sensors of fixtures/navigation/reference_flight; accelerometers' mGal in mg
 REFERENCE = {
     "tactical": ImuNoiseTable(
         angle_random_walk_deg_per_sqrt_h=0.04, velocity_random_walk_m_per_s_per_sqrt_h=0.03,
