@@ -28,7 +28,7 @@ from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
 from swath.calib.outcome import Adjusted
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from swath.daemon.system import keep_freed_memory
 from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
@@ -121,7 +121,7 @@ def cpu(work: Any) -> tuple[float, Any]:
 def measure(flight: Flight, features: Features) -> Figures:
     """All figures."""
     prior = gauss_markov(flight, Taus(), 5.0)
-    wish = Wish("full", priors=PRIORS)
+    wish = ParameterOptions("full", priors=PRIORS)
     part = Features(tuple(replace(plane, patches=plane.patches[:2]) for plane in features.planes[:4]))
     adjust(flight, part, wish, prior)  # compiles
     rows = Rows(flight, features.planes, unknowns(flight, wish), prior)

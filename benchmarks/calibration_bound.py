@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.daemon.processing.calibration.returns import read_flight
 from swath.daemon.processing.calibration.run import prior_of
-from swath.daemon.processing.flights.read import Wish as Logs
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions as Logs
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.arrays import FloatArray, IntArray
 from swath.georef.scanner.uncertainty import Noise
@@ -215,7 +215,7 @@ def bounds(folder: Path, every: int, tell: Callable[[str], None] = print) -> dic
     """Return sigmas by model and whether planes are known, in the units of `UNITS`."""
     options = Options(datum="same", uncertainty=False)
     with tempfile.TemporaryDirectory(prefix="swath-bound-") as work:
-        wish = Logs([folder], Path(work), TrajectoryWish(navigate=True), options)
+        wish = Logs([folder], Path(work), TrajectoryOptions(navigate=True), options)
         kept = read_flight(wish, Path(work), lambda *_: None)
         (head,) = kept.flight.heads
         prior = prior_of(kept)

@@ -27,7 +27,7 @@ from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.outcome import Adjusted
-from swath.calib.parameters import INSTALLED, MODELS, Wish, unknowns
+from swath.calib.parameters import INSTALLED, MODELS, ParameterOptions, unknowns
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, nominal
 from tests.calib.roofs import LINES, Line, Made, made, roofs, trajectory
 from tests.calib.test_rows import shifted
@@ -126,7 +126,7 @@ def flight_of(case: Case) -> tuple[Made, Features]:
     base = made(lines=lines, planes=planes, points=2, seed=case.seed)
     flight = replace(base.flight, trajectories=(told,))
     prior = gauss_markov(flight, Taus(), 4.0)
-    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, Wish()), prior))
+    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, ParameterOptions()), prior))
     draw = np.linalg.cholesky(prior.covariance) @ rng.normal(size=len(prior.covariance))
     true = shifted(told, prior, weight.to_e(draw[:, np.newaxis]).reshape(-1, 6))
     start = nominal("left", base.flight.heads[0].start.lever_arm_b, np.eye(3))
@@ -156,7 +156,7 @@ def offsets_of(case: Case) -> list[Offset]:
     built, features = flight_of(case)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     try:
-        found = adjust(built.flight, features, Wish(case.model), prior, Settings(huber=0.0, family=0.0))
+        found = adjust(built.flight, features, ParameterOptions(case.model), prior, Settings(huber=0.0, family=0.0))
     except NormalError:
         return []
     return normalised(case, built, found)

@@ -21,20 +21,20 @@ from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Knots, TrajectoryPrior, apply, from_smoother, knots_of
 from swath.calib.features import Features, Patch, Plane
 from swath.calib.flight import Flight, Swath
-from swath.calib.parameters import MODELS, Wish
+from swath.calib.parameters import MODELS, ParameterOptions
 from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import thinned
 from swath.calib.planes.search import find_planes
 from swath.daemon.processing.calibration.returns import KNOT_S, read_flight, replaced
-from swath.daemon.processing.flights.read import Wish as Logs
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions as Logs
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.arrays import FloatArray
 from swath.georef.navigation.cross_covariance import ErrorChain
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration, read_calibration
 
-MODEL = Wish("scanner")
+MODEL = ParameterOptions("scanner")
 SETTINGS = Settings(huber=0.0, family=0.0)  # there are no blunders
 MOST_POINTS = 2000  # of a plane in a strip that are drawn from
 NODE_S = 0.02  # closer than the smoother's nodes, so that each is taken
@@ -96,7 +96,7 @@ def read_reference(folder: Path, work: Path, rows: int, workers: int) -> tuple[R
         The reference, and the lower root (6k, 6k) of the nodes' joint covariance.
     """
     options = Options(datum="same", uncertainty=False)
-    wish = Logs([folder], work, TrajectoryWish(navigate=True), options, workers=workers)
+    wish = Logs([folder], work, TrajectoryOptions(navigate=True), options, workers=workers)
     kept = read_flight(wish, work, lambda *_: None)
     (head,) = kept.flight.heads
     told = read_calibration((folder / f"{head.name}.true.toml").read_text("utf-8"), "truth")

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.georef_log import CRS, ONE_HEAD, POINT_BYTES, Bench, compress, fly
-from swath.daemon.processing.flights.read import Wish
+from swath.daemon.processing.flights.read import GeorefOptions
 from swath.daemon.processing.georeferencing.run import georeference
 from swath.daemon.processing.setup.setup import Options
 from swath.daemon.system import keep_freed_memory
@@ -69,7 +69,7 @@ def strips_of(bench: Bench, path: Path) -> Path:
 def run(log: Path, strips: Path, folder: Path, workers: int, *, sigmas: bool, laszip: float) -> Run:
     """Georeference the log."""
     options = Options(crs=CRS, uncertainty=sigmas)
-    wish = Wish(
+    wish = GeorefOptions(
         [log], folder / "out", options=options, strips=str(strips), workers=workers, sigmas=sigmas, overwrite=True
     )
     before, start = _cpu_seconds(), time.perf_counter()

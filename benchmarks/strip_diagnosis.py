@@ -31,8 +31,8 @@ from swath.calib.strips.differences import differences
 from swath.calib.strips.effects import NAMES, SeenFrom
 from swath.calib.strips.signatures import signatures
 from swath.daemon.processing.calibration.returns import read_flight, smoothed_prior
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import Calibration
@@ -51,7 +51,9 @@ def prior_of(folder: Path) -> TrajectoryPrior:
     made = village(folder, prf_hz=2_000.0, lines=(0, 1, 2, 3))
     work = folder / "navigated"
     work.mkdir()
-    wish = Wish([made.flown.log], work, TrajectoryWish(navigate=True), Options(datum="same", uncertainty=False))
+    wish = GeorefOptions(
+        [made.flown.log], work, TrajectoryOptions(navigate=True), Options(datum="same", uncertainty=False)
+    )
     prior = smoothed_prior(read_flight(wish, work, lambda *_: None))
     assert prior is not None
     return prior

@@ -31,7 +31,7 @@ from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted, Considered
-from swath.calib.parameters import Unknowns, Wish, unknowns
+from swath.calib.parameters import ParameterOptions, Unknowns, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import PARAMETERS, Calibration
 
@@ -49,7 +49,7 @@ _NO_PRIOR = (
 def adjust(
     flight: Flight,
     features: Features,
-    wish: Wish,
+    wish: ParameterOptions,
     prior: TrajectoryPrior | None = None,
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,
@@ -103,7 +103,7 @@ def adjust(
 def predict(
     flight: Flight,
     features: Features,
-    wish: Wish,
+    wish: ParameterOptions,
     prior: TrajectoryPrior | None = None,
     settings: Settings = AS_USUAL,
     start: Mapping[str, Calibration] | None = None,

@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from swath.calib.outcome import Held
+from swath.calib.outcome import FixedParameter
 from swath.georef.scanner.calibration import PARAMETERS
 
 MINUS, THIN, SPACE = "−", "\u202f", "\u00a0"  # spaces at which no line ends
@@ -84,7 +84,7 @@ def plain(text: str, *, several: bool) -> str:
     return _NAMED.sub(lambda found: words_of(found[1], found[2], several=several), text)
 
 
-def is_undetermined(held: Held) -> bool:
+def is_undetermined(held: FixedParameter) -> bool:
     """Held because the flight does not tell it, not because the user said so."""
     return bool(held.remedy or held.with_others)
 

@@ -13,7 +13,7 @@ from swath.georef.scanner.calibration import Calibration
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class FixedParameter:
     """A parameter of the model that was not estimated.
 
     Attributes:
@@ -173,7 +173,7 @@ class Adjusted:
     sigmas: FloatArray
     prior_sigmas: FloatArray
     correlation: FloatArray
-    held: tuple[Held, ...]
+    held: tuple[FixedParameter, ...]
     trajectory: TrajectoryFit | None
     residuals: tuple[Residuals, ...]
     groups: tuple[GroupFit, ...]

@@ -14,7 +14,7 @@ import numpy as np
 
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots, curve, nodes_of
-from swath.calib.outcome import Held
+from swath.calib.outcome import FixedParameter
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.beams import OusterGeometry, SpinningGeometry
@@ -43,7 +43,7 @@ class ParameterError(ValueError):
 
 
 @dataclass(frozen=True)
-class Wish:
+class ParameterOptions:
     """What is to be estimated. Names are SI ones, of all scanners (``phi_rad``) or of one (``left.phi_rad``).
 
     What is said of one scanner's parameter stands above what is said of all; of the same name `fix` counts first.
@@ -117,7 +117,7 @@ class Unknowns:
 
     base: tuple[Calibration, ...]
     items: tuple[Unknown, ...]
-    held: tuple[Held, ...] = ()
+    held: tuple[FixedParameter, ...] = ()
     knots: FloatArray = field(default_factory=lambda: np.zeros(0))
     smoothness_m: float = 0.02
     considered: tuple[Unknown, ...] = ()
@@ -154,7 +154,7 @@ class Unknowns:
         arguments = [self.items[index].argument for index in at]
         return np.array(at, dtype=np.int64), np.array(kinds, dtype=np.int64), np.array(arguments, dtype=np.int64)
 
-    def without(self, names: frozenset[str], held: Sequence[Held] = ()) -> Unknowns:
+    def without(self, names: frozenset[str], held: Sequence[FixedParameter] = ()) -> Unknowns:
         """Return the same, some of them held at their start."""
         items = tuple(item for item in self.items if item.name not in names)
         gone = tuple(item for item in self.items if item.name in names and item.plausible > 0.0)
@@ -265,7 +265,7 @@ class Unknowns:
 
 def unknowns(
     flight: Flight,
-    wish: Wish,
+    wish: ParameterOptions,
     start: Mapping[str, Calibration] | None = None,
     first: Mapping[str, Calibration] | None = None,
     doubted: Mapping[str, float] | None = None,
@@ -299,13 +299,13 @@ def unknowns(
             if plausible > 0.0:
                 considered.append(known)
             if name in MODELS[wish.model] or _asked(head, name, wish) == "fix":
-                held.append(Held(head.name, name, word))
+                held.append(FixedParameter(head.name, name, word))
         items += _extras(index, head, base, wish)
     knots = np.array(wish.ibrc_knots, dtype=np.float64)
     return Unknowns(tuple(bases), tuple(items), tuple(held), knots, wish.ibrc_smoothness_m, tuple(considered))
 
 
-def _asked(head: Head, name: str, wish: Wish) -> str:
+def _asked(head: Head, name: str, wish: ParameterOptions) -> str:
     """``fix``, ``free``, ``prior`` or nothing: what is said of it on this head, else on all."""
     for key in (f"{head.name}.{name}", name):
         for word, names in (("fix", wish.fix), ("prior", wish.priors), ("free", wish.free)):
@@ -314,13 +314,13 @@ def _asked(head: Head, name: str, wish: Wish) -> str:
     return ""
 
 
-def _prior(head: Head, name: str, wish: Wish) -> float:
+def _prior(head: Head, name: str, wish: ParameterOptions) -> float:
     if _asked(head, name, wish) == "free":
         return np.inf
     return wish.priors.get(f"{head.name}.{name}", wish.priors.get(name, np.inf))
 
 
-def _word(head: Head, name: str, wish: Wish) -> str | None:
+def _word(head: Head, name: str, wish: ParameterOptions) -> str | None:
     """Why a parameter is not estimated; None: it is."""
     asked = _asked(head, name, wish)
     if name in head.geometry.without:
@@ -336,7 +336,7 @@ def _word(head: Head, name: str, wish: Wish) -> str | None:
     return None if name in MODELS[wish.model] else "not in the model"
 
 
-def _plausible(head: Head, base: Calibration, name: str, wish: Wish) -> float:
+def _plausible(head: Head, base: Calibration, name: str, wish: ParameterOptions) -> float:
     """Return one sigma, SI, by which a parameter may be wrong while it is held; 0: not at all.
 
     The user's word counts first, then what an earlier calibration found, then what is plausible. By convention the scan
@@ -357,7 +357,7 @@ def _plausible(head: Head, base: Calibration, name: str, wish: Wish) -> float:
     return INSTALLED.get(name, 0.0)
 
 
-def _extras(index: int, head: Head, base: Calibration, wish: Wish) -> Iterator[Unknown]:
+def _extras(index: int, head: Head, base: Calibration, wish: ParameterOptions) -> Iterator[Unknown]:
     for kind, word, numbers in (
         (SLOT, "range_offset_slot", wish.range_offset_slots),
         (ZONE, "range_offset_zone", wish.range_offset_zones),
@@ -397,14 +397,14 @@ def _put_offset(offsets: list[RangeOffset], item: Unknown, value: float) -> None
     offsets[:] = [row for row in offsets if not _is_own(row, item.kind, item.argument)] + [own]
 
 
-def _reference(wish: Wish) -> int:
+def _reference(wish: ParameterOptions) -> int:
     """Index of the knot whose correction is 0."""
     if wish.ibrc_reference is None:
         return len(wish.ibrc_knots) // 2
     return int(np.argmin(np.abs(np.array(wish.ibrc_knots) - wish.ibrc_reference)))
 
 
-def _with_knots(calibration: Calibration, wish: Wish) -> Calibration:
+def _with_knots(calibration: Calibration, wish: ParameterOptions) -> Calibration:
     """With the correction by intensity at the wish's knots, 0 at the reference; what that takes goes to the offset."""
     if not wish.ibrc_knots:
         return calibration
@@ -417,7 +417,7 @@ def _with_knots(calibration: Calibration, wish: Wish) -> Calibration:
     return replace(moved, ibrc=(knots, values - away))
 
 
-def check_scanners(scanners: Sequence[str], wish: Wish) -> None:
+def check_scanners(scanners: Sequence[str], wish: ParameterOptions) -> None:
     """Raise ParameterError where a wish names a scanner that is none of these, by name."""
     for name in sorted({*wish.fix, *wish.free, *wish.priors}):
         scanner, dot, _ = name.partition(".")
@@ -425,7 +425,7 @@ def check_scanners(scanners: Sequence[str], wish: Wish) -> None:
             raise ParameterError(f"parameters of {scanner}: no such scanner in this flight, but {', '.join(scanners)}")
 
 
-def check_wish(flight: Flight, wish: Wish) -> None:
+def check_wish(flight: Flight, wish: ParameterOptions) -> None:
     """Raise ParameterError where a wish names what there is not, or says what cannot be; before anything lasts long."""
     if wish.model not in MODELS:
         raise ParameterError(f"model: got {wish.model!r}, want one of {', '.join(MODELS)}")

@@ -19,8 +19,8 @@ from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features, Patch, Plane
 from swath.calib.flight import Flight, FlightError, Head, Swath, Tangent
-from swath.calib.outcome import Held
-from swath.calib.parameters import Wish
+from swath.calib.outcome import FixedParameter
+from swath.calib.parameters import ParameterOptions
 from swath.calib.planes.cells import CELL_SHORT_M, CELL_SIZES_M
 from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.returns import RIM_M
@@ -127,7 +127,7 @@ class Predicted:
     names: tuple[str, ...]
     sigmas: FloatArray
     correlation: FloatArray
-    held: tuple[Held, ...]
+    held: tuple[FixedParameter, ...]
     planes: int
     returns: int
 
@@ -197,7 +197,11 @@ def search_cell_m(scan: Scan, per_m2: FloatArray, speed_mps: float) -> float:
 
 
 def predict(
-    flight: Flight, features: Features, wish: Wish, prior: TrajectoryPrior | None, settings: Settings = AS_USUAL
+    flight: Flight,
+    features: Features,
+    wish: ParameterOptions,
+    prior: TrajectoryPrior | None,
+    settings: Settings = AS_USUAL,
 ) -> Predicted:
     """Sigmas and what is held, by the adjustment's own equations.
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from demo.proof import Show
 from swath.daemon.simulate.ahead import Ahead
 from swath.daemon.simulate.on_wires import own_wires
-from swath.daemon.simulate.plans import Wish, configuration, make_flight_in_time
+from swath.daemon.simulate.plans import FlightOptions, configuration, make_flight_in_time
 
 PLAN = "small"
 WHAT = {
@@ -27,14 +27,14 @@ REMARK = (
 
 def take_off(seconds: float) -> Ahead:
     """Begin to make the flight, in a process of its own."""
-    return Ahead(partial(make_flight_in_time, Wish(PLAN, seconds=seconds)))
+    return Ahead(partial(make_flight_in_time, FlightOptions(PLAN, seconds=seconds)))
 
 
 def prepare(console: Console, folder: Path, ahead: Ahead) -> Show:
     """Write the configuration and the files that it names."""
     with console.status("getting the virtual aircraft ready (the first time, it is compiled)"):
         facts = ahead.facts
-    plan = Wish(PLAN).load()
+    plan = FlightOptions(PLAN).load()
     folder.mkdir(parents=True, exist_ok=True)
     wires = own_wires(folder, facts.sources, {f"gnss/{name}": table.baud for name, table in plan.tables.gnss.items()})
     for name, data in (facts.files | {"swath.toml": configuration(plan, wires, "logs")}).items():

@@ -14,7 +14,7 @@ from swath.drivers.parser import DeviceKind, DeviceSettings, Parser
 from swath.georef.records import NamesEdge
 
 if TYPE_CHECKING:
-    from swath.drivers.startup import StartupMessage, StartupWish
+    from swath.drivers.startup import StartupMessage, StartupOptions
 
 TransportKind = Literal["serial", "can", "udp", "gnss", "ntrip"]
 
@@ -98,4 +98,4 @@ class Driver:
     wavelength_nm: float | None = None
     eight_bit_intensity: bool = False
     past_hour: bool = False
-    startup: Callable[[DeviceSettings, StartupWish], tuple[StartupMessage, ...]] | None = None
+    startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None

@@ -79,7 +79,7 @@ class StartupMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class StartupWish:
+class StartupOptions:
     """What of a set-up is said when it is asked for, not in the configuration.
 
     Attributes:

@@ -35,13 +35,13 @@ def _digest(folder: Path) -> int:
     return digest
 
 
-def kernel(function: Compiled) -> Compiled:
+def jit_inline(function: Compiled) -> Compiled:
     """Compile a function into those that call it; x / 0 is infinite, which spares a branch."""
     compiled: Compiled = _njit(forceinline=True, nogil=True, error_model="numpy")(function)
     return compiled
 
 
-def kept(function: Compiled) -> Compiled:
+def jit_cached(function: Compiled) -> Compiled:
     """Compile an outermost function, and keep it on disk.
 
     Numba takes it for the same by the age of its own file, though kernels of others are compiled into it: the digest of

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import ByteArray, FloatArray
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points, Rays, contiguous
 from swath.georef.records import Int64Array, StructArray
@@ -147,7 +147,7 @@ class Georeferencer:
         return rays.points_e, np.sqrt(rays.covariance_e[:, [0, 3, 5]]).astype(np.float32)
 
 
-@kept
+@jit_cached
 def fill_columns(
     rows: StructArray, time_ns: Int64Array, off_nadir_rad: FloatArray, range_m: FloatArray, to: PointColumns
 ) -> None:

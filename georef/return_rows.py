@@ -29,12 +29,12 @@ def any_has(rows: StructArray, name: str, bits: int) -> bool:
     return bool((rows[name] & bits == bits).any())
 
 
-def taken(rows: StructArray, mask: NDArray[np.bool_]) -> StructArray:
+def take(rows: StructArray, mask: NDArray[np.bool_]) -> StructArray:
     """The rows of a mask."""
     return words(rows).take(np.flatnonzero(mask), axis=0).view(RETURN_DTYPE).reshape(-1)
 
 
-def joined(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
+def concatenate(pieces: list[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
     """One after the other; a single one as it is, for it holds many bytes; none as an empty array like another."""
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
@@ -53,7 +53,7 @@ def compact(rows: StructArray) -> StructArray:
 
 
 @dataclass(slots=True)
-class Held:
+class WaitingReturns:
     """Returns that came to wait at one tick; their times where those are known."""
 
     rows: StructArray
@@ -61,7 +61,7 @@ class Held:
     time_ns: Int64Array
 
 
-def split(held: Held, mask: NDArray[np.bool_]) -> tuple[list[Held], list[Held]]:
+def split_at(held: WaitingReturns, mask: NDArray[np.bool_]) -> tuple[list[WaitingReturns], list[WaitingReturns]]:
     """Those of the mask, and the others, each in order; nothing is copied where the others follow in one piece."""
     count = int(np.count_nonzero(mask))
     if count == len(mask):
@@ -71,12 +71,12 @@ def split(held: Held, mask: NDArray[np.bool_]) -> tuple[list[Held], list[Held]]:
     if mask[:count].all():
         parts = [(held.rows[part], held.time_ns[part]) for part in (slice(count), slice(count, None))]
     else:
-        parts = [(taken(held.rows, part), held.time_ns[part]) for part in (mask, ~mask)]
-    one, other = (Held(rows, held.since_ns, time_ns) for rows, time_ns in parts)
+        parts = [(take(held.rows, part), held.time_ns[part]) for part in (mask, ~mask)]
+    one, other = (WaitingReturns(rows, held.since_ns, time_ns) for rows, time_ns in parts)
     return [one], [other]
 
 
-def beyond(queue: deque[Held], max_rows: int) -> list[Held]:
+def after(queue: deque[WaitingReturns], max_rows: int) -> list[WaitingReturns]:
     """Taken from the queue: the oldest, until no more than so many rows are left."""
     rows, oldest = sum(len(held.rows) for held in queue), []
     while rows > max_rows:

@@ -22,14 +22,14 @@ _make_array: Any = arrayobj.make_array
 _null: Any = cgutils.get_null_value
 
 
-def kernel(function: Compiled) -> Compiled:
+def jit_inline(function: Compiled) -> Compiled:
     """Compile a function into those that call it: no way in from Python; x / 0 is infinite, which spares a branch."""
     options = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     compiled: Compiled = _njit(forceinline=True, **options)(function)
     return compiled
 
 
-def kept(function: Compiled) -> Compiled:
+def jit_cached(function: Compiled) -> Compiled:
     """Compile an outermost function, and keep it on disk.
 
     Numba knows it again by the age of its file and by what its closure holds: `digest` there stands for other files.

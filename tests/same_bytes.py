@@ -140,7 +140,7 @@ def made_by(commit: Commit, flight: Flight, folder: Path) -> dict[str, str]:
     commit.run("sim", "fly", flight.preset, "--seconds", f"{flight.seconds:g}", "-o", str(flown))
     found = {f"flight/{name}": digest for name, digest in digests(flown).items()}
     found |= {f"replay{topic}": digest for topic, digest in delivered(commit, flown, folder / "replay").items()}
-    commit.run("georef", str(flown), "-o", str(products / "points"), "--crs", CRS, usable=False)
+    commit.run("georef", str(flown), "-o", str(products / "points"), "--crs", CRS, "--strips", "whole", usable=False)
     commit.run("trajectory", str(flown), "-o", str(products / "trajectory"), usable=False)
     commit.run("view", str(products / "points"), "-o", str(products / "view"), usable=False)
     if flight.calibrates:
@@ -157,7 +157,7 @@ def main() -> int:
     options = parser.parse_args()
     different = 0
     with tempfile.TemporaryDirectory() as name:
-        commits = []
+        commits: list[Commit] = []
         for one in (options.before, options.after):
             (Path(name) / str(len(commits))).mkdir()
             commits.append(Commit(one, Path(name) / str(len(commits))))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.calib.equations.tables import Beam, Head, Looks, Sigmas
+from swath.calib.equations.tables import Beam, Head, RowDiagnostics, Sigmas
 from swath.calib.flight import Flight, Swath
 from swath.calib.intensity_curve import at_knots, curve_by_knots
 from swath.calib.parameters import Unknowns
@@ -25,9 +25,9 @@ SECOND_NS = 1e9
 TRACKED = ("time_ns", "position_e", "q_e_from_b", "position_sigma_l", "attitude_sigma_rad")
 
 
-def new_looks(count: int, cofactor: FloatArray, design: FloatArray) -> Looks:
+def new_looks(count: int, cofactor: FloatArray, design: FloatArray) -> RowDiagnostics:
     """Room for what is seen of n rows."""
-    return Looks(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), cofactor, design)
+    return RowDiagnostics(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), cofactor, design)
 
 
 def writeable(trajectory: Trajectory) -> Trajectory:

@@ -14,7 +14,7 @@ import numpy as np
 
 from swath.calib.equations.tables import OF_PLANE, STATES, Beam, Head, Knots, Planes, Sigmas, Task
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.vectors import cross, dot, matrix_at, plus, rot_of, times, transposed_times, vector_at
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import INDEX
@@ -41,7 +41,7 @@ NORMAL, BORE, BODY, BODY_E, ALONG, BY_ANGLE, BY_TILT, SHARE, MISCLOSURE, VARIANC
 SPEED, TURNED, PLACE, RANGING, LONGER, AHEAD, COMMON, ROWS = 18, 19, 20, 23, 24, 25, 26, 27
 
 
-@kernel
+@jit_inline
 def geometry(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: Planes, at: int, states: bool) -> None:
     """What the columns are made of."""
     normal, centre = vector_at(planes.normal_e, at), vector_at(planes.centre_e, at)
@@ -76,7 +76,7 @@ def geometry(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: 
             cells[BODY_E, i], cells[BODY_E + 1, i], cells[BODY_E + 2, i] = turned
 
 
-@kernel
+@jit_inline
 def speeds(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: Three) -> None:
     """Speed of the body along the normal."""
     epoch = -1
@@ -90,7 +90,7 @@ def speeds(cells: FloatArray, n: int, k: int, beam: Beam, track: Track, normal: 
         cells[SPEED, i] = speed
 
 
-@kernel
+@jit_inline
 def turnings(cells: FloatArray, n: int, k: int, beam: Beam, track: Track) -> None:
     """Speed along the normal of the point by the body's turning."""
     for i in range(n):
@@ -101,7 +101,7 @@ def turnings(cells: FloatArray, n: int, k: int, beam: Beam, track: Track) -> Non
         cells[TURNED, i] = turned * (_LATER / (track.time_ns[at + 1] - track.time_ns[at]))
 
 
-@kernel
+@jit_inline
 def own_variance(cells: FloatArray, n: int, k: int, beam: Beam, head: Head) -> None:
     """M of range, footprint, scan angle and time (FORMULAS 6.2)."""
     longer, wider = 1.0 + head.value[SCALE], 1.0 + head.value[ENCODER_SCALE]
@@ -116,7 +116,7 @@ def own_variance(cells: FloatArray, n: int, k: int, beam: Beam, head: Head) -> N
         cells[VARIANCE, i] = along * along * ranging + turned * turned + later * later
 
 
-@kernel
+@jit_inline
 def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, planes: Planes, at: int) -> None:
     """Points as adjusted, l − Σ Bᵀ f / M in range and scan angle (FORMULAS 6.3), for all that columns are made of.
 
@@ -160,7 +160,7 @@ def adjust_observations(cells: FloatArray, n: int, k: int, beam: Beam, head: Hea
         cells[PLACE + 1, i] -= dot(second, moved)
 
 
-@kernel
+@jit_inline
 def flown_variance(
     cells: FloatArray, n: int, k: int, beam: Beam, sigmas: Sigmas, normal: Three, rot_l_from_e: FloatArray
 ) -> None:
@@ -183,7 +183,7 @@ def flown_variance(
         cells[VARIANCE, i] += shifted + rolled * rolled + pitched * pitched + headed * headed
 
 
-@kernel
+@jit_inline
 def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) -> float:
     """A row (d,) of a table at its nodes (d,), linear between them, level beyond the ends."""
     last = len(nodes) - 1
@@ -196,7 +196,7 @@ def between(nodes: FloatArray, value: FloatArray, row: int, intensity: float) ->
     return float(value[row, at] + share * (value[row, at + 1] - value[row, at]))
 
 
-@kernel
+@jit_inline
 def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, argument: int) -> float:
     """Column of what is no parameter of the model."""
     row, along = beam.rows[j], cells[ALONG, i]
@@ -222,7 +222,7 @@ def extra(cells: FloatArray, i: int, j: int, beam: Beam, head: Head, kind: int, 
     return float(length * dot(normal, plus(spin, -sine, u)) / math.sqrt(1.0 - sine * sine))
 
 
-@kernel
+@jit_inline
 def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int, argument: int, out: Any) -> None:
     """One parameter's column (FORMULAS 5.2), as `swath.georef.scanner.jacobian.parameter_columns_e`."""
     outer, value = matrix_at(head.outer, 0), head.value
@@ -277,7 +277,7 @@ def column(cells: FloatArray, n: int, k: int, beam: Beam, head: Head, kind: int,
             out[i] = extra(cells, i, k + i, beam, head, kind, argument)
 
 
-@kernel
+@jit_inline
 def share_of(knots: Knots, before: int, after: int, t: int) -> float:
     """Where between its knots; 0 where there is one."""
     if after == before:
@@ -285,7 +285,7 @@ def share_of(knots: Knots, before: int, after: int, t: int) -> float:
     return float((t - knots.time_ns[before]) / (knots.time_ns[after] - knots.time_ns[before]))
 
 
-@kernel
+@jit_inline
 def states_now(
     cells: FloatArray, n: int, k: int, beam: Beam, knots: Knots, before: int, after: int, normal: Three
 ) -> None:
@@ -302,7 +302,7 @@ def states_now(
         cells[MISCLOSURE, i] += (1.0 - share) * (shift + dot(turn, by)) + share * (shifted + dot(turned, by))
 
 
-@kernel
+@jit_inline
 def walked(cells: FloatArray, n: int, walk: float) -> None:
     """Variance of f by what the attitude does between knots: a bridge's, from one to the other."""
     for i in range(n):
@@ -310,7 +310,7 @@ def walked(cells: FloatArray, n: int, walk: float) -> None:
         cells[COMMON, i] = share * (1.0 - share) * walk * dot(by, by) if walk > 0.0 else 0.0
 
 
-@kernel
+@jit_inline
 def of_states(cells: FloatArray, n: int, panel: FloatArray, c: int) -> None:
     """The eight columns of the states, from column c on."""
     for i in range(n):
@@ -322,7 +322,7 @@ def of_states(cells: FloatArray, n: int, panel: FloatArray, c: int) -> None:
         panel[c + 5, i], panel[c + 6, i], panel[c + 7, i] = share * x, share * y, share * z
 
 
-@kept
+@jit_cached
 def fill(
     cells: FloatArray,
     panel: FloatArray,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.calib.labels import sized
-from swath.calib.outcome import Held
+from swath.calib.outcome import FixedParameter
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
 
@@ -177,7 +177,7 @@ def decide(
     names: Sequence[str],
     prior_sigmas: FloatArray | None = None,
     rules: Rules = RULES_OF_ALL,
-) -> tuple[tuple[Held, ...], dict[str, float]]:
+) -> tuple[tuple[FixedParameter, ...], dict[str, float]]:
     """Return which unknowns are to be held, and which are to be estimated with their start as an observation.
 
     The worst is held and all is reckoned anew, until every other is determined; at last those that are determined
@@ -241,7 +241,7 @@ class _Case:
             if self._determined(active, self._figures(active)[0]).all():
                 del self.partner[at]
 
-    def told(self, at: int) -> Held:
+    def told(self, at: int) -> FixedParameter:
         """In words, beside what it was given up for: where that is held as well, it alone would look determined."""
         free, other = set(self._active()), at
         while other in self.partner and other not in free:
@@ -257,7 +257,7 @@ class _Case:
         scanner, _, name = self._names[at].partition(".")
         found = float(sigma[here] * self._size[at]) if sigma[here] < NOTHING else np.inf
         others = [other for other, _ in alike]
-        return Held(scanner, name, self._why(at, found, alike), self._remedy(at, others), found, alike)
+        return FixedParameter(scanner, name, self._why(at, found, alike), self._remedy(at, others), found, alike)
 
     def _active(self) -> list[int]:
         return [at for at in range(len(self._names)) if at not in self.partner]

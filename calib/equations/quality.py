@@ -3,7 +3,7 @@
 Residuals are those of the misclosures, e = −(w + A δ) at the last linearisation; r = 1 − A Q Aᵀ / M with the cofactors
 of parameters, trajectory states and features together (Baarda 1968; Förstner 1979 for groups). M is all that a return
 errs by, also what it has in common with the others of its moment; what of A Q Aᵀ counts then is said in
-`swath.calib.equations.sums.look`.
+`swath.calib.equations.sums.inspect`.
 """
 
 from __future__ import annotations

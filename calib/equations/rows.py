@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from swath.calib.equations.inputs import beam_table, head_table, new_looks, rays_of, sigmas_of, track_of, writeable
-from swath.calib.equations.sums import MODE_GIVE, MODE_LOOK, MODE_SUM, go_over
-from swath.calib.equations.tables import OF_PLANE, STATES, Looks, Sigmas, Sums, Task
+from swath.calib.equations.sums import MODE_GIVE, MODE_LOOK, MODE_SUM, accumulate
+from swath.calib.equations.tables import OF_PLANE, STATES, RowDiagnostics, Sigmas, Sums, Task
 from swath.calib.equations.tables import Beam as BeamTable
 from swath.calib.equations.tables import Groups as GroupTable
 from swath.calib.equations.tables import Knots as KnotTable
@@ -37,7 +37,7 @@ from swath.georef.scanner.sensor_model import SensorModel
 BATCH = 16_384  # returns placed at once: what is known of them stays in the second cache
 SECOND_NS = 1e9
 _NO_SIGMAS = Sigmas(np.zeros((0, 3)), np.zeros((0, 3)))
-_NO_LOOKS = Looks(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
+_NO_LOOKS = RowDiagnostics(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,13 +182,13 @@ class Rows:
         sums = self._new_sums()
         for batch, task in self._tasks(state):
             mine = weight[batch.begin : batch.begin + batch.size].astype(np.float64)
-            go_over(MODE_SUM, task, mine, float(huber), sums, _NO_LOOKS)
+            accumulate(MODE_SUM, task, mine, float(huber), sums, _NO_LOOKS)
         return sums
 
     def looks(
         self, state: State, cofactors: Any = None, weight: SingleArray | None = None
-    ) -> Iterator[tuple[Batch, Looks]]:
-        """Batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.equations.sums.look` has them).
+    ) -> Iterator[tuple[Batch, RowDiagnostics]]:
+        """Batch by batch f and M of each row, and A Q Aᵀ (as `swath.calib.equations.sums.inspect` has them).
 
         Args:
             state: at which.
@@ -206,7 +206,7 @@ class Rows:
             mode = MODE_GIVE if cofactors is None else MODE_LOOK
             mine = slice(batch.begin, batch.begin + batch.size)
             kept = np.ones(batch.size) if weight is None else weight[mine].astype(np.float64)
-            go_over(mode, task, kept, 0.0, sums, looks)
+            accumulate(mode, task, kept, 0.0, sums, looks)
             yield batch, looks
 
     def placed(self, state: State) -> Iterator[BeamTable]:

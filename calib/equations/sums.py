@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from swath.calib.equations.kernels import ALONG, AZIMUTH, COMMON, MISCLOSURE, ROWS, SPEED, VARIANCE, fill
-from swath.calib.equations.tables import OF_PLANE, STATES, Groups, Head, Knots, Looks, Sums, Task
+from swath.calib.equations.tables import OF_PLANE, STATES, Groups, Head, Knots, RowDiagnostics, Sums, Task
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel, whole
+from swath.georef.compiled import jit_cached, jit_inline, whole
 from swath.georef.geodesy.vectors import vector_at
 from swath.georef.records import Int64Array
 from swath.georef.scanner.kernels.types import Three
@@ -19,7 +19,7 @@ PIECE = 256  # returns at once
 MODE_SUM, MODE_LOOK, MODE_GIVE = whole(0), whole(1), whole(2)
 
 
-@kernel
+@jit_inline
 def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, together: float) -> tuple[float, int]:
     """Rows times √(weight / (M + n c)); Huber's weight by f / √(M + c) where asked for (> 0). Returns Σ p f², how many
     count.
@@ -41,7 +41,7 @@ def weigh(cells: FloatArray, panel: FloatArray, weight: Any, huber: float, toget
     return total, count
 
 
-@kernel
+@jit_inline
 def add_up(total: FloatArray, more: FloatArray) -> None:
     """Elementwise."""
     for i in range(len(total)):
@@ -49,7 +49,7 @@ def add_up(total: FloatArray, more: FloatArray) -> None:
             total[i, j] += more[i, j]
 
 
-@kernel
+@jit_inline
 def spread_out(head: Head, knots: Knots, active: Int64Array, normal: Three, groups: Groups, g: int, table: Any) -> int:
     """Unknowns behind a group's columns: their number; in ``table`` where they stand, in the plane's list, whence."""
     to, place, source, factor = table
@@ -72,7 +72,7 @@ def spread_out(head: Head, knots: Knots, active: Int64Array, normal: Three, grou
     return m
 
 
-@kernel
+@jit_inline
 def put(sums: Sums, total: FloatArray, table: Any, m: int, columns: int, plane: int) -> None:
     """A group's sums of products (c + 1, c + 1) to the unknowns they belong to."""
     to, place, source, factor = table
@@ -91,8 +91,8 @@ def put(sums: Sums, total: FloatArray, table: Any, m: int, columns: int, plane: 
         sums.plane_right[plane, i] += total[columns + i, f]
 
 
-@kernel
-def give(k: int, cells: FloatArray, panel: FloatArray, looks: Looks) -> None:
+@jit_inline
+def give(k: int, cells: FloatArray, panel: FloatArray, looks: RowDiagnostics) -> None:
     """Rows as they are."""
     for i in range(panel.shape[1]):
         looks.misclosure[k + i], looks.variance[k + i] = cells[MISCLOSURE, i], cells[VARIANCE, i]
@@ -101,9 +101,16 @@ def give(k: int, cells: FloatArray, panel: FloatArray, looks: Looks) -> None:
             looks.design[k + i, c] = panel[c, i]
 
 
-@kernel
-def look(
-    k: int, cells: FloatArray, panel: FloatArray, looks: Looks, cofactor: FloatArray, g: int, weight: Any, n: float
+@jit_inline
+def inspect(
+    k: int,
+    cells: FloatArray,
+    panel: FloatArray,
+    looks: RowDiagnostics,
+    cofactor: FloatArray,
+    g: int,
+    weight: Any,
+    n: float,
 ) -> None:
     """f, its variance M + c, and how much of that the estimated unknowns take away; ``cofactor`` is room.
 
@@ -136,7 +143,7 @@ def look(
         looks.spread[k + i] = (variance * own + common * with_mean) / (variance + common)
 
 
-@kernel
+@jit_inline
 def counted(weight: Any, fate: Any, begin: int, end: int) -> float:
     """How many rows of a run there are: those kept, each with those that it stands for."""
     n = 0.0
@@ -146,8 +153,8 @@ def counted(weight: Any, fate: Any, begin: int, end: int) -> float:
     return n
 
 
-@kept
-def go_over(mode: int, task: Task, weight: FloatArray, huber: float, sums: Sums, looks: Looks) -> None:
+@jit_cached
+def accumulate(mode: int, task: Task, weight: FloatArray, huber: float, sums: Sums, looks: RowDiagnostics) -> None:
     """A batch: MODE_SUM adds to ``sums``, MODE_LOOK and MODE_GIVE fill ``looks``."""
     groups, head, planes, knots = task.groups, task.head, task.planes, task.knots
     widest = len(head.kind) + STATES + OF_PLANE + 1
@@ -176,7 +183,7 @@ def go_over(mode: int, task: Task, weight: FloatArray, huber: float, sums: Sums,
                 sums.counts[0] += count
                 add_up(total, np.dot(panel, panel.T))
             elif mode == MODE_LOOK:
-                look(k, cells, panel, looks, total, g, weight[k : k + n], together)
+                inspect(k, cells, panel, looks, total, g, weight[k : k + n], together)
             else:
                 give(k, cells, panel, looks)
         if mode == MODE_SUM:

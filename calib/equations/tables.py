@@ -128,7 +128,7 @@ class Sums(NamedTuple):
     counts: Int64Array
 
 
-class Looks(NamedTuple):
+class RowDiagnostics(NamedTuple):
     """Of each row of a batch (n,): f, M (looked at: with c, that of what it has in common with its run), n · beam, q =
     A Q Aᵀ; Q (g, c, c) of the groups; the design (n, c + 1).
     """

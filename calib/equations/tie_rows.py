@@ -15,7 +15,7 @@ import numpy as np
 
 from swath.calib.equations.inputs import new_looks
 from swath.calib.equations.rows import Batch, Rows, Run, State
-from swath.calib.equations.sums import MODE_GIVE, go_over
+from swath.calib.equations.sums import MODE_GIVE, accumulate
 from swath.calib.equations.tables import Planes as PlaneTable
 from swath.calib.features import ControlPoint, Sighting, TiePoint
 from swath.georef.arrays import FloatArray
@@ -130,7 +130,7 @@ class Ties:
             runs += [Run(3 * place + axis, run.swath, run.at, run.before, run.after) for axis in range(3)]
         task = rows.task(state, Batch(runs[0].swath, tuple(runs), 0), planes)
         looks = new_looks(len(runs), np.zeros((0, 0, 0)), np.zeros((len(runs), len(task.head.kind) + 12)))
-        go_over(MODE_GIVE, task, np.ones(len(runs)), 0.0, rows.no_sums, looks)
+        accumulate(MODE_GIVE, task, np.ones(len(runs)), 0.0, rows.no_sums, looks)
         for place, index in enumerate(which):
             three = slice(3 * place, 3 * place + 3)
             if np.isfinite(looks.misclosure[three]).all():

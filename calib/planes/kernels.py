@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import ByteArray, FloatArray
-from swath.georef.compiled import kept, kernel, whole
+from swath.georef.compiled import jit_cached, jit_inline, whole
 from swath.georef.records import Int64Array
 
 Int32Array = NDArray[np.int32]
@@ -27,7 +27,7 @@ _SURELY = 3.0  # sigmas of a plane's direction
 _REFIT_SHARE = 1.15  # a growing plane is fitted anew when it has so many times the points of its last fit
 
 
-@kernel
+@jit_inline
 def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> tuple[float, float, float, float]:
     """Least eigenvalue of a symmetric matrix and its unit vector, z not negative (Smith, Comm. ACM 4, 1961)."""
     middle = (xx + yy + zz) / 3.0
@@ -57,7 +57,7 @@ def smallest(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -
     return least, x * scale, y * scale, z * scale
 
 
-@kernel
+@jit_inline
 def shorter_axis(sums: FloatArray, least: float) -> float:
     """The middle eigenvalue of moments (10,), the least being known: of the product and the sum of the other two."""
     xx, xy, xz, yy, yz, zz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
@@ -67,7 +67,7 @@ def shorter_axis(sums: FloatArray, least: float) -> float:
     return shorter
 
 
-@kept
+@jit_cached
 def accumulate(
     points_t: FloatArray,
     returns: ByteArray,
@@ -123,7 +123,7 @@ def accumulate(
         sums[9] += z * z
 
 
-@kept
+@jit_cached
 def fit_cells(
     moments: FloatArray,
     base: FloatArray,
@@ -185,7 +185,7 @@ def fit_cells(
             what[at] = GOOD
 
 
-@kernel
+@jit_inline
 def _joined(one: FloatArray, more: FloatArray) -> None:
     """Moments of both sets of points, in place of the first (Chan, Golub and LeVeque 1983)."""
     n, m = one[0], more[0]
@@ -204,7 +204,7 @@ def _joined(one: FloatArray, more: FloatArray) -> None:
     one[9] += more[9] + weight * z * z
 
 
-@kernel
+@jit_inline
 def _fits(
     cell: FloatArray, region: FloatArray, plane: FloatArray, doubt: float, rough_m: float, sigma_m: float
 ) -> bool:
@@ -225,14 +225,14 @@ def _fits(
     return on_it
 
 
-@kernel
+@jit_inline
 def _refitted(region: FloatArray, plane: FloatArray, sigma_m: float) -> float:
     """The region's plane anew; sigma of its direction, rad, by its spread along its shorter axis."""
     least, plane[0], plane[1], plane[2] = smallest(region[4], region[5], region[6], region[7], region[8], region[9])
     return sigma_m / math.sqrt(max(shorter_axis(region, least), 1e-6))
 
 
-@kept
+@jit_cached
 def grow(
     order: Int64Array,
     what: ByteArray,
@@ -314,14 +314,14 @@ def grow(
     return count
 
 
-@kernel
+@jit_inline
 def _slot(key: int, mask: int) -> int:
     """Where to look for a key first: Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
     slot: int = ((key * _GOLDEN) >> _HIGH) & mask
     return slot
 
 
-@kept
+@jit_cached
 def fill_table(keys: Int64Array, labels: Int32Array, table_keys: Int64Array, table_labels: Int32Array) -> None:
     """A table of labels by key with open addresses; its size is a power of two, empty slots have label −1."""
     mask = len(table_keys) - 1
@@ -332,7 +332,7 @@ def fill_table(keys: Int64Array, labels: Int32Array, table_keys: Int64Array, tab
         table_keys[at], table_labels[at] = keys[i], labels[i]
 
 
-@kept
+@jit_cached
 def gather(
     points_t: FloatArray,
     returns: ByteArray,

@@ -30,7 +30,7 @@ from swath.calib.equations.trajectory_prior import ERRORS, TrajectoryPrior, appl
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import TrajectoryFit
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray, SingleArray
 from swath.georef.records import Int64Array
 from swath.georef.scanner.calibration import Calibration
@@ -209,7 +209,7 @@ class _Equations:
         row_weight: SingleArray | None,
     ) -> None:
         planes = tuple(plane for plane in features.planes if plane.points)
-        self._rows = Rows(flight, planes, unknowns(flight, Wish(), calibrations), free)
+        self._rows = Rows(flight, planes, unknowns(flight, ParameterOptions(), calibrations), free)
         self._ties = Ties(self._rows, features.ties, None)
         self._weight = TrajectoryWeight(self._rows)
         self._weight.normal = np.zeros_like(self._weight.normal)

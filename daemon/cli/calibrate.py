@@ -92,19 +92,19 @@ def command(
     from swath.daemon.processing.calibration.model import file_of, model_of
     from swath.daemon.processing.calibration.products import write_products
     from swath.daemon.processing.calibration.record import facts_of
-    from swath.daemon.processing.calibration.run import CalibrateWish, calibrate
-    from swath.daemon.processing.flights.read import Wish
-    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.calibration.run import CalibrationOptions, calibrate
+    from swath.daemon.processing.flights.read import GeorefOptions
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.setup.setup import Options
 
     _refuse(output, observe, overwrite=overwrite)
     if facts is not None and report is None:
         raise UserError("--facts: they stand in the record; want --report DIR, too", ExitCode.USAGE)
-    wish = CalibrateWish(
-        logs=Wish(
+    wish = CalibrationOptions(
+        logs=GeorefOptions(
             logs=logs,
             output=output,
-            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
+            trajectory=TrajectoryOptions(trajectory, week, at, navigate=True, force=force_trajectory),
             options=Options(
                 crs=crs,
                 force_crs=force_crs,

@@ -68,16 +68,16 @@ def command(
     require_installed("swath georef")
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights.read import Wish
-    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.flights.read import GeorefOptions
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.georeferencing.run import georeference
     from swath.daemon.processing.setup.setup import Options
     from swath.georef.strips import StripRules
 
-    wish = Wish(
+    wish = GeorefOptions(
         logs=logs,
         output=output,
-        trajectory=TrajectoryWish(trajectory, week, at, force=force_trajectory),
+        trajectory=TrajectoryOptions(trajectory, week, at, force=force_trajectory),
         options=Options(
             crs=crs,
             force_crs=force_crs,

@@ -48,13 +48,13 @@ def command(
 
     from swath.daemon.processing.calibration.model import model_of
     from swath.daemon.processing.calibration.plan.page import draw_planned, require_picture
-    from swath.daemon.processing.calibration.plan.run import PlanWish, plan_calibration
-    from swath.daemon.simulate.plans import Wish
+    from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
+    from swath.daemon.simulate.plans import FlightOptions
 
     picture = output if output is not None else Path(f"{Path(plan).stem}-calibration.png")
     require_picture(picture)
-    asked = PlanWish(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
-    wish = Wish(plan)
+    asked = PlanOptions(model_of(model), None if sigmas is None else _three(sigmas), not no_control, control_sigma)
+    wish = FlightOptions(plan)
     with Console(stderr=True).status("flying on paper"), wish.told():
         planned = plan_calibration(wish.load(), asked)
         try:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from swath.daemon.simulate.ahead import Ahead, FlightFacts
     from swath.daemon.simulate.folder import FlightFolder
     from swath.daemon.simulate.into_log import SimReport
-    from swath.daemon.simulate.plans import Wish
+    from swath.daemon.simulate.plans import FlightOptions
 
 PRESETS = "small, calibration, corridor, block, bench"  # swath.sim.plan.plan's
 CONFIG_NAME, TRUTH_NAME, LOGS_NAME = "swath.toml", "truth.npz", "logs"
@@ -75,11 +75,11 @@ def fly(
     """
     from rich.console import Console
 
-    from swath.daemon.simulate.plans import Wish
+    from swath.daemon.simulate.plans import FlightOptions
 
     logging.getLogger("swath").addHandler(logging.NullHandler())  # events of the log are in the log
     console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
-    wish = Wish(plan, seed, seconds)
+    wish = FlightOptions(plan, seed, seconds)
     if wire:
         if config is not None and output is not None:
             raise UserError("-o makes wires, --config names some; give one of them", ExitCode.USAGE)
@@ -103,12 +103,12 @@ def plan_(
     """Draw a plan: map of lines, swaths and buildings, height profile, point density, overlap; the same as a table."""
     from rich.console import Console
 
-    from swath.daemon.simulate.plans import Wish, draw
+    from swath.daemon.simulate.plans import FlightOptions, draw
 
     picture = output if output is not None else Path(f"{Path(plan).stem}.png")
     try:
         with Console(stderr=True).status("drawing"):
-            rows = draw(Wish(plan), picture)
+            rows = draw(FlightOptions(plan), picture)
     except OSError as error:
         raise UserError(one_line(f"{picture}: {error.strerror or error}"), ExitCode.IO) from error
     if as_json:
@@ -144,7 +144,7 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
 # ---------------------------------------------------------------------------------------------- into a log
 
 
-def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: bool) -> None:
+def _fly_into_log(console: Console, wish: FlightOptions, output: Path, *, with_truth: bool) -> None:
     from swath.daemon.simulate.folder import FlightFolder
 
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -164,7 +164,9 @@ def _fly_into_log(console: Console, wish: Wish, output: Path, *, with_truth: boo
     _print_flown(report, time.monotonic() - started_s, logs, names)
 
 
-def _make_log(console: Console, wish: Wish, folder: FlightFolder, *, with_truth: bool) -> tuple[SimReport, list[str]]:
+def _make_log(
+    console: Console, wish: FlightOptions, folder: FlightFolder, *, with_truth: bool
+) -> tuple[SimReport, list[str]]:
     """Everything of a flight, in the folder's place out of sight."""
     from swath.daemon.config import load_config
     from swath.daemon.simulate.into_log import fly_into_log, sim_session_info
@@ -217,7 +219,13 @@ def _print_flown(report: SimReport, took_s: float, logs: list[Path], names: list
 
 
 def _fly_on_wires(
-    console: Console, wish: Wish, folder: Path | None, config_path: Path | None, wait_s: float, *, set_clock: bool
+    console: Console,
+    wish: FlightOptions,
+    folder: Path | None,
+    config_path: Path | None,
+    wait_s: float,
+    *,
+    set_clock: bool,
 ) -> None:
     from swath.daemon.config import load_config
     from swath.daemon.replay.units import close_outputs

@@ -16,7 +16,7 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.requirements import require_installed
 
 if TYPE_CHECKING:
-    from swath.daemon.processing.flights.read import Wish
+    from swath.daemon.processing.flights.read import GeorefOptions
 
 SMALLEST_CELL_M, LARGEST_CELL_M = 0.05, 100.0
 LEVELS = ("QL0", "QL1", "QL2", "QL3")
@@ -80,8 +80,8 @@ def command(
     require_installed("swath strips", *(["matplotlib"] if output else []))
     from swath.daemon.cli.georef import calibrations_given
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights.read import Wish
-    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.flights.read import GeorefOptions
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.setup.setup import Options
 
     if cell is not None and not SMALLEST_CELL_M <= cell <= LARGEST_CELL_M:
@@ -89,10 +89,10 @@ def command(
         raise UserError(f"--cell: got {cell:g}, want {wanted}", ExitCode.USAGE)
     if level is not None and level not in LEVELS:
         raise UserError(f'--level: got "{level}", want one of {", ".join(LEVELS)}', ExitCode.USAGE)
-    logs = Wish(
+    logs = GeorefOptions(
         logs=paths,
         output=output or Path(),
-        trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
+        trajectory=TrajectoryOptions(trajectory, week, at, navigate=True, force=force_trajectory),
         options=Options(
             datum=datum, calibrations=calibrations_given(calibration or []), uncertainty=False, force_crs=True
         ),
@@ -112,7 +112,7 @@ def command(
 
 
 def _compare(
-    logs: Wish,
+    logs: GeorefOptions,
     before: Sequence[Path],
     cells: tuple[int, float | None],
     output: Path | None,
@@ -121,9 +121,9 @@ def _compare(
     as_json: bool,
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
-    from swath.daemon.processing.strips.compare import StripsWish, compare_strips, rules_of
+    from swath.daemon.processing.strips.compare import StripsOptions, compare_strips, rules_of
 
-    wish = StripsWish(logs.logs, logs, before, rules_of(*cells), output, level)
+    wish = StripsOptions(logs.logs, logs, before, rules_of(*cells), output, level)
     with tempfile.TemporaryDirectory(prefix="swath-") as folder, progress_bar() as tell:
         done = compare_strips(wish, Path(folder), tell)
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, done.lines)))
@@ -132,14 +132,14 @@ def _compare(
 
 
 def _adjust(
-    logs: Wish, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
+    logs: GeorefOptions, folder: Path, control: Path | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.processing.carried_verdict import refusal
-    from swath.daemon.processing.strips.adjust import AdjustWish, correct_strips
+    from swath.daemon.processing.strips.adjust import AdjustOptions, correct_strips
     from swath.daemon.processing.strips.adjust_products import write_adjustment
 
-    wish = AdjustWish(logs, folder, control, strip_model, overwrite)
+    wish = AdjustOptions(logs, folder, control, strip_model, overwrite)
     with tempfile.TemporaryDirectory(prefix="swath-") as returns, progress_bar() as tell:
         told = write_adjustment(wish, correct_strips(wish, Path(returns), tell), tell)
     print(json.dumps(told.record, indent=2) if as_json else "\n".join(map(one_line, told.lines)))

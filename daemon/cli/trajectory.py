@@ -58,9 +58,9 @@ def command(
     require_installed("swath trajectory", *([] if no_page else ["matplotlib"]))
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
-    from swath.daemon.processing.navigation.inputs import INS_USES, InputWish
-    from swath.daemon.processing.navigation.navigate import NavigateWish, arm_of_text, attitude_of_text
-    from swath.daemon.processing.trajectory.request import TrajectoryWish
+    from swath.daemon.processing.navigation.inputs import INS_USES, InputOptions
+    from swath.daemon.processing.navigation.navigate import NavigationOptions, arm_of_text, attitude_of_text
+    from swath.daemon.processing.trajectory.request import TrajectoryRequest
     from swath.daemon.processing.trajectory.run import make_trajectory
 
     if ins not in INS_USES:
@@ -70,12 +70,12 @@ def command(
         raise UserError(
             "--lever-arm: is of the antenna of --gnss FILE; the log's own is gnss.….lever_arm_m", ExitCode.USAGE
         )
-    inputs = InputWish(imu, gnss_name, None if config is None else load_config(config), gnss, week, arm, ins)
+    inputs = InputOptions(imu, gnss_name, None if config is None else load_config(config), gnss, week, arm, ins)
     attitude = None if start is None else attitude_of_text(start)
-    wish = TrajectoryWish(
+    wish = TrajectoryRequest(
         logs,
         output,
-        NavigateWish(inputs, smooth=smooth, attitude_rad=attitude, compare_noise=True),
+        NavigationOptions(inputs, smooth=smooth, attitude_rad=attitude, compare_noise=True),
         csv=csv,
         events=events,
         page=not no_page,

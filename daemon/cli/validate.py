@@ -64,10 +64,10 @@ def command(
     require_installed("swath validate", *(["matplotlib"] if output else []))
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
-    from swath.daemon.processing.flights.read import Wish
-    from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+    from swath.daemon.processing.flights.read import GeorefOptions
+    from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
     from swath.daemon.processing.setup.setup import Options
-    from swath.daemon.processing.validation.run import ValidateWish, read_file, run_validation
+    from swath.daemon.processing.validation.run import ValidationOptions, read_file, run_validation
 
     if not logs and not past:
         raise UserError("nothing to validate against; want LOG… or --history", ExitCode.USAGE)
@@ -77,12 +77,12 @@ def command(
     given = {read_file(path).scanner: (text_of(path, "a calibration file"), str(path)) for path in files}
     if len(given) < len(files):
         raise UserError(f"{files[-1]}: is the second calibration of one scanner; want one a scanner", ExitCode.USAGE)
-    wish = ValidateWish(
+    wish = ValidationOptions(
         calibrations=files,
-        logs=Wish(
+        logs=GeorefOptions(
             logs=logs or [],
             output=output or Path(),
-            trajectory=TrajectoryWish(trajectory, week, at, navigate=True, force=force_trajectory),
+            trajectory=TrajectoryOptions(trajectory, week, at, navigate=True, force=force_trajectory),
             options=Options(datum=datum, calibrations=given, uncertainty=False, force_crs=True),
             config=None if config is None else load_config(config),
             strips=strips,

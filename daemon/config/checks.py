@@ -22,7 +22,7 @@ from swath.daemon.config.config import Config, DeviceTable
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
 from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DriverSettingsError
-from swath.drivers.startup import StartupWish
+from swath.drivers.startup import StartupOptions
 from swath.drivers.transports.spec import TransportSpec, parse_pps, parse_transport
 from swath.georef.text_encoding import decoded
 from swath.georef.toml_tables import TomlError, toml_tables
@@ -137,7 +137,7 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
         try:
             driver.make_parser(settings)
             if driver.startup is not None:
-                driver.startup(settings, StartupWish())
+                driver.startup(settings, StartupOptions())
         except DriverSettingsError as error:
             yield f"{section}: {error}"
 

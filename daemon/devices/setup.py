@@ -17,7 +17,7 @@ from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings
-from swath.drivers.startup import Answer, StartupMessage, StartupWish
+from swath.drivers.startup import Answer, StartupMessage, StartupOptions
 from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec
@@ -177,7 +177,7 @@ def plan_setup(
         if not only or entry.source in only:
             carrier = entries[f"gnss/{entry.transport.address}"] if entry.transport.kind == "gnss" else entry
             wire = wires.setdefault(carrier.source, WireSetup(carrier.transport))
-            _add_device(wire, entry, carrier, StartupWish(save, present_baud and _configured_baud(carrier)))
+            _add_device(wire, entry, carrier, StartupOptions(save, present_baud and _configured_baud(carrier)))
     if present_baud is not None:
         _change_rate(wires, present_baud)
     return list(wires.values())
@@ -200,7 +200,7 @@ def _change_rate(wires: dict[str, WireSetup], present_baud: int) -> None:
     changing[0][1].present_baud = present_baud
 
 
-def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish: StartupWish) -> None:
+def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, wish: StartupOptions) -> None:
     device = DeviceSetup(entry.source, entry.protocol, entry.transport.text)
     wire.devices.append(device)
     startup = find_driver(entry.kind, entry.protocol).startup

@@ -13,7 +13,7 @@ from swath.daemon.log.format import LogError
 
 
 @contextmanager
-def told_in_a_line(place: Path, *refused: type[Exception]) -> Iterator[None]:
+def as_user_error(place: Path, *refused: type[Exception]) -> Iterator[None]:
     """Whatever is raised within becomes a UserError.
 
     Args:

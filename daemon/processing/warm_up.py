@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from swath.calib.adjust import adjust
 from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.calib.parameters import Wish
+from swath.calib.parameters import ParameterOptions
 from swath.calib.planes.matching import rematch
 from swath.calib.planes.search import find_planes
 from swath.daemon.config.config import Config
@@ -432,7 +432,7 @@ def warm_calibration() -> None:
     planes = find_planes(flight)
     planes = rematch(flight, planes)
     with contextlib.suppress(ValueError):  # what such a flight does not determine is no matter here
-        adjust(flight, planes, Wish("basic"), gauss_markov(flight))
+        adjust(flight, planes, ParameterOptions("basic"), gauss_markov(flight))
 
 
 def _flight() -> Flight:

@@ -21,7 +21,7 @@ WARM_UP_S = 0.3  # a block of every source
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class FlightOptions:
     """A plan as it is asked for on the command line.
 
     Attributes:
@@ -70,7 +70,7 @@ def _check_installed() -> None:
         raise UserError(text, ExitCode.USAGE)
 
 
-def make_flight(wish: Wish, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
+def make_flight(wish: FlightOptions, truth: Path | None = None) -> tuple[Flight, dict[str, bytes]]:
     """A flight, and the files that stand beside it but for the configuration.
 
     Args:
@@ -96,7 +96,7 @@ def make_flight(wish: Wish, truth: Path | None = None) -> tuple[Flight, dict[str
         raise
 
 
-def make_flight_in_time(wish: Wish) -> tuple[Flight, dict[str, bytes]]:
+def make_flight_in_time(wish: FlightOptions) -> tuple[Flight, dict[str, bytes]]:
     """`make_flight` for real time: what is compiled when it is first used has been used before.
 
     A moment of the same flight is flown with all scanners on.
@@ -125,7 +125,7 @@ def configuration(plan: Any, wires: dict[str, str] | None, directory: str) -> by
     return text.encode()
 
 
-def draw(wish: Wish, picture: Path) -> list[dict[str, Any]]:
+def draw(wish: FlightOptions, picture: Path) -> list[dict[str, Any]]:
     """Draw a plan; what it covers, a row a line and one for all. Raises UserError, OSError."""
     plan = wish.load()
     from swath.sim.preview.picture import draw_plan

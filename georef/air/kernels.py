@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import roots_jacobi
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import A_M, B_M, E2, EP2
 
 FLOOR_M, STEP_M, CELLS = -1000.0, 250.0, 84
@@ -56,7 +56,7 @@ _roots, _weights = roots_jacobi(4, 1.0, 0.0)
 NODES, WEIGHTS = 0.5 * (1.0 + _roots), 0.25 * _weights
 
 
-@kernel
+@jit_inline
 def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """The ellipsoid's normal (up, in e), the height above it and its mean radius of curvature at an ECEF position.
 
@@ -75,7 +75,7 @@ def vertical_of(x: float, y: float, z: float) -> tuple[float, float, float, floa
     return x * out, y * out, sin, height, B_M / bulge
 
 
-@kernel
+@jit_inline
 def cell_of(height_m: float) -> tuple[int, float]:
     """Cell of a height and the share of it that lies below; not-a-number is taken as low."""
     if not height_m > FLOOR_M:
@@ -87,7 +87,7 @@ def cell_of(height_m: float) -> tuple[int, float]:
     return cell, place - cell
 
 
-@kernel
+@jit_inline
 def value_of(table: FloatArray, height_m: float) -> float:
     """Refractivity at a height; columns 0 to 3 of the table are its cubic's coefficients."""
     cell, x = cell_of(height_m)
@@ -95,7 +95,7 @@ def value_of(table: FloatArray, height_m: float) -> float:
     return value
 
 
-@kernel
+@jit_inline
 def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
     """Refractivity and its derivative by height, 1/m."""
     cell, x = cell_of(height_m)
@@ -104,7 +104,7 @@ def slope_of(table: FloatArray, height_m: float) -> tuple[float, float]:
     return value, slope / STEP_M
 
 
-@kernel
+@jit_inline
 def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
     """Refractivity and its integral from the table's floor; column 4 holds it at the floors of the cells."""
     cell, x = cell_of(height_m)
@@ -113,14 +113,14 @@ def sum_of(table: FloatArray, height_m: float) -> tuple[float, float]:
     return value, table[cell, 4] + STEP_M * x * (table[cell, 0] + first / 2.0 + second / 3.0 + third / 4.0)
 
 
-@kernel
+@jit_inline
 def mean_of(from_m: float, from_sum: float, to_m: float, to_sum: float, value: float) -> float:
     """Mean refractivity between heights: the difference of integrals over theirs; level: the value at the second."""
     apart = from_m - to_m
     return (from_sum - to_sum) / apart if abs(apart) > LEVEL_M else value
 
 
-@kernel
+@jit_inline
 def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
     """Height reached along a straight line, on the sphere that touches the ellipsoid below the sensor.
 
@@ -131,7 +131,7 @@ def height_along(sensor_m: float, radius_m: float, range_m: float, cos: float) -
     return sensor_m - range_m * cos + across / (2.0 * centre) * (1.0 - 0.25 * across / (centre * centre))
 
 
-@kernel
+@jit_inline
 def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
     """Δd / sin α of the ARDC model (NGA Eq. 4, 5): K over the cosine of the nadir angle.
 
@@ -144,7 +144,7 @@ def bent_by_ardc(sensor_m: float, ground_m: float, cos: float) -> float:
     return 2410e-6 * (first - second) / max(cos, FLATTEST_COS) if down else 0.0
 
 
-@kernel
+@jit_inline
 def bent_by_layers(table: FloatArray, sensor_m: float, radius_m: float, range_m: float, cos: float) -> float:
     """Δd / sin α in spherical layers: what NGA Eq. 6 to 8 amount to, as an integral along the path.
 
@@ -168,7 +168,7 @@ def bent_by_layers(table: FloatArray, sensor_m: float, radius_m: float, range_m:
     return turned * start * range_m
 
 
-@kernel
+@jit_inline
 def take(block: FloatArray, origin_e: FloatArray, points_e: FloatArray, start: int, n: int) -> None:
     """Fill a block with n returns."""
     for i in range(n):
@@ -177,7 +177,7 @@ def take(block: FloatArray, origin_e: FloatArray, points_e: FloatArray, start: i
             block[UX + axis, i] = points_e[start + i, axis]
 
 
-@kernel
+@jit_inline
 def look(block: FloatArray, n: int) -> None:
     """Directions, ranges, nadir angles."""
     for i in range(n):
@@ -195,7 +195,7 @@ def look(block: FloatArray, n: int) -> None:
         block[LENGTH, i] = said
 
 
-@kernel
+@jit_inline
 def shorten(block: FloatArray, group: FloatArray, travelled_m: FloatArray, start: int, n: int, index: float) -> None:
     """Ranges in the air at the sensor: 100 ppm from those in the mean air at worst."""
     for i in range(n):
@@ -208,7 +208,7 @@ def shorten(block: FloatArray, group: FloatArray, travelled_m: FloatArray, start
         block[LENGTH, i] += block[TRAVELLED, i] * (index / (1.0 + block[TOP_VALUE, i]) - 1.0)
 
 
-@kernel
+@jit_inline
 def bend(block: FloatArray, phase: FloatArray, n: int, model: int) -> None:
     """Δd / sin α."""
     if model == ARDC:
@@ -222,7 +222,7 @@ def bend(block: FloatArray, phase: FloatArray, n: int, model: int) -> None:
             block[TURNED, i] = bent_by_layers(phase, place[0], place[1], block[LENGTH, i], block[COS, i])
 
 
-@kernel
+@jit_inline
 def turn(block: FloatArray, n: int) -> None:
     """Directions towards nadir by Δd: u' = sin(α − Δd)/sin α u + sin Δd/sin α d (FORMULAS 4.1), good at nadir too."""
     for i in range(n):
@@ -236,7 +236,7 @@ def turn(block: FloatArray, n: int) -> None:
         block[COS, i] = along * cos + down
 
 
-@kernel
+@jit_inline
 def measure(block: FloatArray, group: FloatArray, n: int, index: float) -> None:
     """Ranges in the mean air of their paths; the mean depends on where they end, which one step of Newton settles."""
     for i in range(n):
@@ -253,7 +253,7 @@ def measure(block: FloatArray, group: FloatArray, n: int, index: float) -> None:
         block[LENGTH, i] = block[SAID, i] + travelled * (index / (1.0 + mean) - 1.0)
 
 
-@kernel
+@jit_inline
 def give(block: FloatArray, points_e: FloatArray, start: int, n: int) -> None:
     """Points out of a block; what has no range stays where it is."""
     for i in range(n):
@@ -262,7 +262,7 @@ def give(block: FloatArray, points_e: FloatArray, start: int, n: int) -> None:
                 points_e[start + i, axis] = block[OX + axis, i] + block[LENGTH, i] * block[UX + axis, i]
 
 
-@kept
+@jit_cached
 def apply_air(
     origin_e: FloatArray,
     points_e: FloatArray,
@@ -298,7 +298,7 @@ def apply_air(
         give(block, points_e, start, n)
 
 
-@kept
+@jit_cached
 def means(table: FloatArray, from_m: FloatArray, to_m: FloatArray, out: FloatArray) -> None:
     """Mean refractivities over height, all (n,)."""
     for i in range(len(out)):

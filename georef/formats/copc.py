@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 from swath.georef.formats.las import BLOCK, Clipped, LasSettings, PointPacker
 from swath.georef.formats.las_header import POINT_FORMAT, LasHeader, encode_copc_info, encode_evlr, encode_vlr
 from swath.georef.points import Points
@@ -196,7 +196,7 @@ class _Tree:
         return nodes
 
 
-@kept
+@jit_cached
 def _fill_cells(records: Any, per_unit: FloatArray, shift: FloatArray, most: int, cells: Int64Array) -> None:
     for i in range(len(records)):
         x = min(max(int(records[i].x * per_unit[0] + shift[0]), 0), most)
@@ -205,7 +205,7 @@ def _fill_cells(records: Any, per_unit: FloatArray, shift: FloatArray, most: int
         cells[i] = x << 2 * _AXIS_BITS | y << _AXIS_BITS | z
 
 
-@kept
+@jit_cached
 def _fill_nodes(cells: Int64Array, first: int, known: Int64Array, left: FloatArray, nodes: Int64Array) -> None:
     for i in range(len(cells)):
         draw = float((np.uint64(first + i) * _WEYL) >> np.uint64(11)) * 2.0**-53

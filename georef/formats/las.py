@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import ByteArray, FloatArray, SingleArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
 from swath.georef.points import Points
 from swath.georef.records import Int64Array
@@ -196,7 +196,7 @@ class LasWriter:
         self._stream.seek(0, 2)
 
 
-@kept
+@jit_cached
 def _pack(
     out: Any, first: int, time_ns: Int64Array, points_map: FloatArray, angle_rad: SingleArray, intensity: SingleArray,
     number: ByteArray, of: ByteArray, beam: NDArray[np.uint16], offset: FloatArray, per_unit: FloatArray,
@@ -240,7 +240,7 @@ def _pack(
     return -1
 
 
-@kernel
+@jit_inline
 def _clip_sigmas(record: Any, east: float, north: float, height: float, clipped: Int64Array) -> None:
     if east != east or north != north or height != height:
         clipped[1] += 1
@@ -254,7 +254,7 @@ def _clip_sigmas(record: Any, east: float, north: float, height: float, clipped:
         record.sigma_height = np.uint16(65535)
 
 
-@kept
+@jit_cached
 def _pack_sigmas(out: Any, first: int, sigma_map: SingleArray, clipped: Int64Array) -> None:
     """Three sigmas of each record; a sigma that is no number stands as the largest."""
     per = 1.0 / SIGMA_SCALE_M

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 
 A_M = 6_378_137.0
 F = 1.0 / 298.257223563
@@ -65,7 +65,7 @@ def rot_e_from_l(lat_rad: ArrayLike, lon_rad: ArrayLike) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-@kernel
+@jit_inline
 def geodetic_of(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Latitude, longitude and height of one ECEF position: Bowring's step, twice (FORMULAS 1.2)."""
     flat = math.hypot(x, y)
@@ -80,14 +80,14 @@ def geodetic_of(x: float, y: float, z: float) -> tuple[float, float, float]:
     return lat, math.atan2(y, x), height
 
 
-@kernel
+@jit_inline
 def down_of(lat_rad: float, lon_rad: float) -> tuple[float, float, float]:
     """The ellipsoid's nadir direction in e, of unit length."""
     cos = math.cos(lat_rad)
     return -cos * math.cos(lon_rad), -cos * math.sin(lon_rad), -math.sin(lat_rad)
 
 
-@kept
+@jit_cached
 def _geodetic(position_e: FloatArray, lat: FloatArray, lon: FloatArray, height: FloatArray) -> None:
     for i in range(len(position_e)):
         lat[i], lon[i], height[i] = geodetic_of(position_e[i, 0], position_e[i, 1], position_e[i, 2])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import A_M, B_M, E2, EP2, F
 from swath.georef.scanner.kernels.types import Matrix, Three
 
@@ -23,7 +23,7 @@ SOMIGLIANA_K = 0.00193185265241
 GRAVITY_RATIO = 0.00344978650684  # m = ω² a² b / GM
 
 
-@kernel
+@jit_inline
 def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
     """Upward normal of the ellipsoid in e and the height of a point, without a trigonometric function (Bowring 1976).
 
@@ -40,7 +40,7 @@ def normal_of(x: float, y: float, z: float) -> tuple[Three, float]:
     return (share * x, share * y, sin), flat * cos + z * sin - A_M * math.sqrt(1.0 - E2 * sin * sin)
 
 
-@kernel
+@jit_inline
 def normal_gravity(sin: float, height_m: float) -> float:
     """Magnitude, m/s², at the sine of a latitude and a height."""
     square = sin * sin
@@ -49,7 +49,7 @@ def normal_gravity(sin: float, height_m: float) -> float:
     return surface * (1.0 - 2.0 * (1.0 + F + GRAVITY_RATIO - 2.0 * F * square) * ratio + 3.0 * ratio * ratio)
 
 
-@kernel
+@jit_inline
 def gravity_of(x: float, y: float, z: float) -> Three:
     """Gravity in e at a point of e, m/s²."""
     up, height_m = normal_of(x, y, z)
@@ -57,7 +57,7 @@ def gravity_of(x: float, y: float, z: float) -> Three:
     return -magnitude * up[0], -magnitude * up[1], -magnitude * up[2]
 
 
-@kernel
+@jit_inline
 def gradient_of(x: float, y: float, z: float) -> Matrix:
     """∂ gravity / ∂ position in e, 1/s²: the normal turns by 1 / (M + h) and 1 / (N + h), the magnitude falls upward.
 
@@ -86,7 +86,7 @@ def gradient_of(x: float, y: float, z: float) -> Matrix:
     )
 
 
-@kernel
+@jit_inline
 def _gradient_row(
     u_i: float,
     n_i: float,
@@ -117,7 +117,7 @@ def gravity_e(position_e: ArrayLike) -> FloatArray:
     return gravity.reshape(position.shape)
 
 
-@kept
+@jit_cached
 def _gravities(position_e: FloatArray, gravity: FloatArray) -> None:
     for i in range(len(position_e)):
         g = gravity_of(position_e[i, 0], position_e[i, 1], position_e[i, 2])

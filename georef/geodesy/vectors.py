@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kernel
+from swath.georef.compiled import jit_inline
 from swath.georef.scanner.kernels.types import Matrix, Three
 
 SMALL_ANGLE_2 = 1e-2  # below 0.1 rad the series below are exact to the last bit
@@ -17,13 +17,13 @@ _TO_WHOLE = 1.5 * 2.0**52  # added, it leaves no room for a fraction
 _QUARTER = (1.5707963267341256, 6.077100506506192e-11, 2.022266248795951e-21)  # π/2 in three parts of 33 bits
 
 
-@kernel
+@jit_inline
 def vector_at(array: FloatArray, k: int) -> Three:
     """Row k of (n, 3)."""
     return array[k, 0], array[k, 1], array[k, 2]
 
 
-@kernel
+@jit_inline
 def matrix_at(array: FloatArray, k: int) -> Matrix:
     """Matrix k of (n, 3, 3)."""
     return (
@@ -33,13 +33,13 @@ def matrix_at(array: FloatArray, k: int) -> Matrix:
     )
 
 
-@kernel
+@jit_inline
 def rot_at(q: FloatArray, k: int) -> Matrix:
     """Matrix of unit quaternion k of (n, 4), scalar first."""
     return rot_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
 
 
-@kernel
+@jit_inline
 def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
     """Matrix of a unit quaternion."""
     return (
@@ -49,19 +49,19 @@ def rot_of(w: float, x: float, y: float, z: float) -> Matrix:
     )
 
 
-@kernel
+@jit_inline
 def dot(a: Three, b: Three) -> float:
     """Inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@jit_inline
 def times(m: Matrix, v: Three) -> Three:
     """A matrix times a vector."""
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
-@kernel
+@jit_inline
 def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
     """factor · sin(x)/x and cos(x) of small x, of their square and the factor: of x itself, the sine."""
     sin = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
@@ -69,7 +69,7 @@ def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
     return angle * sin, cos
 
 
-@kernel
+@jit_inline
 def sine_cosine(square: float, angle: float) -> tuple[float, float]:
     """sin(angle), cos(angle) of mostly small angles; ``square`` is that of the angle."""
     if square >= SMALL_ANGLE_2:
@@ -77,7 +77,7 @@ def sine_cosine(square: float, angle: float) -> tuple[float, float]:
     return small_sine_cosine(square, angle)
 
 
-@kernel
+@jit_inline
 def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, float]:
     """What `sin_cos` gave, or where it does not reach the library's."""
     if abs(angle) < LARGE_ANGLE:
@@ -85,7 +85,7 @@ def sine_cosine_of_large(angle: float, sin: float, cos: float) -> tuple[float, f
     return math.sin(angle), math.cos(angle)
 
 
-@kernel
+@jit_inline
 def sin_cos(angle: float) -> tuple[float, float]:
     """Sine and cosine at once, to the last bit or so: Cody and Waite's reduction, the polynomials of fdlibm.
 
@@ -117,7 +117,7 @@ def sin_cos(angle: float) -> tuple[float, float]:
     return -sin if quadrant & 2 else sin, -cos if (quadrant + 1) & 2 else cos
 
 
-@kernel
+@jit_inline
 def angle_of(across: float, down: float) -> float:
     """atan2 to 2e-8 rad, by steps that every processor rounds alike (Abramowitz and Stegun 4.4.49)."""
     a, b = abs(across), abs(down)
@@ -131,45 +131,45 @@ def angle_of(across: float, down: float) -> float:
     return -angle if across < 0.0 else angle
 
 
-@kernel
+@jit_inline
 def plus(a: Three, factor: float, b: Three) -> Three:
     """a + factor · b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
-@kernel
+@jit_inline
 def unit(a: Three) -> Three:
     """A vector's direction; of none, none."""
     per_length = 1.0 / math.sqrt(max(dot(a, a), 1e-300))
     return per_length * a[0], per_length * a[1], per_length * a[2]
 
 
-@kernel
+@jit_inline
 def cross(a: Three, b: Three) -> Three:
     """Vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@kernel
+@jit_inline
 def transposed_times(m: Matrix, v: Three) -> Three:
     """A matrix, transposed, times a vector."""
     a, b, c = m
     return plus(plus((v[0] * a[0], v[0] * a[1], v[0] * a[2]), v[1], b), v[2], c)
 
 
-@kernel
+@jit_inline
 def product(a: Matrix, b: Matrix) -> Matrix:
     """Of two matrices."""
     return transposed_times(b, a[0]), transposed_times(b, a[1]), transposed_times(b, a[2])
 
 
-@kernel
+@jit_inline
 def turned_by(sin: float, cos: float, v: Three) -> Three:
     """Ry(angle) v, of the angle's sine and cosine."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
 
 
-@kernel
+@jit_inline
 def small_turn_factors(square: float, share: float) -> tuple[float, float]:
     """`turn_factors` of turns that are small for sure."""
     first = 1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0 - square / 362880.0)))
@@ -177,7 +177,7 @@ def small_turn_factors(square: float, share: float) -> tuple[float, float]:
     return share * first, share * share * second
 
 
-@kernel
+@jit_inline
 def turn_factors(square: float, share: float) -> tuple[float, float]:
     """a, b of exp(share [φ]×) v = v + a φ × v + b φ × (φ × v) (Rodrigues), of ``square`` = |share φ|²."""
     if square >= SMALL_ANGLE_2:
@@ -187,7 +187,7 @@ def turn_factors(square: float, share: float) -> tuple[float, float]:
     return small_turn_factors(square, share)
 
 
-@kernel
+@jit_inline
 def turned_on(phi: Three, a: float, b: float, v: Three) -> Three:
     """v + a φ × v + b φ × (φ × v)."""
     once = cross(phi, v)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray, IntArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 
 Exact = Callable[[FloatArray], FloatArray]
 
@@ -229,20 +229,20 @@ def _blocks(size: int) -> list[slice]:
     return [slice(start, min(start + BLOCK, size)) for start in range(0, size, BLOCK)]
 
 
-@kernel
+@jit_inline
 def _key_at(level: int, x: float, y: float, z: float) -> int:
     per_m = 2.0**level / ROOT_M
     i, j, k = math.floor(x * per_m), math.floor(y * per_m), math.floor(z * per_m)
     return (level << 60) | (int(i) + _OFFSET << 40) | (int(j) + _OFFSET << 20) | (int(k) + _OFFSET)
 
 
-@kernel
+@jit_inline
 def _slot_of(key: int, size: int) -> int:
     mixed = (key ^ (key >> 21)) * 0x9E3779B1
     return (mixed ^ (mixed >> 17)) & (size - 1)
 
 
-@kept
+@jit_cached
 def _enter(keys: IntArray, nodes: NDArray[np.int32], table_keys: IntArray, table_nodes: NDArray[np.int32]) -> None:
     for i in range(len(keys)):
         slot = _slot_of(keys[i], len(table_keys))
@@ -251,7 +251,7 @@ def _enter(keys: IntArray, nodes: NDArray[np.int32], table_keys: IntArray, table
         table_keys[slot], table_nodes[slot] = keys[i], nodes[i]
 
 
-@kernel
+@jit_inline
 def _descend(
     x: float,
     y: float,
@@ -278,7 +278,7 @@ def _descend(
     return _ABSENT, _key_at(level, x, y, z)
 
 
-@kept
+@jit_cached
 def _find(
     points: FloatArray,
     nodes: NDArray[np.int32],
@@ -315,7 +315,7 @@ def _find(
     return absent
 
 
-@kernel
+@jit_inline
 def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float, squares: tuple[float, ...]) -> float:
     """Coordinate j of an expansion, x, y, z from its centre."""
     a, b = np.uint64(7 + 3 * j), np.uint64(16 + 6 * j)
@@ -328,7 +328,7 @@ def _second_order(row: NDArray[np.float64], j: int, x: float, y: float, z: float
     return value
 
 
-@kept
+@jit_cached
 def _expand(
     points: FloatArray, nodes: NDArray[np.int32], rows: FloatArray, kinds: NDArray[np.int8], out: FloatArray
 ) -> int:
@@ -348,7 +348,7 @@ def _expand(
     return without
 
 
-@kernel
+@jit_inline
 def _sigma(row: NDArray[np.float64], j: int, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
     """√(g Σ gᵀ) with g the first derivatives of coordinate j (law of propagation of variances)."""
     at = np.uint64(7 + 3 * j)
@@ -357,7 +357,7 @@ def _sigma(row: NDArray[np.float64], j: int, xx: float, xy: float, xz: float, yy
     return math.sqrt(max(variance, 0.0))
 
 
-@kept
+@jit_cached
 def _project(
     nodes: NDArray[np.int32],
     covariance: FloatArray,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.navigation.filter.strapdown import Samples
 from swath.georef.records import Int64Array
 
@@ -70,7 +70,7 @@ def primed_bridges(samples: Samples) -> Bridges:
     return fresh._replace(square=bridges.square, seen=bridges.seen)
 
 
-@kernel
+@jit_inline
 def _leave_out(bridges: Bridges, newest: int, span_s: float) -> None:
     """Bridge over runs that end before the newest sample, and note by how much that is wrong."""
     ring = bridges.ring
@@ -89,7 +89,7 @@ def _leave_out(bridges: Bridges, newest: int, span_s: float) -> None:
             bridges.square[level, axis] += weight * (off * off - bridges.square[level, axis])
 
 
-@kernel
+@jit_inline
 def _variance_of(bridges: Bridges, run: int, axis: int, long_s: float) -> float:
     """Variance of the sum of a run of made-up samples."""
     known = 0
@@ -109,7 +109,7 @@ def _variance_of(bridges: Bridges, run: int, axis: int, long_s: float) -> float:
     return float(here * over ** math.log2(there / here))
 
 
-@kept
+@jit_cached
 def made_up_variance(samples: Samples, bridges: Bridges) -> FloatArray:
     """Return (n, 6) variances that made-up samples add: rad², m²/s² by axis of the body; 0 where a sample is real.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
-from swath.georef.return_rows import joined, words
+from swath.georef.return_rows import concatenate, words
 from swath.georef.scanner.kernels.motion import PLACE, REACH, TRAIN, cut, rates
 
 Moving = tuple[StructArray, Int64Array, FloatArray, FloatArray]
@@ -59,8 +59,8 @@ class EncoderMotion:
         Returns:
             rows, time_ns: (m,) in the same order; rate: rad/s; acceleration: rad/s².
         """
-        self._rows = joined([self._rows, rows], rows)
-        self._time_ns = joined([self._time_ns, time_ns], time_ns)
+        self._rows = concatenate([self._rows, rows], rows)
+        self._time_ns = concatenate([self._time_ns, time_ns], time_ns)
         return self._give(everything=False)
 
     def flush(self) -> Moving:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 from swath.georef.records import Int64Array, NamesEdge, PpsEdge, StructArray, TimeMessage
 from swath.georef.timescales import (
     ClockEvent,
@@ -33,7 +33,7 @@ MAX_CELLS = 1024  # of one question; devices that restarted, and hours that turn
 MAX_RATE_OFF = 1e-3  # of device time against GPS time
 
 
-@kept
+@jit_cached
 def _place(
     device_ns: Int64Array, first_cell: int, gps_ns: Int64Array, rate: NDArray[np.float64], out: Int64Array
 ) -> None:
@@ -43,7 +43,7 @@ def _place(
         out[i] = gps_ns[cell] + np.int64(np.rint(into * rate[cell]))
 
 
-@kept
+@jit_cached
 def _bounds(device_ns: Int64Array, host_ns: Int64Array) -> tuple[int, int, int, int]:
     least, most, earliest, latest = device_ns[0], device_ns[0], host_ns[0], host_ns[0]
     for i in range(len(device_ns)):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from swath.georef.arrays import ByteArray
 from swath.georef.points import FATE_NAMES, Fate, Points
 from swath.georef.records import RETURN_DTYPE, Int64Array, StructArray
-from swath.georef.return_rows import Held, any_has, beyond, compact, joined, split, taken
+from swath.georef.return_rows import WaitingReturns, after, any_has, compact, concatenate, split_at, take
 from swath.georef.stream.clocks import StreamClocks
 from swath.georef.stream.path import CompletePath, GrowingPath, Path
 from swath.georef.timescales.gps_time import SECOND_NS
@@ -144,8 +144,8 @@ class _Lane:
         self.new: list[StructArray] = []
         self.fates: Int64Array = np.zeros(len(Fate), np.int64)
         self._settings = settings
-        self._untimed: deque[Held] = deque()
-        self._timed: deque[Held] = deque()
+        self._untimed: deque[WaitingReturns] = deque()
+        self._timed: deque[WaitingReturns] = deque()
         self._resolves = False  # a return of unknown zone has come
         self._held_back = 0  # by resolver and motion
 
@@ -163,8 +163,8 @@ class _Lane:
             self._give_up_unseen(tick_ns, last=last)
             return None
         ready = self._covered(tick_ns, covered_ns, last=last)
-        rows = joined([held.rows for held in ready], NO_ROWS)
-        time_ns = joined([held.time_ns for held in ready], NO_TIMES)
+        rows = concatenate([held.rows for held in ready], NO_ROWS)
+        time_ns = concatenate([held.time_ns for held in ready], NO_TIMES)
         if self.chain.resolver is not None:
             rows, time_ns = self._resolved(self.chain.resolver, rows, time_ns, trajectory, clocks, last=last)
         return self._points(rows, time_ns, trajectory, last=last)
@@ -172,8 +172,8 @@ class _Lane:
     def _take(self, tick_ns: int) -> None:
         pieces, self.new = [rows for rows in self.new if len(rows)], []
         if pieces:
-            self._untimed.append(Held(compact(joined(pieces, NO_ROWS)), tick_ns, NO_TIMES))
-        for held in beyond(self._untimed, self._settings.max_rows):
+            self._untimed.append(WaitingReturns(compact(concatenate(pieces, NO_ROWS)), tick_ns, NO_TIMES))
+        for held in after(self._untimed, self._settings.max_rows):
             self._give_up(held.rows, Fate.NO_TIME)
 
     def _place(self, tick_ns: int, clocks: StreamClocks, *, last: bool) -> None:
@@ -190,23 +190,23 @@ class _Lane:
                 self._untimed.append(held)
                 continue
             good, time_ns = self._times(held.rows, clocks)
-            timed, rest = split(Held(held.rows, tick_ns, time_ns), good)
+            timed, rest = split_at(WaitingReturns(held.rows, tick_ns, time_ns), good)
             self._timed += timed
             for untimed in rest:
                 if overdue:
                     self._give_up(untimed.rows, Fate.NO_TIME)
                 else:
-                    self._untimed.append(Held(untimed.rows, held.since_ns, held.time_ns))
-        for held in beyond(self._timed, self._settings.max_rows):
+                    self._untimed.append(WaitingReturns(untimed.rows, held.since_ns, held.time_ns))
+        for held in after(self._timed, self._settings.max_rows):
             self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
     def _times(self, rows: StructArray, clocks: StreamClocks) -> tuple[NDArray[np.bool_], Int64Array]:
         return clocks.place(f"scanner/{self.chain.name}", rows, self._settings.max_time_sigma_ns)
 
-    def _was_asked(self, held: Held, tick_ns: int) -> bool:
+    def _was_asked(self, held: WaitingReturns, tick_ns: int) -> bool:
         return (tick_ns - held.since_ns) / SECOND_NS > self._settings.settle_s
 
-    def _is_worth_asking(self, waiting: deque[Held], tick_ns: int, clocks: StreamClocks) -> bool:
+    def _is_worth_asking(self, waiting: deque[WaitingReturns], tick_ns: int, clocks: StreamClocks) -> bool:
         """Whether the first or the last return that was asked in vain has a time by now, so that all are asked."""
         asked = [held for held in waiting if self._was_asked(held, tick_ns)]
         if not asked:
@@ -214,7 +214,7 @@ class _Lane:
         ends = np.concatenate([asked[0].rows[:1], asked[-1].rows[-1:]])
         return bool(self._times(ends, clocks)[0].any())
 
-    def _is_overdue(self, held: Held, tick_ns: int) -> bool:
+    def _is_overdue(self, held: WaitingReturns, tick_ns: int) -> bool:
         return (tick_ns - held.since_ns) / SECOND_NS >= self._settings.trajectory_wait_s
 
     def _give_up_unseen(self, tick_ns: int, *, last: bool) -> None:
@@ -223,15 +223,15 @@ class _Lane:
             held = self._timed.popleft()
             self._give_up(held.rows, Fate.OUTSIDE_TRAJECTORY, held.time_ns)
 
-    def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[Held]:
+    def _covered(self, tick_ns: int, covered_ns: int, *, last: bool) -> list[WaitingReturns]:
         """Taken from the queue: what the trajectory covers, and what has waited for it for too long."""
-        ready: list[Held] = []
+        ready: list[WaitingReturns] = []
         waiting, self._timed = self._timed, deque()
         for held in waiting:
             if last or self._is_overdue(held, tick_ns):
                 ready.append(held)
                 continue
-            covered, rest = split(held, held.time_ns <= covered_ns - self.chain.reach_ns)
+            covered, rest = split_at(held, held.time_ns <= covered_ns - self.chain.reach_ns)
             ready += covered
             self._timed += rest
         return ready
@@ -256,13 +256,13 @@ class _Lane:
             [resolver.feed(rows, None if predict is None else predict(rows, time_ns, trajectory))] if len(rows) else []
         )
         given += [resolver.flush()] if last else []
-        known = joined(given, rows)
+        known = concatenate(given, rows)
         self._held_back += resolver.waiting - held
         good, emitted_ns = self._times(known, clocks)
         if good.all():
             return known, emitted_ns
         self._give_up(known[~good], Fate.NO_TIME)
-        return taken(known, good), emitted_ns[good]
+        return take(known, good), emitted_ns[good]
 
     def _points(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory, *, last: bool) -> Points | None:
         chain = self.chain
@@ -272,7 +272,7 @@ class _Lane:
             )
         if any_has(rows, "flags", CONTEXT_FLAG):
             own = rows["flags"] & CONTEXT_FLAG == 0
-            rows, time_ns = taken(rows, own), time_ns[own]
+            rows, time_ns = take(rows, own), time_ns[own]
             if chain.given is not None:
                 chain.given.keep(own)
         if not len(rows):
@@ -283,7 +283,7 @@ class _Lane:
             lost = fates != Fate.GEOREFERENCED
             if chain.given is not None:
                 chain.given.keep(lost)
-            chain.left_out(taken(rows, lost), time_ns[lost], fates[lost], trajectory)
+            chain.left_out(take(rows, lost), time_ns[lost], fates[lost], trajectory)
         return points if len(points) else None
 
     def _moving(self, motion: Motion, rows: StructArray, time_ns: Int64Array, *, last: bool) -> Moving:
@@ -292,8 +292,8 @@ class _Lane:
         if last:
             (one, at_ns, rate, acceleration), rest = moving, motion.flush()
             moving = (
-                joined([one, rest[0]], NO_ROWS),
-                joined([at_ns, rest[1]], NO_TIMES),
+                concatenate([one, rest[0]], NO_ROWS),
+                concatenate([at_ns, rest[1]], NO_TIMES),
                 np.concatenate([rate, rest[2]]),
                 np.concatenate([acceleration, rest[3]]),
             )
@@ -307,7 +307,7 @@ class _Lane:
         self.fates[fate] += count
         if self.chain.left_out is not None and count:
             times = np.full(count, -1) if time_ns is None else time_ns[own]
-            self.chain.left_out(taken(rows, own), times, np.full(count, fate, np.uint8), None)
+            self.chain.left_out(take(rows, own), times, np.full(count, fate, np.uint8), None)
 
 
 class Stream:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swath.georef.arrays import ByteArray, FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 from swath.georef.geodesy.quaternions import about, conjugate, product, rotated, rotation_vector, rotations_between
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_plumb
@@ -54,7 +54,7 @@ def gps_text(gps_ns: int) -> str:
     return f"GPS week {week}, {of_week_ns / SECOND_NS:.3f} s"
 
 
-@kernel
+@jit_inline
 def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
     """The epoch at or before t, 0 … n − 2; −1 where t lies outside. ``guess``, any number, only saves the search."""
     last = len(time_ns) - 1
@@ -75,7 +75,7 @@ def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
     return low
 
 
-@kernel
+@jit_inline
 def slerp(
     w: float, x: float, y: float, z: float, rx: float, ry: float, rz: float, share: float
 ) -> tuple[float, float, float, float]:
@@ -98,7 +98,7 @@ def slerp(
     )
 
 
-@kept
+@jit_cached
 def _locate(time_ns: Int64Array, max_gap_ns: int, times_ns: Int64Array, epoch: Int64Array, fate: ByteArray) -> None:
     guess = 0
     for i in range(len(times_ns)):
@@ -112,7 +112,7 @@ def _locate(time_ns: Int64Array, max_gap_ns: int, times_ns: Int64Array, epoch: I
             fate[i] = 0
 
 
-@kept
+@jit_cached
 def _slerp_all(q: FloatArray, rotvec_b: FloatArray, epoch: Int64Array, share: FloatArray, turned: FloatArray) -> None:
     for i in range(len(epoch)):
         at, r = q[epoch[i]], rotvec_b[epoch[i]]

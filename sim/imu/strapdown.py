@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from swath.georef.arrays import FloatArray
-from swath.sim.compiled import kept, kernel
+from swath.sim.compiled import jit_cached, jit_inline
 from swath.sim.gravity import EARTH_RATE_RADPS, gravity_at
 
 Vector = tuple[float, float, float]
@@ -59,18 +59,18 @@ def navigate(
 # Vectors and quaternions are tuples in what is compiled: no allocations, and it compiles in a fraction of the time.
 
 
-@kernel
+@jit_inline
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@kernel
+@jit_inline
 def _plus(a: Vector, factor: float, b: Vector) -> Vector:
     """a + factor · b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
-@kernel
+@jit_inline
 def _product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Hamilton's product, scalar first."""
     return (
@@ -81,7 +81,7 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-@kernel
+@jit_inline
 def _turned(q: Quaternion, vector: Vector) -> Vector:
     """q v q*, for a unit quaternion."""
     axis = (q[1], q[2], q[3])
@@ -89,7 +89,7 @@ def _turned(q: Quaternion, vector: Vector) -> Vector:
     return _plus(_plus(vector, 2.0 * q[0], once), 2.0, _cross(axis, once))
 
 
-@kernel
+@jit_inline
 def _quaternion(angle: Vector) -> Quaternion:
     """Of a rotation vector of a small angle."""
     square = 0.25 * (angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2])
@@ -98,7 +98,7 @@ def _quaternion(angle: Vector) -> Quaternion:
     return cosine, half_sine * angle[0], half_sine * angle[1], half_sine * angle[2]
 
 
-@kernel
+@jit_inline
 def _force_increment(angle: Vector, force: Vector, angle_before: Vector, force_before: Vector) -> Vector:
     """∫ f in the axes of the interval's start: exact for steady turning, and sculling."""
     square = angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2]
@@ -108,7 +108,7 @@ def _force_increment(angle: Vector, force: Vector, angle_before: Vector, force_b
     return _plus(_plus(turned, 1.0 / 12.0, _cross(angle_before, force)), 1.0 / 12.0, _cross(force_before, angle))
 
 
-@kept
+@jit_cached
 def _navigate(start: FloatArray, angles: FloatArray, forces: FloatArray, spans: FloatArray) -> FloatArray:
     states = np.empty((len(spans), 10))
     position, velocity = (start[0], start[1], start[2]), (start[3], start[4], start[5])

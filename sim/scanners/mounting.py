@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from swath.georef.arrays import FloatArray
-from swath.sim.compiled import kept, kernel
+from swath.sim.compiled import jit_cached, jit_inline
 from swath.sim.flight.trajectory import Poses
 from swath.sim.plan.tables import ScannerTable
 from swath.sim.shots import Pulses
@@ -53,7 +53,7 @@ class Mounting:
         return Beams(origin_e, origin, direction)
 
 
-@kernel
+@jit_inline
 def _turned(rotation: FloatArray, vector: FloatArray | Three) -> Three:
     """A vector (3,) by a matrix (3, 3), as three numbers."""
     return (
@@ -63,7 +63,7 @@ def _turned(rotation: FloatArray, vector: FloatArray | Three) -> Three:
     )
 
 
-@kept
+@jit_cached
 def _axes(
     pulses: tuple[FloatArray, FloatArray, FloatArray],
     mounting: tuple[FloatArray, float, FloatArray, FloatArray],

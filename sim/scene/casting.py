@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from swath.georef.arrays import FloatArray, IntArray
-from swath.sim.compiled import kernel, whole
+from swath.sim.compiled import jit_inline, whole
 from swath.sim.scene.rays import (
     NEVER,
     Ray,
@@ -93,7 +93,7 @@ class SceneArrays(NamedTuple):
     seed: int
 
 
-@kernel
+@jit_inline
 def clipped(at: float, step: float, low: float, high: float, start: float, stop: float) -> tuple[float, float]:
     """Distances between which a coordinate of a ray lies between limits."""
     if step == 0.0:
@@ -102,7 +102,7 @@ def clipped(at: float, step: float, low: float, high: float, start: float, stop:
     return max(start, min(one, other)), min(stop, max(one, other))
 
 
-@kernel
+@jit_inline
 def texture(x: float, y: float) -> float:
     """A factor about 1 that belongs to a place: patches of some 25 m, and grain of half a metre."""
     column, row = math.floor(x / 25.0), math.floor(y / 25.0)
@@ -116,7 +116,7 @@ def texture(x: float, y: float) -> float:
     return 1.0 + 0.3 * ((1.0 - v) * southern + v * northern - 0.5) + 0.1 * (grain - 0.5)
 
 
-@kernel
+@jit_inline
 def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y: float) -> int:
     """What covers a place as far as roads go: `ROAD`, `MARKING` or `NO_SURFACE`; crossings bear no paint."""
     found, nearest, crossing, surface = -1.0, NEVER, False, NO_SURFACE
@@ -141,7 +141,7 @@ def on_road(rows: FloatArray, item: IntArray, first: int, last: int, x: float, y
     return ROAD if crossing else surface
 
 
-@kernel
+@jit_inline
 def on_water(rows: FloatArray, item: IntArray, first: int, last: int, ray: Ray, at: float, pulse: Pulse) -> Hit:
     """The lake above the ground that a ray meets at a distance; most pulses do not come back from it."""
     for k in range(first, last):
@@ -163,7 +163,7 @@ def on_water(rows: FloatArray, item: IntArray, first: int, last: int, ray: Ray, 
     return NEVER, NO_SURFACE, 0.0, 1.0
 
 
-@kernel
+@jit_inline
 def on_ground(
     frame: Frame,
     z: FloatArray,
@@ -190,7 +190,7 @@ def on_ground(
     return at, surface, min(1.0, reflectance * texture(x, y)), min(1.0, max(cos, 0.0))
 
 
-@kernel
+@jit_inline
 def into_crown(
     rows: FloatArray, tree: int, ray: Ray, start: float, stop: float, pulse: Pulse, soft: FloatArray, count: int
 ) -> int:
@@ -208,7 +208,7 @@ def into_crown(
     return count
 
 
-@kernel
+@jit_inline
 def into_wire(
     rows: FloatArray, wire: int, ray: Ray, start: float, stop: float, spread: float, soft: FloatArray, count: int
 ) -> int:
@@ -224,7 +224,7 @@ def into_wire(
     return count
 
 
-@kernel
+@jit_inline
 def beside_car(frame: Frame, z: FloatArray, rows: FloatArray, car: int, ray: Ray, time_s: float) -> Ray:
     """A ray as it is seen from a car: its rows stand at the middle of its floor, which moves over the ground."""
     length = rows[car + 10]
@@ -235,7 +235,7 @@ def beside_car(frame: Frame, z: FloatArray, rows: FloatArray, car: int, ray: Ray
     return ray[0] - x, ray[1] - y, ray[2] - floor, ray[3], ray[4], ray[5], ray[6], ray[7]
 
 
-@kernel
+@jit_inline
 def meet(
     frame: Frame,
     z: FloatArray,
@@ -276,7 +276,7 @@ def meet(
     return best, surface, reflectance, cosine, edge, count
 
 
-@kernel
+@jit_inline
 def march(
     frame: Frame,
     z: FloatArray,

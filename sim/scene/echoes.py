@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray, IntArray
 from swath.sim import compiled, shots
-from swath.sim.compiled import borrowed, digest, kept, kernel, whole
+from swath.sim.compiled import borrowed, digest, jit_cached, jit_inline, whole
 from swath.sim.scene import casting, rays
 from swath.sim.scene.casting import RIM_SHARE, SPENT, Frame, Pulse, SceneArrays, march
 from swath.sim.scene.rays import NEVER, Ray
@@ -29,12 +29,12 @@ class Work(NamedTuple):
     echo: FloatArray
 
 
-def room_to_work() -> Work:
+def workspace_bytes() -> Work:
     """For one call at a time."""
     return Work(np.empty((SOFT_HITS, 5)), np.empty((SOFT_HITS + 5, 5)))
 
 
-@kernel
+@jit_inline
 def in_order(rows: FloatArray, count: int) -> None:
     """Sort the first rows by distance; they are few."""
     for i in range(1, count):
@@ -45,7 +45,7 @@ def in_order(rows: FloatArray, count: int) -> None:
                 rows[j - 1, k], rows[j, k] = rows[j, k], rows[j - 1, k]
 
 
-@kernel
+@jit_inline
 def energy_at(soft: FloatArray, count: int, at: float) -> float:
     """What soft hits, in order, leave of a pulse's energy for a distance."""
     energy = 1.0
@@ -56,7 +56,7 @@ def energy_at(soft: FloatArray, count: int, at: float) -> float:
     return energy if energy >= SPENT else 0.0
 
 
-@kernel
+@jit_inline
 def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, surface: float, on_axis: float) -> int:
     """One more echo, if there is any of it."""
     if at < NEVER and strength > 0.0 and count < len(echo):
@@ -71,7 +71,7 @@ def add(echo: FloatArray, count: int, at: float, strength: float, cos: float, su
     return count
 
 
-@kernel
+@jit_inline
 def rim(ray: Ray, spread: float, side: int) -> Ray:
     """One of four rays that leave with a beam's axis, ``spread`` radians from it."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
@@ -89,14 +89,14 @@ def rim(ray: Ray, spread: float, side: int) -> Ray:
     return ox, oy, oz, dx, dy, dz, 1.0 / dx, 1.0 / dy
 
 
-@kernel
+@jit_inline
 def move(echo: FloatArray, source: int, target: int) -> None:
     """A row over another."""
     for k in range(5):
         echo[target, k] = echo[source, k]
 
 
-@kernel
+@jit_inline
 def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
     """Echoes in order, those nearer to each other than a pulse made one: the axis' stands, else the stronger one."""
     kept = _NONE
@@ -112,7 +112,7 @@ def merged(echo: FloatArray, count: int, pulse_m: float) -> int:
     return kept + 1 if count else 0
 
 
-@kernel
+@jit_inline
 def echoes_of(
     frame: Frame,
     z: FloatArray,
@@ -153,7 +153,7 @@ def echoes_of(
 def _cast_pulses(sources: int) -> Callable[..., None]:
     """`cast_pulses` as compiled from ``sources``."""
 
-    @kept
+    @jit_cached
     def cast_pulses(
         scene: SceneArrays,
         work: Work,

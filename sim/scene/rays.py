@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.sim.compiled import kernel
+from swath.sim.compiled import jit_inline
 
 Ray = tuple[float, float, float, float, float, float, float, float]
 
@@ -24,7 +24,7 @@ _ODD_3, _ODD_4 = np.uint64(0x8CB92BA72F3D8DD7), np.uint64(0xAEF17502108EF2D9)
 _S11, _S27, _S30, _S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31)
 
 
-@kernel
+@jit_inline
 def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
     """A number in [0, 1) that hangs on its four names alone (the finaliser of SplitMix64, Steele et al. 2014)."""
     state = np.uint64(seed) * _ODD_1 + np.uint64(number) * _ODD_2 + np.uint64(purpose) * _ODD_3
@@ -34,7 +34,7 @@ def uniform(seed: int, number: int, purpose: int, draw: int) -> float:
     return float((state ^ (state >> _S31)) >> _S11) * 2.0**-53
 
 
-@kernel
+@jit_inline
 def patch_root(height: float, slope: float, bend: float) -> float:
     """Smallest s > 0 with height + slope · s + bend · s² = 0, height > 0 at s = 0: where a ray goes below a patch."""
     inside = slope * slope - 4.0 * bend * height
@@ -47,7 +47,7 @@ def patch_root(height: float, slope: float, bend: float) -> float:
     return NEVER
 
 
-@kernel
+@jit_inline
 def boundary(at: float, step: float, per_step: float, low: float, size: float, index: int) -> float:
     """Distance at which a ray leaves slice ``index`` of slices of this size, in one coordinate."""
     if step > 0.0:
@@ -55,13 +55,13 @@ def boundary(at: float, step: float, per_step: float, low: float, size: float, i
     return (low + index * size - at) * per_step if step < 0.0 else NEVER
 
 
-@kernel
+@jit_inline
 def slice_at(value: float, low: float, size: float, count: int) -> int:
     """Index of the slice that holds a value, the nearest one beyond the ends."""
     return min(max(math.floor((value - low) / size), 0), count - 1)
 
 
-@kernel
+@jit_inline
 def ground_entry(
     z: FloatArray, west: float, south: float, cell: float, ray: Ray, start: float, stop: float, fresh: bool
 ) -> float:
@@ -101,7 +101,7 @@ def ground_entry(
     return NEVER
 
 
-@kernel
+@jit_inline
 def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> tuple[float, float]:
     """Slope of the bilinear ground at a place: (dz/dx, dz/dy)."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
@@ -112,7 +112,7 @@ def ground_normal(z: FloatArray, west: float, south: float, cell: float, x: floa
     return (z10 - z00 + twist * v) / cell, (z01 - z00 + twist * u) / cell
 
 
-@kernel
+@jit_inline
 def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y: float) -> float:
     """Site z of the bilinear ground at a place."""
     column = slice_at(x, west, cell, z.shape[1] - 1)
@@ -123,7 +123,7 @@ def ground_z(z: FloatArray, west: float, south: float, cell: float, x: float, y:
     return float((1.0 - v) * southern + v * northern)
 
 
-@kernel
+@jit_inline
 def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
     """Distance at which a ray is nearest to a point, if ahead and within a radius; else never."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
@@ -134,7 +134,7 @@ def passes(ray: Ray, x: float, y: float, z: float, radius: float) -> float:
     return along
 
 
-@kernel
+@jit_inline
 def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) -> tuple[float, int, float, float]:
     """Where a ray enters the body behind the planes in ``rows[first:last]`` (`Things.plane`).
 
@@ -170,7 +170,7 @@ def solid_entry(rows: FloatArray, first: int, last: int, ray: Ray, grow: float) 
     return enter, through, cos, NEVER
 
 
-@kernel
+@jit_inline
 def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
     """Where a ray enters and leaves an upright ellipsoid (`Things.tree`, at ``rows[tree]``)."""
     ox, oy, oz, dx, dy, dz, _, _ = ray
@@ -186,7 +186,7 @@ def crown_span(rows: FloatArray, tree: int, ray: Ray) -> tuple[float, float]:
     return (-b - root) / a, (root - b) / a
 
 
-@kernel
+@jit_inline
 def wire_passage(rows: FloatArray, wire: int, ray: Ray) -> tuple[float, float, float]:
     """Where a ray passes a piece of wire (`Things.wire`): distance, miss distance, cosine; never beside its ends."""
     ox, oy, oz, dx, dy, dz, _, _ = ray

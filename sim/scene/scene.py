@@ -17,7 +17,7 @@ from swath.sim.plan.tables import ScannerTable
 from swath.sim.plan.terrain_tables import CarTable, RoadTable, TerrainTable, WireTable
 from swath.sim.scene.casting import CARS, COVERS, LAKES, ROADS, SOLIDS, THINGS, TREES, WIRES, Frame, SceneArrays
 from swath.sim.scene.cells import CELL_M, Listed, build_cells
-from swath.sim.scene.echoes import cast_pulses, room_to_work
+from swath.sim.scene.echoes import cast_pulses, workspace_bytes
 from swath.sim.scene.objects import (
     CAR_SIZE_M,
     Solids,
@@ -106,7 +106,7 @@ class Scene:
         surface = np.zeros(shape, np.uint8)
         cast_pulses(
             self.arrays,
-            room_to_work(),
+            workspace_bytes(),
             np.ascontiguousarray(origin, np.float64),
             np.ascontiguousarray(direction, np.float64),
             np.ascontiguousarray(time_s, np.float64),

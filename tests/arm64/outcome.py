@@ -18,7 +18,7 @@ import numpy as np
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.flights.read import Flight, Wish, read_flights
+from swath.daemon.processing.flights.read import Flight, GeorefOptions, read_flights
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.points import Points
@@ -29,7 +29,7 @@ CRS = "EPSG:32632"
 
 def main(log: Path, file: Path) -> None:
     """Write what became of a log."""
-    (flight,) = read_flights(Wish([log], log, options=Options(crs=CRS)), lambda *_: None)
+    (flight,) = read_flights(GeorefOptions([log], log, options=Options(crs=CRS)), lambda *_: None)
     assert flight.trajectory is not None
     found: dict[str, Any] = {f"digest {source}": digest for source, digest in digests(log).items()}
     for name in ("time_ns", "position_e", "q_e_from_b", "velocity_e"):

@@ -15,7 +15,7 @@ import numpy as np
 from swath.calib.calibration_file import Header
 from swath.calib.features import ControlPoint, Features, Patch, Plane, Sighting, TiePoint
 from swath.calib.flight import Flight, Head, Swath, Tangent
-from swath.calib.outcome import Adjusted, ControlFit, GroupFit, Held, Residuals, TrajectoryFit
+from swath.calib.outcome import Adjusted, ControlFit, FixedParameter, GroupFit, Residuals, TrajectoryFit
 from swath.calib.summary import DifferenceMap, PairDifference, Profile, ReportInput
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
@@ -262,12 +262,13 @@ def _adjusted(flight: Flight, features: Features, found: Calibration, random: np
     )
     names = tuple(f"left.{name}" for name in ESTIMATED)
     held = (
-        Held("left", "lever_arm_z_m", "raising the scanner and lowering the range offset look alike over flat ground",
+        FixedParameter("left", "lever_arm_z_m",
+             "raising the scanner and lowering the range offset look alike over flat ground",
              "control points seen at nadir and at the edges of two flying heights", 0.13, (("range_offset_m", -0.97),)),
-        Held("left", "scan_plane_tilt_rad", "the tilt moves points along track, as pitch does",
+        FixedParameter("left", "scan_plane_tilt_rad", "the tilt moves points along track, as pitch does",
              "a line at a second height, at least 1.7 times as high", math.inf, (("phi_rad", 0.999),)),
-        Held("left", "lever_arm_x_m", "fixed at the user's word"),
-        Held("left", "lever_arm_y_m", "fixed at the user's word"),
+        FixedParameter("left", "lever_arm_x_m", "fixed at the user's word"),
+        FixedParameter("left", "lever_arm_y_m", "fixed at the user's word"),
     )  # fmt: skip
     groups = tuple(
         GroupFit(

@@ -20,7 +20,7 @@ from swath.calib.features import ControlPoint, Features, Sighting, TiePoint
 from swath.calib.flight import Flight
 from swath.calib.intensity_curve import STEPS, at_knots, curve_by_knots
 from swath.calib.outcome import Adjusted
-from swath.calib.parameters import MODELS, Wish, unknowns
+from swath.calib.parameters import MODELS, ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration, nominal
 from swath.georef.trajectory.trajectory import Trajectory
@@ -40,7 +40,7 @@ def worked() -> Printed:
 @cache
 def adjusted_as_printed() -> Adjusted:
     flight, features = worked().flight()
-    return adjust(flight, features, Wish(), None, PLAIN)
+    return adjust(flight, features, ParameterOptions(), None, PLAIN)
 
 
 def test_the_printed_adjustment() -> None:
@@ -68,13 +68,13 @@ def test_the_printed_adjustment() -> None:
 
 def test_the_printed_blunder_is_the_largest_w_and_is_taken_out() -> None:
     flight, features = worked().with_blunder().flight()
-    plain = adjust(flight, features, Wish(), None, PLAIN)
+    plain = adjust(flight, features, ParameterOptions(), None, PLAIN)
     (residuals,) = plain.residuals
     worst = int(np.abs(residuals.normalised).argmax())
     assert abs(residuals.normalised[worst]) == pytest.approx(7.980954746253744, rel=3e-3)
     line = np.flatnonzero(worked().line == residuals.swath[worst])
     assert line[residuals.at[worst]] == 137
-    kept = adjust(flight, features, Wish())
+    kept = adjust(flight, features, ParameterOptions())
     (residuals,) = kept.residuals
     assert residuals.weight[worst] == 0.0
     assert residuals.weight.sum() == 1521
@@ -86,7 +86,7 @@ NO_TIES = np.zeros(0, np.float32)
 
 
 def block(
-    flight: Flight, features: Features, wish: Wish, prior: TrajectoryPrior | None
+    flight: Flight, features: Features, wish: ParameterOptions, prior: TrajectoryPrior | None
 ) -> tuple[Rows, Ties, TrajectoryWeight]:
     rows = Rows(flight, features.planes, unknowns(flight, wish), prior)
     return rows, Ties(rows, features.ties, None), TrajectoryWeight(rows)
@@ -125,7 +125,7 @@ def in_planes(rows: Rows, state: State) -> tuple[FloatArray, list[int]]:
 @pytest.mark.parametrize("weighted", [True, False])
 def test_reduced_equations_give_the_whole_dense_solution(weighted: bool) -> None:
     built, prior = small(), knots(small().flight.trajectories[0])
-    rows, ties, weight = block(built.flight, built.features, Wish(priors={"range_offset_m": 0.05}), prior)
+    rows, ties, weight = block(built.flight, built.features, ParameterOptions(priors={"range_offset_m": 0.05}), prior)
     state = rows.start()
     share = np.ones(rows.count, np.float32)
     state = moved(state, normals(rows, ties, weight, state, share, NO_TIES, 0.0).step())
@@ -161,7 +161,7 @@ def test_reduced_equations_give_the_whole_dense_solution(weighted: bool) -> None
 def test_the_hard_constraint_is_the_limit_of_a_weighted_one() -> None:
     """Four unknowns a plane and s1² + s2² + s3² = 1 with σ = 1e-7 (ISO/TS 19159-2 Eq. 18, 20)."""
     built = small()
-    rows, ties, weight = block(built.flight, built.features, Wish(priors={"range_offset_m": 0.05}), None)
+    rows, ties, weight = block(built.flight, built.features, ParameterOptions(priors={"range_offset_m": 0.05}), None)
     ones, none = np.ones(rows.count, np.float32), NO_TIES
     state = rows.start()
     for _ in range(2):
@@ -211,11 +211,11 @@ def test_tie_points_alone_find_the_truth() -> None:
     control = ControlPoint("a", built.features.planes[0].centre_t, 0.01)
     ties = tied(built, 0.0, 1)
     ties = (replace(ties[0], control=control), *ties[1:])
-    exact = adjust(built.flight, Features(ties=ties), Wish(), prior, Settings(tolerance=1e-6))
+    exact = adjust(built.flight, Features(ties=ties), ParameterOptions(), prior, Settings(tolerance=1e-6))
     np.testing.assert_allclose(exact.values, built.truth.parameters[:4], atol=1e-9)
     sightings = sum(len(tie.sightings) for tie in ties)
     assert exact.redundancy == pytest.approx(3 * sightings + 3 - 3 * len(ties) - 4, abs=1e-6)
-    noisy = adjust(built.flight, Features(ties=tied(built, 0.05, 2)), Wish(), prior)
+    noisy = adjust(built.flight, Features(ties=tied(built, 0.05, 2)), ParameterOptions(), prior)
     assert (np.abs(noisy.values - built.truth.parameters[:4]) < 3.5 * noisy.sigmas).all()
     assert 0.8 < noisy.variance_factor < 1.2
     figures = [noisy.variance_factor, noisy.global_test, *((one.variance_factor, one.rms_m) for one in noisy.groups)]
@@ -226,11 +226,11 @@ def test_a_wrong_sighting_is_taken_out() -> None:
     built = made(noise=0.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)
     ties = list(tied(built, 0.05, 2))
-    good = adjust(built.flight, Features(ties=tuple(ties)), Wish(), prior)
+    good = adjust(built.flight, Features(ties=tuple(ties)), ParameterOptions(), prior)
     first = ties[3].sightings[0]
     wrong = replace(first, point_t=first.point_t + np.array([0.0, 2.0, 0.5]))
     ties[3] = replace(ties[3], sightings=(wrong, *ties[3].sightings[1:]))
-    found = adjust(built.flight, Features(ties=tuple(ties)), Wish(), prior)
+    found = adjust(built.flight, Features(ties=tuple(ties)), ParameterOptions(), prior)
     (residuals,) = (one for one in found.residuals if one.group == "ties")
     taken = np.flatnonzero(residuals.weight == 0.0)
     assert set(residuals.feature[taken]) == {3}
@@ -256,14 +256,14 @@ def test_control_determines_the_range_offset_and_says_what_each_point_does() -> 
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     features = controlled(built)
-    without = adjust(built.flight, built.features, Wish(), prior, PLAIN)
-    found = adjust(built.flight, features, Wish(), prior, PLAIN)
+    without = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN)
+    found = adjust(built.flight, features, ParameterOptions(), prior, PLAIN)
     assert found.sigmas[3] < 0.9 * without.sigmas[3]
     assert abs(found.values[3] - built.truth.parameters[3]) < 3 * found.sigmas[3]
     planes = list(features.planes)
     left_out = planes[5].control[1]
     planes[5] = replace(planes[5], control=planes[5].control[:1])
-    again = adjust(built.flight, Features(tuple(planes)), Wish(), prior, PLAIN)
+    again = adjust(built.flight, Features(tuple(planes)), ParameterOptions(), prior, PLAIN)
     (fit,) = (one for one in found.control if one.name == left_out.name)
     change = (again.values - found.values) / found.sigmas
     np.testing.assert_allclose([fit.influence[name] for name in found.names], change, atol=1e-4)
@@ -279,7 +279,7 @@ def test_control_that_is_too_high_is_seen() -> None:
     point = planes[10].control[0]
     high = replace(point, position_t=point.position_t + np.array([0.0, 0.0, 0.3]))
     planes[10] = replace(planes[10], control=(high, planes[10].control[1]))
-    found = adjust(built.flight, Features(tuple(planes)), Wish(), prior)
+    found = adjust(built.flight, Features(tuple(planes)), ParameterOptions(), prior)
     worst = max(found.control, key=lambda fit: abs(fit.normalised))
     assert worst.name == point.name
     assert worst.misclosure_m > 0.1
@@ -290,8 +290,8 @@ def test_a_surveyed_plane_gives_the_height() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     given = tuple(replace(plane, given_sigma_m=0.005, given_sigma_rad=1e-4) for plane in built.features.planes)
-    free = adjust(built.flight, built.features, Wish(), prior)
-    found = adjust(built.flight, Features(given), Wish(), prior)
+    free = adjust(built.flight, built.features, ParameterOptions(), prior)
+    found = adjust(built.flight, Features(given), ParameterOptions(), prior)
     assert found.sigmas[3] < 0.7 * free.sigmas[3]
     assert (np.abs(found.values - built.truth.parameters[:4]) < 3.5 * found.sigmas).all()
 
@@ -299,7 +299,7 @@ def test_a_surveyed_plane_gives_the_height() -> None:
 def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    good = adjust(built.flight, built.features, Wish(), prior)
+    good = adjust(built.flight, built.features, ParameterOptions(), prior)
     g, swaths, wrong = np.random.default_rng(6), [], 0
     for swath in built.flight.swaths:
         rows = swath.rows.copy()
@@ -307,7 +307,7 @@ def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
         rows["range_m"][hit] += g.uniform(0.5, 6.0, int(hit.sum()))
         wrong += int(hit.sum())
         swaths.append(replace(swath, rows=rows))
-    found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, Wish(), prior)
+    found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, ParameterOptions(), prior)
     (residuals,) = found.residuals
     assert (np.abs(found.values - good.values) < good.sigmas).all()
     assert 0.97 * wrong <= (residuals.weight == 0.0).sum() <= 1.02 * wrong
@@ -317,8 +317,8 @@ def test_ten_percent_of_gross_errors_change_nothing_by_a_sigma() -> None:
 def test_sigmas_grow_where_the_observations_are_worse_than_they_say() -> None:
     built = made(noise=2.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior, Settings(family=0.0))
-    said = adjust(built.flight, built.features, Wish(), prior, Settings(family=0.0, test_level=0.0))
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, Settings(family=0.0))
+    said = adjust(built.flight, built.features, ParameterOptions(), prior, Settings(family=0.0, test_level=0.0))
     assert found.scaled
     assert not said.scaled
     assert 3.5 < found.variance_factor < 4.2
@@ -328,7 +328,7 @@ def test_sigmas_grow_where_the_observations_are_worse_than_they_say() -> None:
 def test_what_is_not_determined_is_held_at_its_start() -> None:
     built = made(lines=LINES[:2], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior)
     assert {one.name for one in found.held} == {"range_offset_m"}
     assert found.names == ("left.omega_rad", "left.phi_rad", "left.kappa_rad")
     assert found.calibrations["left"].value("range_offset_m") == 0.0
@@ -339,8 +339,8 @@ def test_prediction_is_what_the_adjustment_finds() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
     at_truth = {"left": built.truth}
-    asked, covariance = predict(built.flight, built.features, Wish(), prior, start=at_truth)
-    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, at_truth)
+    asked, covariance = predict(built.flight, built.features, ParameterOptions(), prior, start=at_truth)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, at_truth)
     assert asked.names == found.names
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), found.sigmas, rtol=1e-3)
 
@@ -354,11 +354,11 @@ def test_correspondences_are_found_anew_until_they_are_stable() -> None:
         asked.append(calibrations)
         return built.features
 
-    found = adjust(built.flight, built.features, Wish(), prior, rematch=rematch)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, rematch=rematch)
     assert found.matchings == 2
     assert len(asked) == 1
     coarse = Features(tuple(built.features.planes[:12]))
-    more = adjust(built.flight, coarse, Wish(), prior, rematch=rematch)
+    more = adjust(built.flight, coarse, ParameterOptions(), prior, rematch=rematch)
     np.testing.assert_allclose(more.values, found.values, atol=0.02 * found.sigmas.min())
     assert more.matchings == 3
 
@@ -373,25 +373,25 @@ def test_everything_that_was_observed_is_adjusted_once_correspondences_stay() ->
         asked.append(calibrations)
         return built.features
 
-    found = adjust(built.flight, part, Wish(), prior, rematch=lambda _: part, entire=everything)
-    whole = adjust(built.flight, built.features, Wish(), prior)
-    less = adjust(built.flight, part, Wish(), prior)
+    found = adjust(built.flight, part, ParameterOptions(), prior, rematch=lambda _: part, entire=everything)
+    whole = adjust(built.flight, built.features, ParameterOptions(), prior)
+    less = adjust(built.flight, part, ParameterOptions(), prior)
     assert len(asked) == 1
     np.testing.assert_allclose(asked[0]["left"].parameters, less.calibrations["left"].parameters, atol=1e-6)
     np.testing.assert_allclose(found.values, whole.values, atol=0.05 * whole.sigmas.min())
     np.testing.assert_allclose(found.sigmas, whole.sigmas, rtol=1e-3)
     assert (found.sigmas < less.sigmas).all()
-    same = adjust(built.flight, part, Wish(), prior, entire=lambda _: None)
+    same = adjust(built.flight, part, ParameterOptions(), prior, entire=lambda _: None)
     np.testing.assert_array_equal(same.values, less.values)
 
 
 def test_returns_that_scatter_less_than_is_said_are_weighed_by_what_they_scatter() -> None:
     built = made(noise=0.5, points=30)
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior, entire=lambda _: built.features)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, entire=lambda _: built.features)
     quieter = replace(built.flight.heads[0], noise=NOISE.times(0.5))
-    known = adjust(replace(built.flight, heads=(quieter,)), built.features, Wish(), prior)
-    said = adjust(built.flight, built.features, Wish(), prior)
+    known = adjust(replace(built.flight, heads=(quieter,)), built.features, ParameterOptions(), prior)
+    said = adjust(built.flight, built.features, ParameterOptions(), prior)
     np.testing.assert_allclose(found.sigmas, known.sigmas, rtol=0.05)
     assert (found.sigmas < 0.95 * said.sigmas).any()
     assert found.variance_factor == pytest.approx(1.0, abs=0.1)
@@ -402,8 +402,8 @@ def test_returns_that_scatter_less_than_is_said_are_weighed_by_what_they_scatter
 def test_returns_that_scatter_as_is_said_or_more_keep_their_sigmas(noise: float) -> None:
     built = made(noise=noise, points=30)
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior, entire=lambda _: built.features)
-    said = adjust(built.flight, built.features, Wish(), prior)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, entire=lambda _: built.features)
+    said = adjust(built.flight, built.features, ParameterOptions(), prior)
     np.testing.assert_allclose(found.sigmas, said.sigmas, rtol=1e-3)
     assert not any("scatter" in note for note in found.notes)
 
@@ -411,7 +411,7 @@ def test_returns_that_scatter_as_is_said_or_more_keep_their_sigmas(noise: float)
 def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
     built = made()
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior).trajectory
+    found = adjust(built.flight, built.features, ParameterOptions(), prior).trajectory
     assert found is not None
     assert found.position_l.shape == (len(prior.time_ns), 3)
     assert (found.attitude_sigma_rad <= found.prior_attitude_sigma_rad * (1 + 1e-9)).all()
@@ -421,7 +421,7 @@ def test_the_trajectory_comes_out_with_sigmas_below_the_prior() -> None:
 
 def test_without_observations_there_is_one_plain_line() -> None:
     with pytest.raises(NormalError, match="nothing to adjust; want strips that overlap"):
-        adjust(made(lines=LINES[:1]).flight, Features(), Wish())
+        adjust(made(lines=LINES[:1]).flight, Features(), ParameterOptions())
 
 
 SCALED = {
@@ -444,7 +444,7 @@ def test_a_held_scale_stands_in_the_sigma_of_the_range_offset(lines: tuple[Line,
     """A scan angle scale 250 ppm off moves the range offset by decimetres; taken as exact it would be many sigmas."""
     built = made(truth=SCALED, lines=lines, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
-    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, start)
     assert found.names == tuple(f"left.{name}" for name in MODELS["basic"])
     error = np.abs(found.values - built.truth.parameters[:4])
     own = np.sqrt(found.sigmas**2 - (found.moved**2).sum(axis=1))
@@ -462,7 +462,7 @@ def test_what_two_lines_tell_in_part_is_estimated_with_its_start() -> None:
     """Of the model `scanner`: each sigma is at most what is plausible, and the scale is no reason for a wrong range."""
     built = made(truth=SCALED, lines=CROSSING, points=100)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
-    found = adjust(built.flight, built.features, Wish("scanner"), prior, PLAIN, start)
+    found = adjust(built.flight, built.features, ParameterOptions("scanner"), prior, PLAIN, start)
     kinds = [INDEX[name.partition(".")[2]] for name in found.names]
     assert INDEX["scan_angle_scale"] in kinds
     assert (found.sigmas <= [1.001 * PARAMETERS[kind].plausible for kind in kinds]).all()
@@ -473,11 +473,11 @@ def test_what_a_held_parameter_does_is_what_another_start_of_it_does() -> None:
     """Against the adjustment itself, started with the parameter one sigma away."""
     built = made(lines=LINES[:6])
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
-    found = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, start)
     for name in ("scan_angle_scale", "range_scale", "time_offset_s"):
         column = [one.name for one in found.considered].index(name)
         away = {"left": start["left"].changed(**{name: found.considered[column].sigma})}
-        other = adjust(built.flight, built.features, Wish(), prior, PLAIN, away)
+        other = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, away)
         moved = found.moved[:, column]  # linear to a thousandth
         assert (np.abs(other.values - found.values - moved) < 1e-3 * (np.abs(moved) + found.sigmas)).all()
 
@@ -486,14 +486,14 @@ def test_a_flight_that_contradicts_what_is_held_says_so() -> None:
     """A scale said to be known to 5 ppm that is 250 ppm off: the flight sees it, and its sigma is not believed."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), unknown_start(built)
-    wish = Wish(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
+    wish = ParameterOptions(fix=frozenset(["scan_angle_scale"]), priors={"scan_angle_scale": 5e-6})
     found = adjust(built.flight, built.features, wish, prior, PLAIN, start)
     (one,) = (one for one in found.considered if one.contradicted)
     assert one.name == "scan_angle_scale"
     assert abs(one.told - 2.5e-4) < 4.0 * one.told_sigma
     assert one.sigma == pytest.approx(abs(one.told))
     assert (np.abs(found.values - built.truth.parameters[:4]) < 4.0 * found.sigmas).all()
-    plain = adjust(built.flight, built.features, Wish(), prior, PLAIN, start)
+    plain = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN, start)
     assert not any(one.contradicted for one in plain.considered)
 
 
@@ -502,7 +502,7 @@ def test_what_is_held_at_the_user_s_word_is_said_to_be_wrong_where_the_flight_kn
     """However plausible its error is; its sigma stays what is plausible."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
-    wish, away = Wish(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
+    wish, away = ParameterOptions(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]
     right = adjust(built.flight, built.features, wish, prior, PLAIN, start)
     assert not any(one.contradicted for one in right.considered)
     off = {"left": start["left"].changed(**{name: built.truth.value(name) + away})}
@@ -516,7 +516,7 @@ def test_what_is_held_at_the_user_s_word_is_said_to_be_wrong_where_the_flight_kn
 def test_where_nothing_is_determined_all_is_held() -> None:
     built = made(lines=LINES[:1], planes=roofs(0.0))
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior)
     assert found.names == ()
     assert {one.name for one in found.held} == {"omega_rad", "phi_rad", "kappa_rad", "range_offset_m"}
     assert found.calibrations["left"].value("omega_rad") == 0.0
@@ -530,7 +530,7 @@ LOGARITHM = 0.3 * np.log((INTENSITY + 30.0) / (KNOTS[3] + 30.0))
 def by_intensity(correction_m: FloatArray, noise: float = 1.0) -> Adjusted:
     """Of a scanner with this correction at `INTENSITY`."""
     built = made(ibrc=(INTENSITY, correction_m), points=24, noise=noise)
-    wish = Wish(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
+    wish = ParameterOptions(ibrc_knots=tuple(KNOTS.tolist()), ibrc_reference=45.0, ibrc_smoothness_m=1.0)
     return adjust(built.flight, built.features, wish, gauss_markov(built.flight, Taus(), 4.0))
 
 

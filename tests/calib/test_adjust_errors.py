@@ -11,7 +11,7 @@ from swath.calib.equations.normals import TrajectoryWeight
 from swath.calib.equations.rows import Rows
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from tests.calib.roofs import LINES, made, trajectory
 from tests.calib.test_rows import shifted
 
@@ -26,14 +26,14 @@ def test_errors_over_many_runs_are_as_large_as_the_sigmas_say() -> None:
     flown = trajectory(lines)
     base = made(lines=lines, points=4, seed=5)
     prior = gauss_markov(base.flight, Taus(), 4.0)
-    weight = TrajectoryWeight(Rows(base.flight, (), unknowns(base.flight, Wish()), prior))
+    weight = TrajectoryWeight(Rows(base.flight, (), unknowns(base.flight, ParameterOptions()), prior))
     root, g = np.linalg.cholesky(prior.covariance), np.random.default_rng(2024)
     offs, inside = [], 0
     for run in range(RUNS):
         errors = weight.to_e((root @ g.normal(size=len(root)))[:, np.newaxis]).reshape(-1, 6)
         true = shifted(flown, prior, errors)
         built = made(lines=lines, points=4, seed=100 + run, true=true)
-        found = adjust(built.flight, built.features, Wish(), prior, Settings(huber=0.0, family=0.0))
+        found = adjust(built.flight, built.features, ParameterOptions(), prior, Settings(huber=0.0, family=0.0))
         off = (found.values - built.truth.parameters[:4]) / found.sigmas
         offs.append(off)
         inside += int((np.abs(off) < 1.96).sum())

@@ -12,7 +12,7 @@ from swath.calib.adjust import adjust
 from swath.calib.equations.solve import Settings
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import ControlPoint, Features
-from swath.calib.parameters import Wish
+from swath.calib.parameters import ParameterOptions
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
@@ -48,7 +48,7 @@ def test_six_lines_and_thirty_control_points_tell_the_boresight_of_a_mems_unit(s
     features = with_points(planes, 6, seed)
     assert sum(len(plane.control) for plane in features.planes) == 30
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, features, Wish(case.model), prior, Settings(huber=0.0, family=0.0))
+    found = adjust(built.flight, features, ParameterOptions(case.model), prior, Settings(huber=0.0, family=0.0))
     assert set(found.names) == {*ANGLES, "left.range_offset_m"}
     assert found.held == ()
     sigmas = dict(zip(found.names, found.sigmas.tolist(), strict=True))

@@ -9,7 +9,7 @@ from swath.calib.equations.inverse import inverted
 from swath.calib.equations.normals import TrajectoryWeight
 from swath.calib.equations.rows import Rows
 from swath.calib.equations.trajectory_prior import gauss_markov
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from tests.calib.roofs import LINES, made
 
 
@@ -33,7 +33,7 @@ def test_what_is_not_positive_definite_has_none(last: float) -> None:
 def test_the_trajectorys_weight_and_variances_are_turned_with_the_axes() -> None:
     flight = made(lines=LINES[:2], points=2).flight
     prior = gauss_markov(flight, knot_s=5.0)
-    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, Wish()), prior))
+    weight = TrajectoryWeight(Rows(flight, (), unknowns(flight, ParameterOptions()), prior))
     turn = np.zeros((len(prior), 2, 3, len(prior), 2, 3))
     for knot in range(len(prior)):
         turn[knot, 0, :, knot, 0] = turn[knot, 1, :, knot, 1] = weight.rot_e_from_l[knot]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swath.calib.equations.observability import RULES, Rules, decide, kind_of, spectrum
-from swath.calib.outcome import Held
+from swath.calib.outcome import FixedParameter
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic, rot_e_from_l
 from swath.georef.geodesy.rotations import quaternion_from_rot, rot_l_from_b
@@ -144,7 +144,7 @@ def reduced(name: str, roofs: bool, names: tuple[str, ...]) -> FloatArray:
     return normal
 
 
-def held_by(*given: Any) -> tuple[Held, ...]:
+def held_by(*given: Any) -> tuple[FixedParameter, ...]:
     """Return what `decide` holds."""
     return decide(*given)[0]
 
@@ -209,7 +209,7 @@ def test_the_table_of_designs(
         assert abs(rho - printed) <= 0.51 * 10.0**-digits, (one, other, rho)
 
 
-def held_of(lines: str, roofs: bool, *added: str) -> dict[str, Held]:
+def held_of(lines: str, roofs: bool, *added: str) -> dict[str, FixedParameter]:
     names = [f"left.{name}" for name in (*BASIC, *added)]
     return {held.name: held for held in held_by(reduced(lines, roofs, (*BASIC, *added)), names)}
 

@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 
 from swath.calib.flight import Flight, Head
 from swath.calib.intensity_curve import at_knots
-from swath.calib.parameters import MODELS, ParameterError, Unknowns, Wish, unknowns
+from swath.calib.parameters import MODELS, ParameterError, ParameterOptions, Unknowns, unknowns
 from swath.georef.scanner.beams import LineGeometry, SpinningGeometry
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration, RangeOffset, nominal
 from tests.calib.roofs import LINES, frame, trajectory
@@ -41,7 +41,9 @@ def test_models_are_those_of_the_program() -> None:
 
 
 def test_several_heads_stand_in_one_vector() -> None:
-    asked = unknowns(flight(), Wish("scanner", fix=frozenset(["left.kappa_rad"]), priors={"lever_arm_z_m": 0.02}))
+    asked = unknowns(
+        flight(), ParameterOptions("scanner", fix=frozenset(["left.kappa_rad"]), priors={"lever_arm_z_m": 0.02})
+    )
     left, top = ([name.split(".", 1)[1] for name in asked.names if name.startswith(head)] for head in ("left", "top"))
     assert left == [name for name in INDEX if name in {*MODELS["scanner"], "lever_arm_z_m"} - {"kappa_rad"}]
     assert "scan_plane_tilt_rad" not in top  # a spinning head has none
@@ -56,17 +58,17 @@ def test_several_heads_stand_in_one_vector() -> None:
 
 
 def test_the_scan_angle_s_offset_is_held_unless_it_is_freed() -> None:
-    held = unknowns(flight(), Wish("full"))
+    held = unknowns(flight(), ParameterOptions("full"))
     assert "left.scan_angle_offset_rad" not in held.names
     assert any(one.name == "scan_angle_offset_rad" and "boresight" in one.why for one in held.held)
-    freed = unknowns(flight(), Wish("full", free=frozenset(["left.scan_angle_offset_rad"])))
+    freed = unknowns(flight(), ParameterOptions("full", free=frozenset(["left.scan_angle_offset_rad"])))
     assert "left.scan_angle_offset_rad" in freed.names
 
 
 def test_what_is_said_of_one_scanner_stands_above_what_is_said_of_all() -> None:
     asked = unknowns(
         flight(),
-        Wish(
+        ParameterOptions(
             fix=frozenset(["omega_rad", "left.phi_rad"]),
             free=frozenset(["top.omega_rad", "top.kappa_rad"]),
             priors={"phi_rad": 0.1, "kappa_rad": 0.2},
@@ -91,7 +93,7 @@ def extras() -> Unknowns:
         beams={2: BeamCorrection(0.01, 0.02, 0.03)},
     )
     made = replace(made, heads=(made.heads[0], replace(made.heads[1], start=old)))
-    wish = Wish(
+    wish = ParameterOptions(
         ibrc_knots=(0.0, 50.0, 75.0, 100.0),
         ibrc_reference=50.0,
         beams=frozenset(["azimuth_rad", "range_m"]),
@@ -132,7 +134,7 @@ def test_a_curve_comes_back_at_the_same_knots() -> None:
     done = asked.calibrations(asked.start + np.arange(1, len(asked) + 1) * 1e-3)
     made = flight()
     again = replace(made, heads=tuple(replace(head, start=done[head.name]) for head in made.heads))
-    wish = Wish(ibrc_knots=(0.0, 50.0, 75.0, 100.0), ibrc_reference=50.0)
+    wish = ParameterOptions(ibrc_knots=(0.0, 50.0, 75.0, 100.0), ibrc_reference=50.0)
     asked = unknowns(again, wish)
     for name, found in asked.calibrations(asked.start).items():
         before = done[name].ibrc
@@ -152,7 +154,7 @@ def test_pseudo_observations_are_priors_and_bends() -> None:
     correction_m = at_knots(table[1])
     bend = correction_m[2] - (correction_m[1] + correction_m[3]) / 2.0
     assert misclosure[3] == pytest.approx(bend / 0.02)
-    prior = unknowns(flight(), Wish(priors={"left.phi_rad": 0.01}))
+    prior = unknowns(flight(), ParameterOptions(priors={"left.phi_rad": 0.01}))
     design, misclosure = prior.pseudo(prior.start + 0.005)
     assert design.shape == (1, 8)
     assert design[0, 1] == pytest.approx(100.0)
@@ -160,7 +162,7 @@ def test_pseudo_observations_are_priors_and_bends() -> None:
 
 
 def test_sigmas_and_correlations_go_to_their_head() -> None:
-    asked = unknowns(flight(), Wish())
+    asked = unknowns(flight(), ParameterOptions())
     root = np.random.default_rng(5).normal(size=(8, 8))
     covariance = root @ root.T
     held = np.array([one.plausible for one in asked.considered])
@@ -174,7 +176,7 @@ def test_sigmas_and_correlations_go_to_their_head() -> None:
     np.testing.assert_allclose(done.covariance()[at, arm], moved[4:, own] * 0.002)
 
 
-def held_sigma(name: str, wish: Wish, start: Calibration | None = None) -> float:
+def held_sigma(name: str, wish: ParameterOptions, start: Calibration | None = None) -> float:
     """One sigma of a parameter of ``left`` that is not estimated; 0: it counts as exact."""
     starts = flight().starts()
     asked = unknowns(flight(), wish, starts if start is None else {**starts, "left": start})
@@ -185,31 +187,35 @@ def held_sigma(name: str, wish: Wish, start: Calibration | None = None) -> float
 def test_how_well_a_held_parameter_is_known() -> None:
     """By the user, by an earlier calibration, by what is plausible of it, in this order."""
     scale, fixed = INDEX["scan_angle_scale"], frozenset(["scan_angle_scale"])
-    assert held_sigma("scan_angle_scale", Wish()) == pytest.approx(3e-4)
-    assert held_sigma("scan_angle_scale", Wish("scanner", fix=fixed)) == pytest.approx(3e-4)
-    assert held_sigma("scan_angle_scale", Wish(fix=fixed, priors={"scan_angle_scale": 1e-5})) == 1e-5
+    assert held_sigma("scan_angle_scale", ParameterOptions()) == pytest.approx(3e-4)
+    assert held_sigma("scan_angle_scale", ParameterOptions("scanner", fix=fixed)) == pytest.approx(3e-4)
+    assert held_sigma("scan_angle_scale", ParameterOptions(fix=fixed, priors={"scan_angle_scale": 1e-5})) == 1e-5
     assert (
         held_sigma(
-            "scan_angle_scale", Wish(fix=frozenset(["left.scan_angle_scale"]), priors={"left.scan_angle_scale": 2e-5})
+            "scan_angle_scale",
+            ParameterOptions(fix=frozenset(["left.scan_angle_scale"]), priors={"left.scan_angle_scale": 2e-5}),
         )
         == 2e-5
     )
     found = np.zeros(len(PARAMETERS))
     found[scale] = 6e-6
     earlier = replace(flight().starts()["left"], method="planes", sigmas=found)
-    assert held_sigma("scan_angle_scale", Wish(), earlier) == 6e-6
-    assert held_sigma("scan_angle_scale", Wish(), replace(earlier, sigmas=0.0 * found, held_sigmas=found)) == 6e-6
-    assert held_sigma("scan_angle_scale", Wish(), replace(earlier, method="nominal")) == pytest.approx(3e-4)
-    assert held_sigma("lever_arm_z_m", Wish("scanner")) == 0.002
-    assert held_sigma("lever_arm_z_m", Wish("full", fix=frozenset(["lever_arm_z_m"]))) == 0.05
-    assert held_sigma("pitch_slope", Wish("scanner")) == 0.0
-    assert held_sigma("scan_angle_offset_rad", Wish("full")) == 0.0
+    assert held_sigma("scan_angle_scale", ParameterOptions(), earlier) == 6e-6
+    assert (
+        held_sigma("scan_angle_scale", ParameterOptions(), replace(earlier, sigmas=0.0 * found, held_sigmas=found))
+        == 6e-6
+    )
+    assert held_sigma("scan_angle_scale", ParameterOptions(), replace(earlier, method="nominal")) == pytest.approx(3e-4)
+    assert held_sigma("lever_arm_z_m", ParameterOptions("scanner")) == 0.002
+    assert held_sigma("lever_arm_z_m", ParameterOptions("full", fix=frozenset(["lever_arm_z_m"]))) == 0.05
+    assert held_sigma("pitch_slope", ParameterOptions("scanner")) == 0.0
+    assert held_sigma("scan_angle_offset_rad", ParameterOptions("full")) == 0.0
 
 
 def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -> None:
     starts = flight().starts()
     near = {name: one.changed(omega_rad=0.01, kappa_rad=0.02, range_offset_m=9.0) for name, one in starts.items()}
-    asked = unknowns(flight(), Wish(fix=frozenset(["kappa_rad"])), starts, near)
+    asked = unknowns(flight(), ParameterOptions(fix=frozenset(["kappa_rad"])), starts, near)
     first = dict(zip(asked.names, asked.first.tolist(), strict=True))
     start = dict(zip(asked.names, asked.start.tolist(), strict=True))
     assert first["left.omega_rad"] == 0.01
@@ -225,17 +231,20 @@ def test_what_is_held_keeps_the_start_and_what_is_estimated_begins_elsewhere() -
 @pytest.mark.parametrize(
     ("wish", "text"),
     [
-        (Wish("everything"), "want one of basic, scanner, full"),
-        (Wish(fix=frozenset(["omega"])), "omega: is no parameter"),
-        (Wish(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
-        (Wish(priors={"phi_rad": 0.0}), "want a sigma above 0"),
-        (Wish(fix=frozenset(["right.omega_rad"])), "parameters of right: no such scanner in this flight, but "),
-        (Wish(priors={"fie_rad": 0.1}), "prior fie_rad"),
-        (Wish(ibrc_knots=(5.0, 5.0)), "rising intensities"),
-        (Wish(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
+        (ParameterOptions("everything"), "want one of basic, scanner, full"),
+        (ParameterOptions(fix=frozenset(["omega"])), "omega: is no parameter"),
+        (ParameterOptions(free=frozenset(["top.pitch_slope"])), "top.pitch_slope: cannot be freed"),
+        (ParameterOptions(priors={"phi_rad": 0.0}), "want a sigma above 0"),
+        (
+            ParameterOptions(fix=frozenset(["right.omega_rad"])),
+            "parameters of right: no such scanner in this flight, but ",
+        ),
+        (ParameterOptions(priors={"fie_rad": 0.1}), "prior fie_rad"),
+        (ParameterOptions(ibrc_knots=(5.0, 5.0)), "rising intensities"),
+        (ParameterOptions(beams=frozenset(["roll_rad"])), "beams: got 'roll_rad'"),
     ],
 )
-def test_wishes_that_cannot_be_met_are_refused(wish: Wish, text: str) -> None:
+def test_wishes_that_cannot_be_met_are_refused(wish: ParameterOptions, text: str) -> None:
     with pytest.raises(ParameterError, match=text.replace(".", r"\.")) as refused:
         unknowns(flight(), wish)
     assert "\n" not in str(refused.value)
@@ -244,4 +253,4 @@ def test_wishes_that_cannot_be_met_are_refused(wish: Wish, text: str) -> None:
 def test_a_beam_s_correction_needs_a_spinning_head() -> None:
     only = replace(flight(), heads=flight().heads[:1])
     with pytest.raises(ParameterError, match="no scanner of this flight is a spinning head"):
-        unknowns(only, Wish(beams=frozenset(["range_m"])))
+        unknowns(only, ParameterOptions(beams=frozenset(["range_m"])))

@@ -14,7 +14,7 @@ from swath.calib.equations.tie_rows import Ties
 from swath.calib.equations.trajectory_prior import apply, draw, gauss_markov
 from swath.calib.features import ControlPoint
 from swath.calib.flight import FlightError
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from swath.calib.plan import MOST_MADE, Scan, planned, predict, search_cell_m
 from swath.georef.arrays import FloatArray
 from tests.calib.planned_flight import (
@@ -72,13 +72,13 @@ def test_sigmas_are_those_of_flights_with_such_errors() -> None:
     A trajectory taken as white would make these four sigmas several times too small.
     """
     flight, features = flown(ONE_HEIGHT)
-    prior, wanted = gauss_markov(flight), unknowns(flight, Wish())
-    predicted = predict(flight, features, Wish(), prior)
+    prior, wanted = gauss_markov(flight), unknowns(flight, ParameterOptions())
+    predicted = predict(flight, features, ParameterOptions(), prior)
     assert predicted.held == ()
     assert predicted.returns == sum(len(swath) for swath in flight.swaths)
     covariance = predicted.correlation * np.outer(predicted.sigmas, predicted.sigmas)
     rng, found, white = np.random.default_rng(11), [], []
-    careless = predict(flight, features, Wish(), None)
+    careless = predict(flight, features, ParameterOptions(), None)
     for seed in range(60):
         errors = draw(prior, rng)
         spoilt = replace(flight, trajectories=(apply(flight.trajectories[0], 0, prior, -errors),))
@@ -96,21 +96,21 @@ def test_sigmas_are_those_of_flights_with_such_errors() -> None:
 def test_a_second_height_tells_time_from_pitch_and_control_the_range() -> None:
     """What each design adds."""
     one, two = flown(ONE_HEIGHT), flown(TWO_HEIGHTS)
-    model = Wish("scanner")
+    model = ParameterOptions("scanner")
     low = predict(one[0], one[1], model, gauss_markov(one[0]))
     high = predict(two[0], two[1], model, gauss_markov(two[0]))
     sigma_low, sigma_high = (dict(zip(one.names, one.sigmas.tolist(), strict=True)) for one in (low, high))
     assert sigma_high["left.range_scale"] < 0.5 * sigma_low.get("left.range_scale", np.inf)
     assert sigma_high["left.time_offset_s"] < sigma_low.get("left.time_offset_s", np.inf)
     flight, features = flown(OPPOSITE, roofs=False)
-    told = {held.name for held in predict(flight, features, Wish(), gauss_markov(flight)).held}
+    told = {held.name for held in predict(flight, features, ParameterOptions(), gauss_markov(flight)).held}
     assert told == {"range_offset_m"}
     planes = tuple(
         replace(plane, control=(ControlPoint(f"{index}", plane.centre_t, 0.01),)) if index % 4 == 0 else plane
         for index, plane in enumerate(features.planes)
     )
     controlled = replace(features, planes=planes)
-    sigmas = predict(flight, controlled, Wish(), gauss_markov(flight))
+    sigmas = predict(flight, controlled, ParameterOptions(), gauss_markov(flight))
     assert sigmas.held == ()
     assert sigmas.sigmas[sigmas.names.index("left.range_offset_m")] < 0.02
 

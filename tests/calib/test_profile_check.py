@@ -12,7 +12,7 @@ from swath.calib.equations.trajectory_prior import Taus, TrajectoryPrior, apply,
 from swath.calib.features import ControlPoint
 from swath.calib.flight import Flight
 from swath.calib.outcome import Adjusted
-from swath.calib.parameters import Wish
+from swath.calib.parameters import ParameterOptions
 from swath.calib.planes.search import find_planes
 from swath.calib.profiles.check import CHECK, check, compare
 from swath.calib.profiles.influence import influence
@@ -122,7 +122,7 @@ def test_opposite_lines_side_by_side_do_not_tell_heading_from_pitch(prior: Traje
 def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: TrajectoryPrior) -> None:
     moved = flown_wrong(flight, prior, draw(prior, np.random.default_rng(3)))
     known = {name: exactly_known(one) for name, one in moved.starts().items()}
-    wish = Wish("basic", fix=frozenset({"range_offset_m"}))
+    wish = ParameterOptions("basic", fix=frozenset({"range_offset_m"}))
     adjusted = adjust(moved, find_planes(moved), wish, prior, start=known)
     placed = moved.placed(adjusted.calibrations)
     checked = check(placed, adjusted, prior)

@@ -15,7 +15,7 @@ from swath.calib.equations.rows import Rows, State
 from swath.calib.equations.solve import Block, Settings, solved
 from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
-from swath.calib.parameters import Wish, unknowns
+from swath.calib.parameters import ParameterOptions, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.records import Int64Array
 from tests.calib.printed import printed
@@ -37,7 +37,7 @@ def test_printed_limits() -> None:
 def test_the_printed_huber_weight() -> None:
     """Four times six steps with weights of the last solution; a blunder of 0.6 m gets 0.185."""
     flight, features = printed().with_blunder().flight()
-    block = Block.of(flight, features, unknowns(flight, Wish()), None, None)
+    block = Block.of(flight, features, unknowns(flight, ParameterOptions()), None, None)
     done = solved(block, Settings(huber=HUBER, family=0.0, rounds=0, tolerance=1e-3), block.start())
     (residuals,) = done.quality.residuals
     size = residuals.misclosure_m.astype(float) / residuals.sigma_m
@@ -53,7 +53,7 @@ def test_redundancy_is_that_of_the_dense_solution() -> None:
     built = made(lines=LINES[:4], points=5)
     prior = gauss_markov(built.flight, Taus(), 5.0)
     features = controlled(built)
-    block = Block.of(built.flight, features, unknowns(built.flight, Wish()), prior, None)
+    block = Block.of(built.flight, features, unknowns(built.flight, ParameterOptions()), prior, None)
     done = solved(block, replace(PLAIN, tolerance=1e-5), block.start())
     rows, state = done.solution.rows, done.solution.state
     columns, misclosure, variance, _ = design(rows, state)
@@ -111,7 +111,7 @@ def test_redundancy_is_that_of_rows_that_share_an_error() -> None:
     built = made(lines=LINES[:4], points=25)
     prior = gauss_markov(built.flight, Taus(), 5.0)
     prior = replace(prior, walk_rad2=np.full(len(prior), (6e-5) ** 2))
-    block = Block.of(built.flight, built.features, unknowns(built.flight, Wish()), prior, None)
+    block = Block.of(built.flight, built.features, unknowns(built.flight, ParameterOptions()), prior, None)
     done = solved(block, PLAIN, block.start())
     rows, state, u = done.solution.rows, done.solution.state, done.solution.rows.size
     run_of, variance, common = sharing(rows, state)
@@ -147,7 +147,7 @@ def test_the_variance_factor_of_rows_that_share_an_error_is_one() -> None:
     built, factors, rejected = made(lines=LINES[:4], points=25), [], 0
     prior = gauss_markov(built.flight, Taus(), 5.0)
     prior = replace(prior, walk_rad2=np.full(len(prior), (8e-5) ** 2))
-    seen = Rows(built.flight, built.features.planes, unknowns(built.flight, Wish()), prior)
+    seen = Rows(built.flight, built.features.planes, unknowns(built.flight, ParameterOptions()), prior)
     run_of, variance, common = sharing(seen, seen.start())
     assert np.median(common / variance) > 0.3
     along = np.concatenate([looks.along for _, looks in seen.looks(seen.start())])
@@ -158,7 +158,7 @@ def test_the_variance_factor_of_rows_that_share_an_error_is_one() -> None:
             at, ranges = np.concatenate([run.at for run in batch.runs]), swaths[batch.swath].rows.copy()
             ranges["range_m"][at] += error_m[batch.begin : batch.begin + batch.size]
             swaths[batch.swath] = replace(swaths[batch.swath], rows=ranges)
-        found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, Wish(), prior)
+        found = adjust(replace(built.flight, swaths=tuple(swaths)), built.features, ParameterOptions(), prior)
         planes = next(fit for fit in found.groups if fit.group == "planes")
         factors.append(planes.variance_factor)
         rejected += planes.rejected
@@ -178,7 +178,7 @@ def test_variance_components_tell_which_group_is_worse() -> None:
             for point in planes[index].control
         )
         planes[index] = replace(planes[index], control=points)
-    found = adjust(built.flight, Features(tuple(planes)), Wish(), prior, PLAIN)
+    found = adjust(built.flight, Features(tuple(planes)), ParameterOptions(), prior, PLAIN)
     groups = {fit.group: fit for fit in found.groups}
     assert groups["control"].variance_factor > 5.0
     assert 0.9 < groups["planes"].variance_factor < 1.1
@@ -189,7 +189,7 @@ def test_returns_that_are_no_points_count_for_nothing() -> None:
     prior = gauss_markov(built.flight, Taus(), 4.0)
     head = replace(built.flight.heads[0], range_gate=(0.0, 850.0))
     lost = sum(int((swath.rows["range_m"] + 0.18 > 850.0).sum()) for swath in built.flight.swaths)
-    found = adjust(replace(built.flight, heads=(head,)), built.features, Wish(), prior)
+    found = adjust(replace(built.flight, heads=(head,)), built.features, ParameterOptions(), prior)
     (residuals,) = found.residuals
     assert lost > 10
     assert abs(int((residuals.weight == 0.0).sum()) - lost) <= 1
@@ -201,7 +201,7 @@ def test_least_detectable_range_error_is_found_as_often_as_it_says() -> None:
     """With 0.8 probability at |w| > 3.29: errors of that size in one range each."""
     built = made(lines=LINES[:4])
     prior = gauss_markov(built.flight, Taus(), 4.0)
-    found = adjust(built.flight, built.features, Wish(), prior, PLAIN)
+    found = adjust(built.flight, built.features, ParameterOptions(), prior, PLAIN)
     (residuals,) = found.residuals
     shift = least_detectable(residuals.sigma_m.astype(float) ** 2, residuals.redundancy.astype(float))
     w = residuals.normalised + shift * np.sqrt(residuals.redundancy) / residuals.sigma_m

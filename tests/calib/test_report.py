@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from swath.calib.features import Features
 from swath.calib.labels import decimals_of, degrees, length, number, plain, share, unknown
 from swath.calib.need import Need
-from swath.calib.outcome import Adjusted, Considered, ControlFit, GroupFit, Held
+from swath.calib.outcome import Adjusted, Considered, ControlFit, FixedParameter, GroupFit
 from swath.calib.profiles.check import Check, Comparison
 from swath.calib.summary import Finding
 from swath.calib.verdict import Level, held_words
@@ -72,12 +72,15 @@ def test_verdict_of_a_good_calibration(report: ReportInput) -> None:
 
 
 def test_verdict_names_what_is_not_determined(report: ReportInput) -> None:
-    held = (Held("left", "lever_arm_z_m", "why", "control"), Held("left", "lever_arm_x_m", "at the user's word"))
+    held = (
+        FixedParameter("left", "lever_arm_z_m", "why", "control"),
+        FixedParameter("left", "lever_arm_x_m", "at the user's word"),
+    )
     verdict = judge(sound(report, held=held))
     assert verdict.level is Level.GOOD
     assert verdict.sentence.endswith("Not determined by this flight: lever arm z.")
     # A boresight angle that is not determined is a reason, and all three are the end of it.
-    pitch = Held("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
+    pitch = FixedParameter("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
     verdict = judge(sound(report, held=(pitch,)))
     assert verdict.level is Level.CARE
     assert verdict.sentence.startswith("Usable with care: not a boresight calibration: boresight φ (pitch), held, ")
@@ -99,7 +102,7 @@ def test_a_correlated_pair_is_a_reason_unless_points_are_known_as_well_as_is_wan
 @pytest.mark.parametrize(("sigma_deg", "level"), [(0.01, Level.CARE), (1.0, Level.UNUSABLE)])
 def test_a_held_angle_is_no_boresight_calibration(report: ReportInput, sigma_deg: float, level: Level) -> None:
     """At the user's word too; how well it is known decides how bad that is, and stands among the sigmas."""
-    held = (Held("left", "kappa_rad", "held at your word"),)
+    held = (FixedParameter("left", "kappa_rad", "held at your word"),)
     considered = (Considered("left", "kappa_rad", 0.0, math.radians(sigma_deg)),)
     verdict = judge(sound(report, held=held, considered=considered))
     assert verdict.level is level
@@ -319,7 +322,7 @@ def test_what_is_not_determined_comes_with_its_remedy(report: ReportInput) -> No
     assert [row[0] for row in table.rows] == ["lever arm z", "scan plane tilt Δη"]
     assert table.rows[0][1:3] == ["0.13 m", "range offset (−0.97)"]
     assert table.rows[1][1] == "none"
-    late = Held("left", "time_offset_s", "why", "a second speed", 9.757e-4)
+    late = FixedParameter("left", "time_offset_s", "why", "a second speed", 9.757e-4)
     again = held_table(replace(report, adjusted=replace(report.adjusted, held=(late,))))
     assert again is not None
     assert again.rows[0][1] == "976 µs"
@@ -396,7 +399,7 @@ def test_two_scanners(report: ReportInput) -> None:
             "right.beam.12.azimuth_rad",
             "right.range_offset_m",
         ),
-        held=(Held("right", "phi_rad", "why", "slopes", math.inf, (("left.phi_rad", 0.97),)),),
+        held=(FixedParameter("right", "phi_rad", "why", "slopes", math.inf, (("left.phi_rad", 0.97),)),),
     )
     two = replace(report, adjusted=both, headers={"left": report.headers["left"], "right": report.headers["left"]})
     assert [table.title for table in parameter_tables(two)] == ["Parameters of left", "Parameters of right"]

@@ -12,7 +12,7 @@ from swath.calib.equations.rows import Rows, State
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import Patch, Plane
 from swath.calib.flight import Flight, Head, Swath
-from swath.calib.parameters import Unknowns, Wish, unknowns
+from swath.calib.parameters import ParameterOptions, Unknowns, unknowns
 from swath.georef.arrays import FloatArray
 from swath.georef.records import RETURN_DTYPE
 from swath.georef.scanner.beams import Geometry, OusterGeometry, SpinningGeometry
@@ -44,7 +44,7 @@ VALUES = {
 }
 SURE = Noise(1e-9, 1e-12, 0.0, 0.0)  # observations as adjusted are those as measured
 RANGES_ONLY = Noise(0.4, 0.0, 0.0, 0.0)
-EVERYTHING = Wish("full", free=frozenset(["scan_angle_offset_rad"]))
+EVERYTHING = ParameterOptions("full", free=frozenset(["scan_angle_offset_rad"]))
 
 
 def line_flight() -> tuple[Flight, tuple[Plane, ...], Calibration]:
@@ -107,7 +107,7 @@ def test_variance_is_that_of_the_eight_observations() -> None:
     told = flight.trajectories[0]
     told = replace(told, position_sigma_l=np.full((len(told), 3), 0.03))
     flight = replace(flight, trajectories=(told,))
-    rows = Rows(flight, planes, unknowns(flight, Wish()), None)
+    rows = Rows(flight, planes, unknowns(flight, ParameterOptions()), None)
     _, _, found, _ = design(rows, rows.start())
     wanted, noise = [], flight.heads[0].noise
     for batch in rows.batches:
@@ -158,7 +158,7 @@ def head_flight(geometry: Geometry) -> Flight:
 @pytest.mark.parametrize("geometry", [spinning(), ouster()])
 def test_columns_of_beams_slots_zones_and_intensities_are_differences_of_the_model(geometry: Geometry) -> None:
     flight = head_flight(geometry)
-    wish = Wish(
+    wish = ParameterOptions(
         ibrc_knots=(0.0, 20.0, 50.0, 100.0),
         beams=frozenset(["azimuth_rad", "elevation_rad", "range_m"]),
         range_offset_slots=(2,),
@@ -213,7 +213,7 @@ def test_columns_of_the_trajectory_are_differences_of_the_model() -> None:
     planes = tuple(replace(plane, patches=plane.patches[:1]) for plane in planes)
     times = START_NS + np.array([2, 5, 7, 12]) * 1_000_000_000
     prior = TrajectoryPrior(np.zeros(4, np.int64), times, np.ones(4, np.int64), np.eye(24))
-    rows = Rows(flight, planes, unknowns(flight, Wish()), prior)
+    rows = Rows(flight, planes, unknowns(flight, ParameterOptions()), prior)
     g = np.random.default_rng(2)
     knots = g.normal(size=(4, 6)) * np.array([0.05, 0.05, 0.05, 1e-5, 1e-5, 1e-5])
     state = replace(rows.start(), knots=knots)
@@ -247,7 +247,7 @@ def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> No
     planes = tuple(replace(plane, patches=plane.patches[:1]) for plane in planes)
     times, walk = START_NS + np.array([16, 21, 70, 120]) * 100_000_000, (2e-4) ** 2
     prior = TrajectoryPrior(np.zeros(4, np.int64), times, np.ones(4, np.int64), np.eye(24))
-    seen = Rows(flight, planes, unknowns(flight, Wish()), replace(prior, walk_rad2=np.full(4, walk)))
+    seen = Rows(flight, planes, unknowns(flight, ParameterOptions()), replace(prior, walk_rad2=np.full(4, walk)))
     found = seen.summed(seen.start(), np.ones(seen.count, np.float32), 0.0)
     weight = np.where(np.arange(seen.count) % 3 > 0, 4.0, 0.0).astype(np.float32)
     expected, rest, grown = np.zeros((4, 4)), np.zeros((4, 4)), []
@@ -268,13 +268,13 @@ def test_what_the_attitude_does_between_knots_is_no_noise_of_each_return() -> No
     np.testing.assert_allclose(found.normal[:4, :4], expected, rtol=1e-9)
     assert max(grown) > 2.0
     np.testing.assert_allclose(seen.summed(seen.start(), weight, 0.0).normal[:4, :4], rest, rtol=1e-9)
-    free = Rows(flight, planes, unknowns(flight, Wish()), prior).summed(
+    free = Rows(flight, planes, unknowns(flight, ParameterOptions()), prior).summed(
         seen.start(), np.ones(seen.count, np.float32), 0.0
     )
     assert np.diag(free.normal)[3] > 1.2 * np.diag(found.normal)[3]
 
 
-def looks_of(flight: Flight, planes: tuple[Plane, ...], wish: Wish) -> tuple[FloatArray, FloatArray]:
+def looks_of(flight: Flight, planes: tuple[Plane, ...], wish: ParameterOptions) -> tuple[FloatArray, FloatArray]:
     """Columns (n, u) of the parameters and of the plane's turns, and f (n,), of one swath's returns on one plane."""
     seen = Rows(flight, planes, unknowns(flight, wish), None)
     ((batch, looks),) = seen.looks(seen.start())

@@ -10,8 +10,8 @@ import numpy as np
 
 from swath.calib.flight import Flight
 from swath.daemon.processing.calibration.returns import read_flight
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.scanner.calibration import Calibration, read_calibration
@@ -145,7 +145,7 @@ def village(
     file.write_text(csv_text(trajectory))
     kept = folder / "kept"
     kept.mkdir()
-    wish = Wish([flown.log], kept, TrajectoryWish(file), Options(datum="same", uncertainty=False))
+    wish = GeorefOptions([flown.log], kept, TrajectoryOptions(file), Options(datum="same", uncertainty=False))
     read = read_flight(wish, kept, lambda what, done, total: None)
     truth = read_calibration((folder / "left.true.toml").read_text(), "left.true.toml")
     flight = replace(read.flight, trajectories=(trajectory,))

@@ -23,7 +23,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration import run as calibrate_run
 from swath.daemon.processing.calibration.model import model_of
-from swath.daemon.processing.calibration.plan.run import PlanWish, plan_calibration
+from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
 from swath.daemon.processing.calibration.run import refuse_no_planes
 from swath.daemon.processing.warm_up import warm_calibration
 from swath.georef.mapping.frame import Mapping
@@ -194,7 +194,9 @@ def test_a_navigated_flight_is_calibrated_on_all_the_ground_as_the_plan_says_bef
     (told,) = re.findall(r"^redundancy = (.+)$", output.read_text(), re.MULTILINE)
     assert float(told) == pytest.approx(every, rel=0.2)
     found = read_calibration(output.read_text(), "left.toml")
-    planned = plan_calibration(parse_plan(made.plan, tmp_path), PlanWish(model_of("basic", KNOWN[1], "", KNOWN[3::2])))
+    planned = plan_calibration(
+        parse_plan(made.plan, tmp_path), PlanOptions(model_of("basic", KNOWN[1], "", KNOWN[3::2]))
+    )
     names = planned.predicted.names
     assert set(names) == {"left.omega_rad", "left.phi_rad", "left.kappa_rad", "left.range_offset_m"}
     for name, predicted in zip(names, planned.predicted.sigmas, strict=True):

@@ -11,9 +11,9 @@ import pytest
 from swath.calib.profiles.check import Check, Comparison
 from swath.daemon.processing.calibration.model import model_of
 from swath.daemon.processing.calibration.products import strips_say, validation_says, write_products
-from swath.daemon.processing.calibration.run import Calibrated, CalibrateWish, calibrate
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.calibration.run import Calibrated, CalibrationOptions, calibrate
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.scanner.calibration import INDEX, Calibration, read_calibration
@@ -36,17 +36,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture(scope="module")
-def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrateWish:
+def wish(made: Made, tmp_path_factory: pytest.TempPathFactory) -> CalibrationOptions:
     folder = made.flown.folder
     true = folder / "left.true.toml"
     options = Options(datum="same", calibrations={"left": (true.read_text(), str(true))}, uncertainty=False)
     output = tmp_path_factory.mktemp("out") / "left.toml"
-    logs = Wish([made.flown.log], output, TrajectoryWish(folder / "true_trajectory.csv"), options)
-    return CalibrateWish(logs, output, model_of("basic", KNOWN[1], "", KNOWN[3::2]), overwrite=True)
+    logs = GeorefOptions([made.flown.log], output, TrajectoryOptions(folder / "true_trajectory.csv"), options)
+    return CalibrationOptions(logs, output, model_of("basic", KNOWN[1], "", KNOWN[3::2]), overwrite=True)
 
 
 @pytest.fixture(scope="module")
-def done(wish: CalibrateWish, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
+def done(wish: CalibrationOptions, tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
     """The outcome before it is written; nothing is wrong with it."""
     return calibrate(wish, tmp_path_factory.mktemp("returns"), quiet)
 
@@ -94,7 +94,7 @@ def test_a_validation_speaks_against_a_roll_that_is_off(done: Calibrated) -> Non
         assert not one.unusable
 
 
-def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wish: CalibrateWish) -> None:
+def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wish: CalibrationOptions) -> None:
     """Eight pairs of one sign, three sigmas off together: on the terminal, in the record and in the file."""
     sigma = 2.0**-16
     comparison = Comparison("left", "phi_rad", 8, -3.0 * sigma, sigma, 0.0, sigma, sigma)
@@ -120,7 +120,7 @@ def test_all_three_are_told_in_the_verdict_of_a_calibration(done: Calibrated, wi
 
 
 def test_a_trajectory_of_another_place_is_noted_where_it_is_forced(
-    made: Made, wish: CalibrateWish, tmp_path: Path
+    made: Made, wish: CalibrationOptions, tmp_path: Path
 ) -> None:
     """All strips are moved alike, so that nothing else says it."""
     true, file = made.trajectory, tmp_path / "away.csv"
@@ -130,7 +130,7 @@ def test_a_trajectory_of_another_place_is_noted_where_it_is_forced(
     )
     sigmas = {name: getattr(true, name) for name in ("position_sigma_l", "attitude_sigma_rad")}
     file.write_text(csv_text(replace(away, **sigmas)))
-    elsewhere = replace(wish.logs, trajectory=TrajectoryWish(file, force=True))
+    elsewhere = replace(wish.logs, trajectory=TrajectoryOptions(file, force=True))
     output = tmp_path / "left.toml"
     forced = replace(wish, logs=elsewhere, output=output)
     told = write_products(forced, calibrate(forced, tmp_path, quiet), quiet)

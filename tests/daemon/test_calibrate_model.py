@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from swath.calib.parameters import Wish
+from swath.calib.parameters import ParameterOptions
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.model import (
     file_of,
@@ -60,7 +60,7 @@ def refused(*given: Any) -> str:
 
 
 def test_a_file_reaches_all_that_can_be_asked_for(tmp_path: Path) -> None:
-    assert model_of(file(tmp_path, WHOLE)) == Wish(
+    assert model_of(file(tmp_path, WHOLE)) == ParameterOptions(
         "full",
         fix=frozenset(["time_offset_s", "right.omega_rad"]),
         free=frozenset(["phi_rad"]),
@@ -91,8 +91,8 @@ def test_the_example_of_the_page_is_such_a_file(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_the_model_that_there_is_without_one(tmp_path: Path) -> None:
-    assert model_of(file(tmp_path, "")) == Wish("scanner") == model_of("scanner")
-    assert model_of(file(tmp_path, "[ibrc]\nknots = [1, 2]")) == Wish("scanner", ibrc_knots=(1.0, 2.0))
+    assert model_of(file(tmp_path, "")) == ParameterOptions("scanner") == model_of("scanner")
+    assert model_of(file(tmp_path, "[ibrc]\nknots = [1, 2]")) == ParameterOptions("scanner", ibrc_knots=(1.0, 2.0))
     assert (file_of("scanner"), file_of("model.TOML")) == (None, Path("model.TOML"))
 
 
@@ -228,7 +228,7 @@ def test_what_is_asked_for_is_told_in_keys_of_files(tmp_path: Path) -> None:
     assert told.endswith(
         "range offset of return slot 1, 2; range offset of zone 0, 3; beam azimuth_deg, elevation_deg, range_m"
     )
-    assert in_words(Wish("basic")) == "basic"
+    assert in_words(ParameterOptions("basic")) == "basic"
     alone = of_parameters(wish)
     assert tables_in_words(alone) == []
     assert set(alone.priors) == {"left.kappa_rad", "range_scale"}

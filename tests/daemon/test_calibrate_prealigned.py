@@ -15,7 +15,7 @@ from swath.calib.equations.trajectory_prior import Taus, gauss_markov
 from swath.calib.features import Features
 from swath.calib.flight import Flight
 from swath.calib.outcome import Considered
-from swath.calib.parameters import Wish
+from swath.calib.parameters import ParameterOptions
 from swath.calib.planes.search import find_planes
 from swath.calib.summary import Finding
 from swath.daemon.processing.calibration.run import COARSE_RAD, _aligned, prealigned_otherwise
@@ -59,7 +59,7 @@ def held_heading(flight: Flight) -> tuple[dict[str, float], Considered, tuple[Fi
     nearest = min(level, key=lambda plane: abs(plane.centre_t[1] - 30.0))
     doubted = {name: abs(apart) for name, apart in away.items()}
     prior = gauss_markov(flight, Taus(), 4.0)
-    found = adjust(aligned, Features((nearest,)), Wish("basic"), prior, first=first, doubted=doubted)
+    found = adjust(aligned, Features((nearest,)), ParameterOptions("basic"), prior, first=first, doubted=doubted)
     assert "kappa_rad" in [one.name for one in found.held]
     (heading,) = (one for one in found.considered if one.name == "kappa_rad")
     start, written = flight.heads[0].start, through_a_file(found.calibrations["left"])

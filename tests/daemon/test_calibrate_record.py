@@ -9,8 +9,8 @@ import pytest
 from swath.calib.record.record import told_value
 from swath.daemon.processing.calibration.record import instruments_of
 from swath.daemon.processing.calibration.returns import read_flight
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from tests.calib.village import Made, village
 
@@ -25,7 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_a_navigated_flight_tells_its_instruments(made: Made, tmp_path: Path) -> None:
     options = Options(datum="same", uncertainty=False)
     kept = read_flight(
-        Wish([made.flown.log], tmp_path, TrajectoryWish(navigate=True), options), tmp_path, lambda *_: None
+        GeorefOptions([made.flown.log], tmp_path, TrajectoryOptions(navigate=True), options), tmp_path, lambda *_: None
     )
     told = instruments_of(kept)
     config = made.flown.config
@@ -43,8 +43,10 @@ def test_a_navigated_flight_tells_its_instruments(made: Made, tmp_path: Path) ->
 
 def test_a_trajectory_from_elsewhere_tells_none(made: Made, tmp_path: Path) -> None:
     options = Options(datum="same", uncertainty=False)
-    trajectory = TrajectoryWish(made.flown.folder / "true_trajectory.csv")
+    trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
     assert (
-        instruments_of(read_flight(Wish([made.flown.log], tmp_path, trajectory, options), tmp_path, lambda *_: None))
+        instruments_of(
+            read_flight(GeorefOptions([made.flown.log], tmp_path, trajectory, options), tmp_path, lambda *_: None)
+        )
         == {}
     )

@@ -14,8 +14,8 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.processing.calibration import returns as calibration_flight
 from swath.daemon.processing.calibration.returns import read_flight
 from swath.daemon.processing.flights import read as flights
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, offset_of
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions, offset_of
 from swath.daemon.processing.points.jobs import JobResult
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.setup.setup import Options, Setup
@@ -35,9 +35,9 @@ def kept_with(made: Made, folder: Path, more: str) -> Flight:
     """As read with the true calibration and these lines behind it."""
     text = (made.flown.folder / "left.true.toml").read_text() + more
     options = Options(datum="same", uncertainty=False, calibrations={"left": (text, "start.toml")})
-    trajectory = TrajectoryWish(made.flown.folder / "true_trajectory.csv")
+    trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
     folder.mkdir()
-    return read_flight(Wish([made.flown.log], folder, trajectory, options), folder, lambda *_: None).flight
+    return read_flight(GeorefOptions([made.flown.log], folder, trajectory, options), folder, lambda *_: None).flight
 
 
 @pytest.mark.parametrize(("rate_hz", "added_m"), [(PRF_HZ, OFFSET_M), (2 * PRF_HZ, 0.0)])
@@ -86,8 +86,8 @@ def test_returns_without_time_are_noted(made: Made, tmp_path: Path, monkeypatch:
         return results
 
     monkeypatch.setattr(calibration_flight, "run_jobs", without_time)
-    trajectory = TrajectoryWish(made.flown.folder / "true_trajectory.csv")
-    wish = Wish([made.flown.log], tmp_path, trajectory, Options(datum="same", uncertainty=False))
+    trajectory = TrajectoryOptions(made.flown.folder / "true_trajectory.csv")
+    wish = GeorefOptions([made.flown.log], tmp_path, trajectory, Options(datum="same", uncertainty=False))
     kept = read_flight(wish, tmp_path, lambda *_: None)
     total = 2 * sum(len(swath) for swath in kept.flight.swaths)
     (line,) = (line for line in kept.notes if "have no time" in line)
@@ -101,7 +101,7 @@ def test_a_navigated_trajectory_is_the_bodys_whatever_is_said(made: Made, tmp_pa
     for at in ("body", "antenna"):
         (tmp_path / at).mkdir()
         options = Options(datum="same", uncertainty=False)
-        wish = Wish([made.flown.log], tmp_path / at, TrajectoryWish(navigate=True, at=at), options)
+        wish = GeorefOptions([made.flown.log], tmp_path / at, TrajectoryOptions(navigate=True, at=at), options)
         kept = read_flight(wish, tmp_path / at, lambda *_: None)
         found.append((kept.flight.trajectories[0].position_e, kept.logged[0].troubles))
     (plain, before), (asked, told) = found

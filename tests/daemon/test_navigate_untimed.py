@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swath.daemon.processing.navigation.inputs import InputWish
-from swath.daemon.processing.navigation.navigate import NavigateWish, navigate_session
+from swath.daemon.processing.navigation.inputs import InputOptions
+from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
 from swath.georef.timescales import SECOND_NS
 from tests.calib.village import HEADER, LINE, LINES
 from tests.daemon.short_flight import fly_short
@@ -25,7 +25,7 @@ def test_samples_timed_by_their_arrival_lead_nobody_along_the_track(tmp_path: Pa
         text += LINE.format(name=name, x0=x0, y0=y0, x1=x1, y1=y1, height=height)
     flown = fly_short(tmp_path, text)
     config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
-    navigated = navigate_session(flown.session(), NavigateWish(InputWish(config=config)))
+    navigated = navigate_session(flown.session(), NavigationOptions(InputOptions(config=config)))
     [leg] = navigated.legs
     offset_s = leg.solved.report.time_offset_s
     assert 3e-4 < offset_s < 5e-4

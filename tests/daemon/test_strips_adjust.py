@@ -15,11 +15,11 @@ import pytest
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
-from swath.daemon.processing.flights.read import Wish
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish
+from swath.daemon.processing.flights.read import GeorefOptions
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
 from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.strips import adjust_products as strip_adjust_products
-from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, correct_strips
+from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected, correct_strips
 from swath.daemon.processing.strips.adjust_products import write_adjustment
 from swath.daemon.processing.trajectory.verdict import Level
 from swath.georef.formats.trajectory.csv import csv_text
@@ -253,19 +253,19 @@ def test_files_that_are_there_stay(
 
 
 @pytest.fixture(scope="module")
-def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[AdjustWish, StripsCorrected]:
+def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[AdjustOptions, StripsCorrected]:
     """The outcome before it is written."""
     folder = tmp_path_factory.mktemp("returns")
     text = (made.flown.folder / "left.true.toml").read_text()
     options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
-    logs = Wish([made.flown.log], folder, TrajectoryWish(lifted), replace(options, uncertainty=False))
-    wish = AdjustWish(logs, folder / "none")
+    logs = GeorefOptions([made.flown.log], folder, TrajectoryOptions(lifted), replace(options, uncertainty=False))
+    wish = AdjustOptions(logs, folder / "none")
     return wish, correct_strips(wish, folder, lambda what, done, total: None)
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
 def test_a_full_disk_leaves_nothing_behind(
-    done: tuple[AdjustWish, StripsCorrected], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool
+    done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool
 ) -> None:
     def full(record: Any, stream: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -283,7 +283,7 @@ def test_a_full_disk_leaves_nothing_behind(
 
 
 def test_a_trajectory_is_given_back_by_the_plumb_line_it_was_read_by(
-    made: Made, done: tuple[AdjustWish, StripsCorrected], tmp_path: Path
+    made: Made, done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path
 ) -> None:
     """Otherwise the deflection of the vertical would be taken off twice."""
     xi_eta_rad = tuple(np.radians([12.0 / 3600.0, -7.0 / 3600.0]))

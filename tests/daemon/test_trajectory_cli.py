@@ -14,7 +14,7 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.log.reader import open_logs
-from swath.daemon.processing.navigation.navigate import NavigateWish, attitude_of_text, navigate_session
+from swath.daemon.processing.navigation.navigate import NavigationOptions, attitude_of_text, navigate_session
 from swath.daemon.processing.trajectory.event_marks import PLACED
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.trajectory.trajectory import Trajectory
@@ -119,7 +119,7 @@ class TestSmoothed:
 
     def test_the_function_for_georeferencing_gives_the_same(self, flown: Flown, made: Path) -> None:
         trajectory = read(made, flown)
-        again = navigate_session(open_logs([flown.log])[0], NavigateWish()).trajectory()
+        again = navigate_session(open_logs([flown.log])[0], NavigationOptions()).trajectory()
         assert np.abs(again.position_e - trajectory.position_e).max() < 1e-6
         assert np.abs(again.position_sigma_l - trajectory.position_sigma_l).max() < 1e-12
 

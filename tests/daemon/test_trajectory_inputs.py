@@ -20,7 +20,7 @@ from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.navigation import doubts as navigation_doubts
 from swath.daemon.processing.navigation.doubts import height_findings
-from swath.daemon.processing.navigation.inputs import InputWish, NavigationInputs, read_inputs
+from swath.daemon.processing.navigation.inputs import InputOptions, NavigationInputs, read_inputs
 from swath.daemon.processing.navigation.observations import (
     DEFAULT_SIGMAS,
     Observed,
@@ -98,7 +98,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 @pytest.fixture(scope="module")
 def inputs(flown: Flown) -> NavigationInputs:
-    return read_inputs(flown.session(), InputWish())
+    return read_inputs(flown.session(), InputOptions())
 
 
 def turned(poses: Poses, vector_b: FloatArray) -> FloatArray:
@@ -183,55 +183,55 @@ class TestOfALog:
     ) -> None:
         monkeypatch.chdir(tmp_path)
         config = stored_config(flown.session().attachments())
-        again = read_inputs(flown.session(), InputWish(config=config))
+        again = read_inputs(flown.session(), InputOptions(config=config))
         assert again.samples == inputs.samples
 
     def test_the_same_log_gives_the_same(self, flown: Flown, inputs: NavigationInputs) -> None:
-        again = read_inputs(flown.session(), InputWish())
+        again = read_inputs(flown.session(), InputOptions())
         assert np.array_equal(again.legs[0].inertial.velocity_b, inputs.legs[0].inertial.velocity_b)
         assert again.legs[0].observations.tobytes() == inputs.legs[0].observations.tobytes()
 
 
 class TestRefusals:
-    def refused(self, flown: Flown, wish: InputWish) -> str:
+    def refused(self, flown: Flown, wish: InputOptions) -> str:
         with pytest.raises(UserError) as caught:
             read_inputs(flown.session(), wish)
         assert "\n" not in caught.value.message
         return caught.value.message
 
     def test_names_that_are_not_there(self, flown: Flown) -> None:
-        assert self.refused(flown, InputWish(imu="other")).endswith(
+        assert self.refused(flown, InputOptions(imu="other")).endswith(
             "--imu: the configuration has no [imu.other]; there are: main"
         )
-        assert "--gnss-name" in self.refused(flown, InputWish(gnss="base"))
+        assert "--gnss-name" in self.refused(flown, InputOptions(gnss="base"))
 
     def test_an_imu_that_says_nothing(self, flown: Flown) -> None:
         config = flown.changed("other_wire.toml", **{"[imu.main": "[imu.second"})
-        said = self.refused(flown, InputWish(config=config))
+        said = self.refused(flown, InputOptions(config=config))
         assert said.endswith("no samples of imu/second: not a byte of it is in the log; is its wire recorded?")
 
     def test_a_receiver_that_speaks_otherwise(self, flown: Flown) -> None:
         config = flown.changed("nmea.toml", **{'protocol = "novatel"': 'protocol = "nmea"'})
-        said = self.refused(flown, InputWish(config=config))
+        said = self.refused(flown, InputOptions(config=config))
         assert "no position of gnss/rover" in said
         assert "of no message it knows; want another protocol, or other messages of the device" in said
 
     def test_a_log_without_a_configured_receiver(self, flown: Flown) -> None:
         config = flown.changed("other_receiver.toml", **{"[gnss.rover]": "[gnss.away]"})
         assert "no position of gnss/away, and an IMU alone cannot be navigated: not a byte" in self.refused(
-            flown, InputWish(config=config)
+            flown, InputOptions(config=config)
         )
 
     def test_positions_of_another_day(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "ppk.pos"
         file.write_text(POS.format("2026/11/01"))
-        assert "of another flight" in self.refused(flown, InputWish(positions=file))
+        assert "of another flight" in self.refused(flown, InputOptions(positions=file))
 
     def test_a_finished_trajectory_is_no_antenna(self, flown: Flown, tmp_path: Path) -> None:
         file = tmp_path / "done.csv"
         file.write_text("gps_ns,lat_deg,lon_deg\n")
-        assert "finished trajectory" in self.refused(flown, InputWish(positions=file))
-        assert "cannot be read" in self.refused(flown, InputWish(positions=tmp_path / "none.pos"))
+        assert "finished trajectory" in self.refused(flown, InputOptions(positions=file))
+        assert "cannot be read" in self.refused(flown, InputOptions(positions=tmp_path / "none.pos"))
 
     def test_antennas_in_one_place(self, flown: Flown) -> None:
         said = r"secondary_lever_arm_m: is 0\.00 m from lever_arm_m"
@@ -240,19 +240,19 @@ class TestRefusals:
         rover = flown.config.gnss["rover"].model_copy(update={"secondary_lever_arm_m": [0.1, -0.05, -1.2]})
         tables = flown.config.tables.model_copy(update={"gnss": {"rover": rover}})
         config = Config(tables, flown.config.path, flown.config.text)  # as a log of an earlier version may have it
-        assert "secondary_lever_arm_m: is 0.00 m from lever_arm_m" in self.refused(flown, InputWish(config=config))
+        assert "secondary_lever_arm_m: is 0.00 m from lever_arm_m" in self.refused(flown, InputOptions(config=config))
 
 
 class TestDoubts:
     def test_a_baseline_that_is_not_the_configured_one(self, flown: Flown) -> None:
         config = flown.changed("long.toml", **{"[0.9, 0.6, -1.2]": "[0.9, 1.6, -1.2]"})
-        (line,) = read_inputs(flown.session(), InputWish(config=config)).doubts
+        (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
         assert "measures 1.03 m between its antennas" in line
         assert "are 1.83 m apart" in line
 
     def test_headings_without_a_second_antenna(self, flown: Flown) -> None:
         config = flown.changed("single.toml", **{"secondary_lever_arm_m": "# "})
-        inputs = read_inputs(flown.session(), InputWish(config=config))
+        inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.observed["heading"] == 0
         assert inputs.refused["heading_no_secondary_lever_arm"] > 60
         assert "want gnss.rover.secondary_lever_arm_m" in inputs.doubts[0]
@@ -260,19 +260,19 @@ class TestDoubts:
     def test_a_second_antenna_that_tells_nothing(self, tmp_path: Path) -> None:
         one = PLAN.replace("secondary_lever_arm_m = [0.9, 0.6, -1.2]", "")
         flown = fly_short(tmp_path, one, 10.0)
-        assert not read_inputs(flown.session(), InputWish()).doubts
+        assert not read_inputs(flown.session(), InputOptions()).doubts
         arm = "lever_arm_m = [0.1, -0.05, -1.2]"
         config = flown.changed("two.toml", **{arm: f"{arm}\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]"})
-        (line,) = read_inputs(flown.session(), InputWish(config=config)).doubts
+        (line,) = read_inputs(flown.session(), InputOptions(config=config)).doubts
         assert "gnss/rover sent no heading that is known here, though secondary_lever_arm_m" in line
 
     def test_an_imu_timed_by_its_arrival(self, flown: Flown) -> None:
         config = flown.changed("untimed.toml", **{"sample_ticks": "# ", "pps_ticks": "# ", 'group = "last"': ""})
-        inputs = read_inputs(flown.session(), InputWish(config=config))
+        inputs = read_inputs(flown.session(), InputOptions(config=config))
         assert inputs.imu_time[0] == "arrival"
         assert "placed by their arrival" in inputs.doubts[0]
         assert inputs.setup.estimate_time_offset_s > 1e-3
-        latched = read_inputs(flown.session(), InputWish()).legs[0].inertial.time_ns
+        latched = read_inputs(flown.session(), InputOptions()).legs[0].inertial.time_ns
         off_ns = inputs.legs[0].inertial.time_ns[200:1200] - latched[200:1200]
         assert np.abs(off_ns - np.median(off_ns)).max() < 300_000
         assert abs(np.median(off_ns)) < 12_000_000  # an interval of 10 ms: what a CAN frame is late, and no more
@@ -290,7 +290,7 @@ def test_positions_from_outside_replace_those_of_the_receiver(flown: Flown, tmp_
     file = tmp_path / "ppk.pos"
     file.write_text(POS.format("2026/06/15"))
     first = flown.truth().time_ns[0]
-    inputs = read_inputs(flown.session(), InputWish(positions=file))
+    inputs = read_inputs(flown.session(), InputOptions(positions=file))
     rows = inputs.legs[0].observations
     rows = rows[rows["kind"] == Kind.POSITION]
     assert rows["fix_type"].tolist() == [FixType.RTK_FIXED, FixType.RTK_FLOAT]
@@ -570,7 +570,7 @@ def test_a_geoid_separation_that_is_said_or_once_zero_is_no_finding() -> None:
 def test_a_log_whose_receiver_says_no_geoid_has_the_finding(tmp_path: Path) -> None:
     plan = PLAN.replace("[gnss.rover]\nrate_hz = 5\nsecondary_lever_arm_m = [0.9, 0.6, -1.2]", NMEA)
     assert NMEA in plan
-    inputs = read_inputs(fly_short(tmp_path, plan, 10.0).session(), InputWish())
+    inputs = read_inputs(fly_short(tmp_path, plan, 10.0).session(), InputOptions())
     assert [finding.code for finding in inputs.findings] == ["geoid_unsaid"]
 
 

@@ -16,7 +16,7 @@ from swath.daemon.cli.main import run_app
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
 from swath.daemon.log.channels import JsonChannel
-from swath.daemon.processing.navigation.inputs import InputWish, read_inputs
+from swath.daemon.processing.navigation.inputs import InputOptions, read_inputs
 from swath.daemon.processing.navigation.times import imu_times, stretches
 from swath.drivers.gnss.novatel.encoder import encode_frame
 from swath.georef.formats.trajectory.file import read_trajectory
@@ -105,7 +105,7 @@ def test_an_imu_without_a_receiver_is_timed_by_the_wall_clock_and_its_pulses(flo
 
 
 def test_a_lever_arm_that_nobody_says_is_estimated_and_told(flown: Flown) -> None:
-    wish = InputWish(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
+    wish = InputOptions(positions=flown.folder / "ppk.pos", config=load_config(without_receiver(flown)))
     inputs = read_inputs(flown.session(), wish)
     assert inputs.setup.estimate_lever_arm == 2.0
     assert any("want --lever-arm X,Y,Z" in line for line in inputs.doubts)
@@ -113,7 +113,7 @@ def test_a_lever_arm_that_nobody_says_is_estimated_and_told(flown: Flown) -> Non
 
 def test_without_a_file_raw_measurements_cannot_be_navigated(flown: Flown) -> None:
     with pytest.raises(UserError, match=r"no position of gnss/rover.*--gnss FILE with post-processed positions"):
-        read_inputs(flown.session(), InputWish())
+        read_inputs(flown.session(), InputOptions())
 
 
 def test_a_lever_arm_of_no_file_is_refused(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

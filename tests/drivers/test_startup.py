@@ -16,7 +16,7 @@ from swath.drivers.gnss.sbf import startup as sbf_startup
 from swath.drivers.gnss.ubx import startup as ubx_startup
 from swath.drivers.gnss.ubx.startup import AckListener
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupWish
+from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupOptions
 from tests.drivers.recordings import FIXTURES
 
 ACK = UBXMessage("ACK", "ACK-ACK", 0, clsID=0x06, msgID=0x8A).serialize()
@@ -52,7 +52,7 @@ def heard(listener: AnswerListener, data: bytes, size: int) -> Answer | None:
 
 
 def sbf_listener(text: str) -> AnswerListener:
-    messages = sbf_startup.startup_messages(settings(), StartupWish())
+    messages = sbf_startup.startup_messages(settings(), StartupOptions())
     return next(message for message in messages if message.lines == (text,)).listen()
 
 
@@ -61,7 +61,7 @@ class TestUbx:
     @pytest.mark.parametrize("rate_hz", [1, 2, 5, 10, 20])
     @pytest.mark.parametrize("save", [False, True])
     def test_pyubx2_reads_back_the_keys_and_values_that_are_shown(self, port: str, rate_hz: int, save: bool) -> None:
-        wish = StartupWish(save=save, baud=460800)
+        wish = StartupOptions(save=save, baud=460800)
         for message in ubx_startup.startup_messages(settings(port=port, rate_hz=rate_hz), wish):
             parsed = UBXReader.parse(message.data, msgmode=SET)
             assert parsed.identity == "CFG-VALSET"
@@ -87,29 +87,29 @@ class TestUbx:
         assert set(ubx_startup.MESSAGE_RATES) <= names
 
     def test_a_rate_is_of_positions_and_raw_measurements_come_once_a_second(self) -> None:
-        lines = texts(ubx_startup.startup_messages(settings(rate_hz=10), StartupWish()))
+        lines = texts(ubx_startup.startup_messages(settings(rate_hz=10), StartupOptions()))
         assert {"CFG-RATE-MEAS = 100", "CFG-RATE-NAV = 1", "CFG-RATE-TIMEREF = 1"} <= set(lines)
         assert "CFG-MSGOUT-UBX_NAV_PVT_UART1 = 1" in lines
         assert "CFG-MSGOUT-UBX_RXM_RAWX_UART1 = 10" in lines
         assert "CFG-MSGOUT-UBX_NAV_TIMELS_UART1 = 10" in lines
 
     def test_the_pulse_is_1_hz_in_gps_time_rising_and_only_when_the_time_is_known(self) -> None:
-        lines = texts(ubx_startup.startup_messages(settings(), StartupWish()))
+        lines = texts(ubx_startup.startup_messages(settings(), StartupOptions()))
         shown = {line.split(" = ")[0]: int(line.split(" = ")[1]) for line in lines if " = " in line}
         assert shown["CFG-TP-PERIOD_LOCK_TP1"] == 1_000_000
         assert shown["CFG-TP-LEN_TP1"] == 0
         assert shown["CFG-TP-TIMEGRID_TP1"] == shown["CFG-TP-POL_TP1"] == shown["CFG-TP-ALIGN_TO_TOW_TP1"] == 1
 
     def test_without_raw_none_is_asked_for(self) -> None:
-        assert "RXM" not in " ".join(texts(ubx_startup.startup_messages(settings(raw=False), StartupWish())))
+        assert "RXM" not in " ".join(texts(ubx_startup.startup_messages(settings(raw=False), StartupOptions())))
 
     def test_usb_has_no_rate(self) -> None:
-        messages = ubx_startup.startup_messages(settings(port="USB"), StartupWish(baud=460800))
+        messages = ubx_startup.startup_messages(settings(port="USB"), StartupOptions(baud=460800))
         assert all(message.baud is None for message in messages)
 
     def test_a_port_that_there_is_not(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'COM1', want one of: UART1, UART2, USB"):
-            ubx_startup.startup_messages(settings(port="COM1"), StartupWish())
+            ubx_startup.startup_messages(settings(port="COM1"), StartupOptions())
 
     @pytest.mark.parametrize(("reply", "answer"), [(ACK, Answer(True)), (NAK, Answer(False, "UBX-ACK-NAK"))])
     def test_an_answer_is_found_amid_data_however_it_is_cut(self, reply: bytes, answer: Answer) -> None:
@@ -134,7 +134,7 @@ class TestUbx:
 
 class TestNovatel:
     def test_logs_are_those_that_are_known(self) -> None:
-        wish = StartupWish()
+        wish = StartupOptions()
         config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"rate_hz": 10}}
         messages = novatel_startup.startup_messages(DeviceSettings("gnss/rover", config), wish)
         messages += novatel_startup.imu_startup_messages(settings(), wish)
@@ -148,31 +148,31 @@ class TestNovatel:
         assert "LOG BESTPOSB ONTIME 0.1" in texts(messages)
 
     def test_the_rate_comes_first_and_saving_last(self) -> None:
-        messages = novatel_startup.startup_messages(settings(), StartupWish(save=True, baud=460800))
+        messages = novatel_startup.startup_messages(settings(), StartupOptions(save=True, baud=460800))
         assert messages[0].data == b"SERIALCONFIG THISPORT 460800 N 8 1 N OFF\r\n"
         assert (messages[0].baud, messages[-1].data, messages[-1].last) == (460800, b"SAVECONFIG\r\n", True)
 
     def test_a_port_is_not_named(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port"):
-            novatel_startup.startup_messages(settings(port="COM1"), StartupWish())
+            novatel_startup.startup_messages(settings(port="COM1"), StartupOptions())
 
     @pytest.mark.parametrize("name", ["novatel/bestpos.gps", "novatel/oemv_200911218.gps.gz"])
     def test_a_receivers_answer_is_found_in_its_recording_however_it_is_cut(self, name: str) -> None:
         data = recording(name)
         first = data.index(b"<OK\r\n")
         for size in (1, 5, 4096):
-            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
             assert heard(listener, data[: first + 5], size) == Answer(True)
-            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
             assert heard(listener, data[max(0, first - 9000) : first + 4], size) is None
 
     def test_data_holds_no_answer(self) -> None:
         for name in ("ins1.gps", "time.gps", "align.gps", "rxstatus.gps", "propak6-basic-fix.gps.gz"):
-            listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+            listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
             assert heard(listener, recording(f"novatel/{name}"), 4096) is None, name
 
     def test_a_refusal_says_why(self) -> None:
-        listener = novatel_startup.startup_messages(settings(), StartupWish())[0].listen()
+        listener = novatel_startup.startup_messages(settings(), StartupOptions())[0].listen()
         answer = heard(listener, recording("novatel/time.gps") + b"\r\n<ERROR:Invalid Message ID\r\n[COM1]", 3)
         assert answer == Answer(False, "Invalid Message ID")
 
@@ -180,8 +180,8 @@ class TestNovatel:
 class TestSbf:
     def test_blocks_are_those_that_are_known(self) -> None:
         config = {"secondary_lever_arm_m": [0, 1, 0], "setup": {"port": "USB1"}}
-        messages = sbf_startup.startup_messages(DeviceSettings("gnss/rover", config), StartupWish())
-        messages += sbf_startup.imu_startup_messages(settings(port="USB1"), StartupWish())
+        messages = sbf_startup.startup_messages(DeviceSettings("gnss/rover", config), StartupOptions())
+        messages += sbf_startup.imu_startup_messages(settings(port="USB1"), StartupOptions())
         streams = [text.split(", ") for text in texts(messages) if text.startswith("setSBFOutput, ")]
         assert [stream[1] for stream in streams] == [f"Stream{number}" for number in range(1, 7)]
         assert {stream[2] for stream in streams} == {"USB1"}
@@ -191,17 +191,17 @@ class TestSbf:
         assert [stream[4] for stream in streams] == ["OnChange", "msec200", "sec1", "msec200", "msec20", "OnChange"]
 
     def test_one_hertz_is_said_in_seconds(self) -> None:
-        assert "EndOfPVT, sec1" in "\n".join(texts(sbf_startup.startup_messages(settings(rate_hz=1), StartupWish())))
+        assert "EndOfPVT, sec1" in "\n".join(texts(sbf_startup.startup_messages(settings(rate_hz=1), StartupOptions())))
 
     def test_the_rate_comes_first_and_saving_last(self) -> None:
-        messages = sbf_startup.startup_messages(settings(port="COM2"), StartupWish(save=True, baud=460800))
+        messages = sbf_startup.startup_messages(settings(port="COM2"), StartupOptions(save=True, baud=460800))
         assert messages[0].data == b"setCOMSettings, COM2, baud460800, bits8, No, bit1, none\r\n"
         assert messages[-1].data == b"exeCopyConfigFile, Current, Boot\r\n"
         assert messages[-1].last
 
     def test_a_port_that_there_is_not(self) -> None:
         with pytest.raises(DriverSettingsError, match=r"setup\.port: got 'UART1', want COM1 to COM4, USB1 or USB2"):
-            sbf_startup.startup_messages(settings(port="UART1"), StartupWish())
+            sbf_startup.startup_messages(settings(port="UART1"), StartupOptions())
 
     @pytest.mark.parametrize(
         ("reply", "answer"),

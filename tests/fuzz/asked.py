@@ -26,7 +26,7 @@ from swath.daemon.recorder.control import LINE_BYTES, Control
 from swath.daemon.recorder.writer import WriterHealth
 from swath.drivers.driver import KINDS, all_drivers
 from swath.drivers.parser import DeviceSettings
-from swath.drivers.startup import MAX_REPLY_BYTES, StartupWish
+from swath.drivers.startup import MAX_REPLY_BYTES, StartupOptions
 from swath.drivers.transports import ntrip as ntrip_client
 from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.descriptor import Gate
@@ -230,7 +230,7 @@ def _startup() -> Target:
         message
         for driver in drivers
         if driver.startup is not None
-        for message in driver.startup(DeviceSettings(f"{driver.kind}/fuzz"), StartupWish(save=True, baud=230_400))
+        for message in driver.startup(DeviceSettings(f"{driver.kind}/fuzz"), StartupOptions(save=True, baud=230_400))
     ]
     said = [recording[:2000] for driver in drivers for recording in streams_of(driver)[:2]]
     seeds = [

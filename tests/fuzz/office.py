@@ -33,7 +33,7 @@ from swath.daemon.processing.calibration.model import read_model
 from swath.daemon.processing.calibration.record import facts_of
 from swath.daemon.processing.flights.read import _given_strips
 from swath.daemon.processing.validation.run import _entry, read_file
-from swath.daemon.simulate.plans import Wish
+from swath.daemon.simulate.plans import FlightOptions
 from swath.daemon.text_files import text_of
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.scanner.beams import GeometryError, read_fibres
@@ -262,7 +262,7 @@ def _plan() -> Target:
     seeds = [(resources.files("sim") / "presets" / f"{name}.toml").read_bytes() for name in PRESETS]
 
     def read(path: Path) -> Iterator[str]:
-        plan = Wish(str(path), seed=3).load()
+        plan = FlightOptions(str(path), seed=3).load()
         yield f"{len(plan.tables.line)} lines, {len(plan.tables.scanner)} scanners"
 
     return text_target("plan", seeds, TOML, read)

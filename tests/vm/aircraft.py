@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from swath.daemon.log.mcap.chunks import json_objects
@@ -34,7 +35,7 @@ prf_hz = 5000
 _WIRES = {
     "gnss/rover": "serial:/dev/ttyS1?baud=115200",
     "imu/main": "can:socketcan:vcan0",
-    "scanner/left": "udp:127.0.0.1:2368?buffer_mb=8",
+    "scanner/left": "udp:127.0.0.1:2368",
     "pps/main": "/dev/pps0",
 }
 # the log on a disk of its own; devices that need no udev come before systemd asks for them
@@ -117,6 +118,11 @@ def numbers(paths: list[Path]) -> dict[str, list[int]]:
                     text += data
     found["serial"] = [int(number) for number in re.findall(rb"\$P,(\d{10})\r\n", text)]
     return dict(found)
+
+
+def missing(numbers: list[int]) -> list[tuple[int, int]]:
+    """Return where numbers do not go on by one: the last before, and the first after."""
+    return [(one, other) for one, other in pairwise(numbers) if other != one + 1]
 
 
 def event_codes(path: Path) -> list[str]:

@@ -26,7 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-from swath.calib.parameters import MODELS, Wish
+from swath.calib.parameters import MODELS, ParameterOptions
 from swath.daemon.config.load import describe, shown
 from swath.daemon.config.tables import Section
 from swath.daemon.errors import ConfigError, ExitCode, UserError, one_line
@@ -170,7 +170,7 @@ Known = Mapping[str, tuple[str, float]]
 States = dict[tuple[str, str], str | float]  # by scanner (of all: empty) and name: FREE, FIXED, or a prior's sigma, SI
 
 
-def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = ()) -> Wish:
+def model_of(model: str, fix: str = "", free: str = "", priors: Sequence[str] = ()) -> ParameterOptions:
     """A model, and keys of a calibration file as ``phi_deg`` or ``left.phi_deg``, to what the adjustment takes.
 
     An option stands above what a file says of the same parameter; that of all scanners also above what it says of one.
@@ -207,11 +207,11 @@ def file_of(model: str) -> Path | None:
     return Path(model) if model.lower().endswith(SUFFIX) else None
 
 
-def of_parameters(wish: Wish) -> Wish:
+def of_parameters(wish: ParameterOptions) -> ParameterOptions:
     """Without what is asked for in tables: the parameters alone."""
     entries = {name for name, _ in _entries(wish).values()}
     priors = {name: sigma for name, sigma in wish.priors.items() if not {name, name.partition(".")[2]} & entries}
-    return Wish(wish.model, wish.fix, wish.free, priors)
+    return ParameterOptions(wish.model, wish.fix, wish.free, priors)
 
 
 def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
@@ -230,7 +230,7 @@ def key_of(name: str, knots: Sequence[float] = ()) -> tuple[str, float]:
     return name, 1.0
 
 
-def in_words(wish: Wish) -> str:
+def in_words(wish: ParameterOptions) -> str:
     """For reports: the model and all that is said beside it, in a file's keys and units."""
     back = {name: (key, factor) for key, (name, factor) in (_PARAMETERS | _entries(wish)).items()}
 
@@ -249,7 +249,7 @@ def in_words(wish: Wish) -> str:
     )
 
 
-def tables_in_words(wish: Wish) -> list[str]:
+def tables_in_words(wish: ParameterOptions) -> list[str]:
     """What is asked for in tables."""
     words = []
     if wish.ibrc_knots:
@@ -273,9 +273,9 @@ def _tables(model: str) -> ModelTables:
     return ModelTables.model_validate({"model": model})
 
 
-def _of_tables(tables: ModelTables) -> Wish:
+def _of_tables(tables: ModelTables) -> ParameterOptions:
     """All but the parameters."""
-    wish, ibrc, offsets, beam = Wish(tables.model), tables.ibrc, tables.range_offset, tables.beam
+    wish, ibrc, offsets, beam = ParameterOptions(tables.model), tables.ibrc, tables.range_offset, tables.beam
     if ibrc is not None:
         wish = replace(
             wish, ibrc_knots=tuple(ibrc.knots), ibrc_reference=ibrc.reference, ibrc_smoothness_m=ibrc.smoothness_m
@@ -288,7 +288,7 @@ def _of_tables(tables: ModelTables) -> Wish:
     return wish
 
 
-def _entries(wish: Wish) -> dict[str, tuple[str, float]]:
+def _entries(wish: ParameterOptions) -> dict[str, tuple[str, float]]:
     """Of the tables that are asked for, what priors may be of: as of `_PARAMETERS`."""
     names = [f"range_offset_slot.{slot}" for slot in wish.range_offset_slots]
     names += [f"range_offset_zone.{zone}" for zone in wish.range_offset_zones]

@@ -31,7 +31,7 @@ from swath.calib.verdict import DEG, Verdict, held_words, judge
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
-from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrateWish, paths_of
+from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrationOptions, paths_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
@@ -53,7 +53,7 @@ class Told:
     lines: list[str]
 
 
-def write_products(wish: CalibrateWish, done: Calibrated, tell: Steps) -> Told:
+def write_products(wish: CalibrationOptions, done: Calibrated, tell: Steps) -> Told:
     """Write all of it; what was there before is replaced last.
 
     Raises:
@@ -161,7 +161,7 @@ def _write(files: Mapping[Path, bytes]) -> None:
         raise UserError(f"{error.filename}: {error.strerror or error}", ExitCode.IO) from error
 
 
-def _inputs(wish: CalibrateWish, done: Calibrated) -> list[tuple[str, str]]:
+def _inputs(wish: CalibrationOptions, done: Calibrated) -> list[tuple[str, str]]:
     """Name and SHA-256 of every file that went in; logs first."""
     paths = [part.path for flight in done.kept.logged for part in flight.session.parts]
     given = (wish.logs.trajectory.file, wish.control, wish.ties, wish.polygons, wish.model_file)
@@ -296,7 +296,7 @@ def _verdict_entry(verdict: Verdict) -> dict[str, Any]:
 
 
 def _report(
-    wish: CalibrateWish,
+    wish: CalibrationOptions,
     done: Calibrated,
     headers: Mapping[str, Header],
     before: FlightStrips,
@@ -370,7 +370,7 @@ def _npz(arrays: Mapping[str, Any]) -> bytes:
     return file.getvalue()
 
 
-def _settings(wish: CalibrateWish, done: Calibrated) -> dict[str, str]:
+def _settings(wish: CalibrationOptions, done: Calibrated) -> dict[str, str]:
     air = done.kept.logged[0].setup.config.atmosphere
     return {
         "Swath": __version__,

@@ -22,7 +22,7 @@ from swath.daemon.config.config import Config
 from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.errors import UserError
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
-from swath.daemon.processing.flights.read import Wish, note_times, read_flights
+from swath.daemon.processing.flights.read import GeorefOptions, note_times, read_flights
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobPlan, JobResult, Tell, feed_job
 from swath.daemon.processing.points.workers import run_jobs
@@ -106,7 +106,7 @@ def smoothed_prior(kept: KeptFlight) -> TrajectoryPrior | None:
 
 
 def read_flight(
-    wish: Wish, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
+    wish: GeorefOptions, folder: Path, tell: Steps, check: Callable[[list[str]], None] = lambda scanners: None
 ) -> KeptFlight:
     """Read logs.
 

@@ -27,7 +27,7 @@ from swath.calib.flight import Flight, FlightError
 from swath.calib.labels import number, unknown
 from swath.calib.outcome import Adjusted
 from swath.calib.parameters import ANGLES, ParameterError, check_scanners, check_wish
-from swath.calib.parameters import Wish as Model
+from swath.calib.parameters import ParameterOptions as Model
 from swath.calib.planes.fit import PlaneError, PlaneSettings
 from swath.calib.planes.given import given_planes
 from swath.calib.planes.matching import rematch
@@ -50,8 +50,8 @@ from swath.daemon.processing.calibration.returns import (
     smoothed_prior,
 )
 from swath.daemon.processing.carried_verdict import told_before
-from swath.daemon.processing.flights.read import Wish, trajectory_verdicts_of
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.flights.read import GeorefOptions, trajectory_verdicts_of
+from swath.daemon.processing.user_errors import as_user_error
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
 from swath.georef.scanner.calibration import Calibration
@@ -85,7 +85,7 @@ REFUSED = (
 
 
 @dataclass(frozen=True)
-class CalibrateWish:
+class CalibrationOptions:
     """What the command line asks for.
 
     Attributes:
@@ -103,7 +103,7 @@ class CalibrateWish:
         overwrite: files of an earlier run are replaced.
     """
 
-    logs: Wish
+    logs: GeorefOptions
     output: Path
     model: Model = field(default_factory=Model)
     model_file: Path | None = None
@@ -143,7 +143,7 @@ class Calibrated:
     findings: tuple[Finding, ...] = ()
 
 
-def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+def calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
     """Calibrate.
 
     Args:
@@ -154,11 +154,11 @@ def calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
     Raises:
         UserError: it cannot be, one line.
     """
-    with told_in_a_line(folder, *REFUSED):
+    with as_user_error(folder, *REFUSED):
         return _calibrate(wish, folder, tell)
 
 
-def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
+def _calibrate(wish: CalibrationOptions, folder: Path, tell: Steps) -> Calibrated:
     _refuse_existing(wish, [] if wish.report is None else [wish.report / OUTCOME])
     kept = read_flight(wish.logs, folder, tell, lambda scanners: check_scanners(scanners, wish.model))
     _refuse_existing(wish, paths_of(wish, (head.name for head in kept.flight.heads)).values())
@@ -167,7 +167,7 @@ def _calibrate(wish: CalibrateWish, folder: Path, tell: Steps) -> Calibrated:
         return _calibrated(wish, kept, folder, tell)
 
 
-def _calibrated(wish: CalibrateWish, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
+def _calibrated(wish: CalibrationOptions, kept: KeptFlight, folder: Path, tell: Steps) -> Calibrated:
     _refuse_one_strip(kept)
     points = _control(wish, kept.flight)
     workers = wish.logs.workers
@@ -268,14 +268,14 @@ def prealigned_otherwise(away: Mapping[str, float], adjusted: Adjusted) -> tuple
     return tuple(found)
 
 
-def _refuse_existing(wish: CalibrateWish, files: Iterable[Path]) -> None:
+def _refuse_existing(wish: CalibrationOptions, files: Iterable[Path]) -> None:
     """UserError where a file is there that may not be replaced."""
     for path in files:
         if path.exists() and not wish.overwrite:
             raise UserError(f"{path}: is there already; want another folder, or --overwrite", ExitCode.USAGE)
 
 
-def paths_of(wish: CalibrateWish, scanners: Iterable[str]) -> dict[str, Path]:
+def paths_of(wish: CalibrationOptions, scanners: Iterable[str]) -> dict[str, Path]:
     """Where each scanner's calibration goes."""
     names = list(scanners)
     if len(names) == 1 and not wish.output.is_dir():
@@ -319,7 +319,7 @@ def refuse_lost_control(control: Path | None, features: Features) -> None:
 # ---------------------------------------------------------------------- observations
 
 
-def _control(wish: CalibrateWish, flight: Flight) -> tuple[ControlPoint, ...]:
+def _control(wish: CalibrationOptions, flight: Flight) -> tuple[ControlPoint, ...]:
     if wish.control is None:
         return ()
     return in_t(read_control(text_of(wish.control), str(wish.control)), flight.frame)
@@ -338,7 +338,7 @@ def _doubts(flight: Flight, points: Sequence[ControlPoint]) -> tuple[str, ...]:
     return tuple(doubt.text for doubt in found)
 
 
-def _features(wish: CalibrateWish, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
+def _features(wish: CalibrationOptions, flight: Flight, planes: Features, points: Sequence[ControlPoint]) -> Features:
     """What the adjustment takes: the planes or their intersections, never both, for they are of the same returns."""
     found = [planes]
     if "ties" in wish.observe:
@@ -362,7 +362,7 @@ def prior_of(kept: KeptFlight) -> TrajectoryPrior:
 # ---------------------------------------------------------------------- results
 
 
-def _refuse_far(wish: CalibrateWish, flight: Flight, adjusted: Adjusted) -> None:
+def _refuse_far(wish: CalibrationOptions, flight: Flight, adjusted: Adjusted) -> None:
     """Nothing is written that led away from what anybody would believe."""
     log = wish.logs.logs[0]
     if not adjusted.converged:

@@ -23,7 +23,7 @@ from swath.daemon.processing.carried_verdict import (
     verdict_entry,
 )
 from swath.daemon.processing.files import refuse_no_name
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryWish, choose_trajectory
+from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions, choose_trajectory
 from swath.daemon.processing.head_clocks import find_stamps, stamp_lines
 from swath.daemon.processing.points.clocks import LogClocks, read_clocks
 from swath.daemon.processing.points.time_checks import refuse_no_time, time_trouble
@@ -51,12 +51,12 @@ INTENSITY_FACTOR = 257.0  # eight bits, 0 … 255, fill the field of 16
 
 
 @dataclass(frozen=True)
-class Wish:
+class GeorefOptions:
     """What the command line asks for.
 
     Attributes:
         logs, output: where from, where to.
-        trajectory: see `TrajectoryWish`.
+        trajectory: see `TrajectoryOptions`.
         options: over the logs' configuration.
         config: instead of the logs' own; None: theirs.
         strips: ``auto``, ``whole``, or a CSV file's name.
@@ -72,7 +72,7 @@ class Wish:
 
     logs: Sequence[Path]
     output: Path
-    trajectory: TrajectoryWish = field(default_factory=TrajectoryWish)
+    trajectory: TrajectoryOptions = field(default_factory=TrajectoryOptions)
     options: Options = field(default_factory=Options)
     config: Config | None = None
     strips: str = "auto"
@@ -178,7 +178,9 @@ class Flight:
         return found
 
 
-def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None) -> list[Flight]:
+def read_flights(
+    wish: GeorefOptions, tell: Tell, check: Callable[[list[str]], None] = lambda scanners: None
+) -> list[Flight]:
     """The flights of a wish, with trajectories and strips; what of a directory is no log is a hole of the first.
 
     Args:
@@ -214,7 +216,7 @@ def read_flights(wish: Wish, tell: Tell, check: Callable[[list[str]], None] = la
     return flights
 
 
-def _setup(wish: Wish, session: Session) -> Setup:
+def _setup(wish: GeorefOptions, session: Session) -> Setup:
     if wish.config is None:
         try:
             setup = Setup.of_log(session.attachments(), wish.options)
@@ -255,7 +257,7 @@ def _read(session: Session, setup: Setup, *, positions: bool) -> Flight:
     return flight
 
 
-def _choose(wish: Wish, flight: Flight) -> None:
+def _choose(wish: GeorefOptions, flight: Flight) -> None:
     """The flight's trajectory; the mapping's operation for where it was."""
     status = flight.status(flight.host_span[1])
     leap_seconds = status.leap_seconds if status is not None and status.leap_origin != "guess" else None
@@ -274,7 +276,7 @@ def _choose(wish: Wish, flight: Flight) -> None:
     flight.troubles += [misfit] if misfit else []
 
 
-def _judge(wish: Wish, flight: Flight) -> None:
+def _judge(wish: GeorefOptions, flight: Flight) -> None:
     """The verdicts that what is made of the flight has to carry."""
     if wish.trajectory.file is not None:
         flight.trajectory_verdicts, flight.source = file_verdicts(wish.trajectory.file, flight.span)
@@ -295,12 +297,12 @@ def trajectory_verdicts_of(flights: Sequence[Flight]) -> list[Carried]:
     return list(dict.fromkeys(one for flight in flights for one in flight.trajectory_verdicts))
 
 
-def verdict_of(wish: Wish, flights: Sequence[Flight]) -> dict[str, Any]:
+def verdict_of(wish: GeorefOptions, flights: Sequence[Flight]) -> dict[str, Any]:
     """Return the verdict on a run, as its record says it: each reason once."""
     return verdict_entry(verdicts_of(flights), accepted=wish.accept_verdict)
 
 
-def _number_strips(wish: Wish, flights: Sequence[Flight]) -> None:
+def _number_strips(wish: GeorefOptions, flights: Sequence[Flight]) -> None:
     """Each flight's strips in log time, numbered through."""
     given = None if wish.strips in ("auto", "whole") else _given_strips(wish.strips)
     number = 1
@@ -339,7 +341,7 @@ def _given_strips(name: str) -> list[Span]:
     return read_strips(text_of(Path(name), "a CSV file with start_gps_ns,end_gps_ns"), name)
 
 
-def _strips(wish: Wish, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
+def _strips(wish: GeorefOptions, flight: Flight, given: Sequence[Span] | None) -> list[Span]:
     laser = laser_spans(*flight.index.spans(), wish.rules)
     if wish.strips == "whole":
         return laser
@@ -351,7 +353,7 @@ def _strips(wish: Wish, flight: Flight, given: Sequence[Span] | None) -> list[Sp
     return [(start, end) for start, end in here if start < flight.host_span[1] and end > flight.host_span[0]]
 
 
-def _straight(wish: Wish, flight: Flight) -> list[Span]:
+def _straight(wish: GeorefOptions, flight: Flight) -> list[Span]:
     """Straight flight in GPS time, and where the trajectory says nothing.
 
     Before a device's own INS is aligned there is nothing to be had: that is told, and no strip.

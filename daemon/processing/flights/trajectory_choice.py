@@ -40,7 +40,7 @@ FROM_LOG = "INS solution in the log"
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectoryWish:
+class TrajectoryOptions:
     """What the command line says of the trajectory.
 
     Attributes:
@@ -82,7 +82,7 @@ class Chosen:
 
 
 def choose_trajectory(
-    wish: TrajectoryWish,
+    wish: TrajectoryOptions,
     setup: Setup,
     session: Session,
     clocks: LogClocks,
@@ -130,7 +130,7 @@ def choose_trajectory(
 
 
 def _belonging(
-    wish: TrajectoryWish, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
+    wish: TrajectoryOptions, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
 ) -> list[str]:
     """Return what is doubtful of a file's trajectory against the log; UserError where it does not belong to it."""
     offset = offset_of(wish.at, setup) or (0.0, 0.0, 0.0)
@@ -141,7 +141,7 @@ def _belonging(
     return [*found.refused, *found.warnings]
 
 
-def _from_file(wish: TrajectoryWish, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
+def _from_file(wish: TrajectoryOptions, file: Path, span: tuple[int, int], leap_seconds: int | None) -> Trajectory:
     smrmsg = smrmsg_beside(file)
     return read_trajectory(
         file.read_bytes(),
@@ -163,8 +163,8 @@ def _from_device(setup: Setup, clocks: LogClocks) -> tuple[Trajectory, dict[str,
 
 def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Navigated:
     """Smoothed from IMU and GNSS."""
-    from swath.daemon.processing.navigation.inputs import InputWish
-    from swath.daemon.processing.navigation.navigate import NavigateWish, navigate_session
+    from swath.daemon.processing.navigation.inputs import InputOptions
+    from swath.daemon.processing.navigation.navigate import NavigationOptions, navigate_session
 
     log = session.parts[0].path
     if setup.sources.imu_source is None or not setup.config.gnss:
@@ -172,7 +172,7 @@ def _navigated(setup: Setup, session: Session, solutions: dict[str, int]) -> Nav
         missing = "no receiver" if setup.sources.imu_source is not None else "no IMU"
         raise UserError(f"{log}: {told}, and {missing} to make one; want --trajectory FILE", ExitCode.USAGE)
     try:
-        return navigate_session(session, NavigateWish(InputWish(config=setup.config)))
+        return navigate_session(session, NavigationOptions(InputOptions(config=setup.config)))
     except UserError as error:
         hint = "; or give --trajectory FILE"
         raise UserError("\n".join(f"{line}{hint}" for line in error.message.splitlines()), error.exit_code) from error

@@ -24,14 +24,21 @@ from swath import __version__
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
 from swath.daemon.processing.files import put_in_place, sha256_of
-from swath.daemon.processing.flights.read import INTENSITY_FACTOR, Flight, Wish, note_times, read_flights, verdict_of
+from swath.daemon.processing.flights.read import (
+    INTENSITY_FACTOR,
+    Flight,
+    GeorefOptions,
+    note_times,
+    read_flights,
+    verdict_of,
+)
 from swath.daemon.processing.georeferencing.sidecar import count_unread, reasons_text, run_record, write_sidecar
 from swath.daemon.processing.points.jobs import MARGIN_NS, Job, JobError, JobResult, SessionPlan
 from swath.daemon.processing.points.workers import run_jobs
 from swath.daemon.processing.quicklook.product_facts import read_sidecar, sessions_in
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.unread import unread_lines
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.user_errors import as_user_error
 from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
 from swath.georef.mapping.frame import MappingError
@@ -53,13 +60,13 @@ class Report:
     sidecar: Path
 
 
-def georeference(wish: Wish, tell: Tell) -> Report:
+def georeference(wish: GeorefOptions, tell: Tell) -> Report:
     """Make the products.
 
     Raises:
         UserError: they cannot be made, one line; nothing that looks like a product is left then.
     """
-    with told_in_a_line(wish.output, StripError, JobError, MappingError):
+    with as_user_error(wish.output, StripError, JobError, MappingError):
         flights = read_flights(wish, tell)
         names = [flight.session.session_id for flight in flights]
         with _out_of_sight(wish, names) as (partial, into_place):
@@ -69,12 +76,12 @@ def georeference(wish: Wish, tell: Tell) -> Report:
 # ---------------------------------------------------------------------- jobs
 
 
-def _jobs(wish: Wish, flight: Flight, number: int, partial: Path) -> list[Job]:
+def _jobs(wish: GeorefOptions, flight: Flight, number: int, partial: Path) -> list[Job]:
     tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
     return [_job(wish, flight, number, tile, partial) for tile in tiles]
 
 
-def _job(wish: Wish, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
+def _job(wish: GeorefOptions, flight: Flight, number: int, tile: Segment, partial: Path) -> Job:
     places = flight.index.between(tile.start_ns - MARGIN_NS, tile.end_ns + MARGIN_NS)
     if not tile.strip:
         return Job(number, tile, places)
@@ -93,7 +100,9 @@ def _numbers(flights: Sequence[Flight]) -> dict[str, int]:
     return {name: number for number, name in enumerate(sorted({n for one in flights for n in one.setup.scanners}))}
 
 
-def _plan(wish: Wish, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]) -> SessionPlan:
+def _plan(
+    wish: GeorefOptions, flight: Flight, origin: tuple[float, float, float], numbers: dict[str, int]
+) -> SessionPlan:
     setup = flight.setup
     assert setup.mapping is not None
     protocols = {name: setup.config.scanner[name].protocol for name in setup.scanners}
@@ -135,7 +144,7 @@ def _origin(flights: Sequence[Flight]) -> tuple[float, float, float]:
 
 
 @contextmanager
-def _out_of_sight(wish: Wish, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
+def _out_of_sight(wish: GeorefOptions, names: Sequence[str]) -> Iterator[tuple[Path, Callable[[list[Path]], None]]]:
     """A folder for what is not finished, and what puts it in its place; it goes whatever happens. Names of sessions."""
     output, name = wish.output, names[0]
     _refuse_existing(wish, names)
@@ -166,7 +175,7 @@ def _strips(folder: Path, name: str) -> list[Path]:
     return [file for file in sorted(folder.glob(f"{glob.escape(name)}_strip*")) if file.name.endswith(ENDINGS)]
 
 
-def _refuse_existing(wish: Wish, names: Sequence[str]) -> None:
+def _refuse_existing(wish: GeorefOptions, names: Sequence[str]) -> None:
     """UserError where products of the sessions are there, or a trajectory of theirs that is read."""
     for name in names:
         files = TrajectoryFiles.in_folder(wish.output, name, csv=True)
@@ -196,7 +205,7 @@ def _refuse_parts(folder: Path, names: Sequence[str]) -> None:
 
 
 def _make(
-    wish: Wish,
+    wish: GeorefOptions,
     flights: Sequence[Flight],
     name: str,
     partial: Path,

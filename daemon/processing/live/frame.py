@@ -11,7 +11,7 @@ from pyproj import CRS
 
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.points import Points
@@ -92,7 +92,7 @@ class LocalFrame:
         return mapped[0], q_local_from_b
 
 
-@kept
+@jit_cached
 def _step_along(position_e: Any, q_e_from_b: Any, places: Any) -> None:
     """(4, 3): a position, and a step from there along each axis of b."""
     rot = rot_of(q_e_from_b[0], q_e_from_b[1], q_e_from_b[2], q_e_from_b[3])
@@ -102,7 +102,7 @@ def _step_along(position_e: Any, q_e_from_b: Any, places: Any) -> None:
             places[1 + of_b, axis] += STEP_M * rot[axis][of_b]
 
 
-@kept
+@jit_cached
 def _attitude_of(places: Any, q: Any) -> None:
     """Quaternion (4,), scalar first, of the steps (4, 3) made perpendicular: the rotation that is nearest to them.
 
@@ -130,7 +130,7 @@ def _attitude_of(places: Any, q: Any) -> None:
     q /= math.copysign(math.sqrt((q * q).sum()), q[0])
 
 
-@kept
+@jit_cached
 def _fill_cloud(points: Any, intensity: Any, keep: Any, origin: Any, unit_m: Any, cloud: Any) -> None:
     """Rows of x, y, z, intensity; the frame's axes are those of the points."""
     for k in range(len(keep)):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 
 TILE = 256  # cells along a side
 _TILE_BITS = 8
@@ -150,7 +150,7 @@ def _find_tile(column: int, row: int, keys: Any, slots: Any, places: Any, state:
     return int(slots[at])
 
 
-_take_tile = kept(_find_tile)
+_take_tile = jit_cached(_find_tile)
 
 
 def _count_points(
@@ -183,10 +183,10 @@ def _count_points(
     return len(points)
 
 
-count_points = kept(_count_points)
+count_points = jit_cached(_count_points)
 
 
-@kept
+@jit_cached
 def _count_cells(counts: Any, held: int, frequency: Any) -> None:
     """How many cells have so many points; the last number stands for all above."""
     most = len(frequency) - 1

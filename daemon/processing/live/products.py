@@ -24,7 +24,7 @@ from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.grid import CountGrid
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
@@ -56,7 +56,7 @@ class Thinning:
         return kept_ones[: _thin(time_ns, self._limit, self._state, kept_ones)]
 
 
-@kept
+@jit_cached
 def _thin(time_ns: Any, limit: int, state: Any, keep: Any) -> int:
     """How many are kept.
 

@@ -122,7 +122,7 @@ class NavigationInputs:
 
 
 @dataclass(frozen=True, slots=True)
-class InputWish:
+class InputOptions:
     """What the command line says of the inputs.
 
     Attributes:
@@ -143,7 +143,7 @@ class InputWish:
     ins: str = "ignore"
 
 
-def read_inputs(session: Session, wish: InputWish, storage: Storage = IN_MEMORY) -> NavigationInputs:
+def read_inputs(session: Session, wish: InputOptions, storage: Storage = IN_MEMORY) -> NavigationInputs:
     """Read a session; its samples are kept in the storage.
 
     Raises:
@@ -196,7 +196,7 @@ def read_inputs(session: Session, wish: InputWish, storage: Storage = IN_MEMORY)
     )
 
 
-def _sources(session: Session, wish: InputWish) -> NavigationSources:
+def _sources(session: Session, wish: InputOptions) -> NavigationSources:
     log = session.parts[0].path
     try:
         files = files_of(session, wish.config)

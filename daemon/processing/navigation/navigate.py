@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.reader import Session
-from swath.daemon.processing.navigation.inputs import InputWish, Leg, NavigationInputs, protocol_of, read_inputs
+from swath.daemon.processing.navigation.inputs import InputOptions, Leg, NavigationInputs, protocol_of, read_inputs
 from swath.daemon.processing.navigation.sources import noise_of
 from swath.daemon.processing.navigation.times import Stretch
 from swath.georef.arrays import FloatArray
@@ -58,7 +58,7 @@ COLUMNS = ("time_ns", "position_e", "q_e_from_b", "velocity_e", "position_sigma_
 
 
 @dataclass(frozen=True, slots=True)
-class NavigateWish:
+class NavigationOptions:
     """What the command line says of the run.
 
     Attributes:
@@ -68,7 +68,7 @@ class NavigateWish:
         compare_noise: find out whether the flight asks for another noise of the unit; takes some runs of ten minutes.
     """
 
-    inputs: InputWish = field(default_factory=InputWish)
+    inputs: InputOptions = field(default_factory=InputOptions)
     smooth: bool = True
     attitude_rad: tuple[float, float, float] | None = None
     compare_noise: bool = False
@@ -148,7 +148,9 @@ class Navigated:
         return np.concatenate([solution.velocity_sigma_l for solution in self.solutions()])
 
 
-def navigate_session(session: Session, wish: NavigateWish, tell: Tell = lambda what, done, total: None) -> Navigated:
+def navigate_session(
+    session: Session, wish: NavigationOptions, tell: Tell = lambda what, done, total: None
+) -> Navigated:
     """Read a session and navigate it.
 
     Raises:
@@ -164,7 +166,7 @@ def navigate_session(session: Session, wish: NavigateWish, tell: Tell = lambda w
 
 def navigate_inputs(
     inputs: NavigationInputs,
-    wish: NavigateWish,
+    wish: NavigationOptions,
     tell: Tell = lambda what, done, total: None,
     storage: Storage = IN_MEMORY,
 ) -> Navigated:
@@ -199,7 +201,7 @@ def navigate_inputs(
     return navigated
 
 
-def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigateWish, storage: Storage) -> NavigatedLeg:
+def _navigated(inputs: NavigationInputs, leg: Leg, wish: NavigationOptions, storage: Storage) -> NavigatedLeg:
     from swath.georef.navigation.alignment.align import align
     from swath.georef.navigation.alignment.earlier_start import earlier_start
     from swath.georef.navigation.diagnosis.diagnose import diagnose

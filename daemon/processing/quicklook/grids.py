@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swath.daemon.processing.quicklook.read import Block
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 
 MOST_CELLS = 2_000_000
 STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # times a power of ten
@@ -70,7 +70,7 @@ def cell_for(density: float, points_a_cell: float) -> float:
     return round_up(max(math.sqrt(points_a_cell / density), SMALLEST_CELL_M))
 
 
-@kept
+@jit_cached
 def _sum_up(
     x_m: Any,
     y_m: Any,

@@ -21,7 +21,7 @@ from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.processing.quicklook.grids import Frame, inner
 from swath.daemon.processing.quicklook.read import Block
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept
+from swath.georef.compiled import jit_cached
 
 TILE = 16  # cells along a side; memory is taken by tiles
 TILE_CELLS = TILE * TILE
@@ -49,7 +49,7 @@ NARROWEST = 0.125  # of a cell: the least spread (one sigma) of a strip's return
 HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
 
 
-@kept
+@jit_cached
 def _sum_moments(
     begin: int,
     x_m: FloatArray,

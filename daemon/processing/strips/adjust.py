@@ -40,11 +40,11 @@ from swath.daemon.processing.calibration.returns import (
 from swath.daemon.processing.calibration.run import PLANES, refuse_lost_control, refuse_no_planes
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, told_before
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
-from swath.daemon.processing.flights.read import Wish, verdicts_of
+from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.strip_agreement import FlightStrips, before_and_after
 from swath.daemon.processing.strips.compare import is_of_logs
 from swath.daemon.processing.trajectory.files import TrajectoryFiles
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.user_errors import as_user_error
 from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError as StripTimesError
 from swath.georef.trajectory.trajectory import TrajectoryError
@@ -66,7 +66,7 @@ REFUSED = (
 
 
 @dataclass(frozen=True)
-class AdjustWish:
+class AdjustOptions:
     """What the command line asks for.
 
     Attributes:
@@ -77,7 +77,7 @@ class AdjustWish:
         overwrite: files of an earlier run are replaced.
     """
 
-    logs: Wish
+    logs: GeorefOptions
     output: Path
     control: Path | None = None
     model: str = AUTO
@@ -111,7 +111,7 @@ class StripsCorrected:
     notes: tuple[str, ...]
 
 
-def _refuse_output(wish: AdjustWish) -> None:
+def _refuse_output(wish: AdjustOptions) -> None:
     """UserError where no folder can be there, or it holds an adjustment already; before anything lasts long."""
     there, permitted = nearest_there(wish.output.absolute())
     if permitted and not there.is_dir():
@@ -124,7 +124,7 @@ def _refuse_output(wish: AdjustWish) -> None:
         )
 
 
-def files_of(wish: AdjustWish, flight: LoggedFlight) -> TrajectoryFiles:
+def files_of(wish: AdjustOptions, flight: LoggedFlight) -> TrajectoryFiles:
     """Names of a session's files; UserError where they are there, or are what the trajectory was read from."""
     files = TrajectoryFiles.in_folder(wish.output, flight.session.session_id, csv=True)
     paths = [path for path in (files.sbet, files.smrmsg, files.csv) if path is not None]
@@ -137,7 +137,7 @@ def files_of(wish: AdjustWish, flight: LoggedFlight) -> TrajectoryFiles:
     return files
 
 
-def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+def correct_strips(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
     """Adjust strips; nothing is written.
 
     Args:
@@ -156,17 +156,17 @@ def correct_strips(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrect
             ExitCode.USAGE,
         )
     _refuse_output(wish)
-    with told_in_a_line(folder, *REFUSED):
+    with as_user_error(folder, *REFUSED):
         return _corrected(wish, folder, tell)
 
 
-def _corrected(wish: AdjustWish, folder: Path, tell: Steps) -> StripsCorrected:
+def _corrected(wish: AdjustOptions, folder: Path, tell: Steps) -> StripsCorrected:
     kept = read_flight(wish.logs, folder, tell)
     with told_before(verdicts_of(kept.logged), *REFUSED):
         return _of_flight(wish, kept, folder, tell)
 
 
-def _of_flight(wish: AdjustWish, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
+def _of_flight(wish: AdjustOptions, kept: KeptFlight, folder: Path, tell: Steps) -> StripsCorrected:
     _refuse(wish, kept)
     for logged in kept.logged:
         files_of(wish, logged)
@@ -197,7 +197,7 @@ def _of_flight(wish: AdjustWish, kept: KeptFlight, folder: Path, tell: Steps) ->
     return StripsCorrected(kept, features, points, adjusted, before, after, tuple(notes))
 
 
-def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
+def _refuse(wish: AdjustOptions, kept: KeptFlight) -> None:
     log = kept.logged[0].log
     strips = {(swath.flown, swath.strip) for swath in kept.flight.swaths}
     if len(strips) < 2:
@@ -216,7 +216,7 @@ def _refuse(wish: AdjustWish, kept: KeptFlight) -> None:
             )
 
 
-def _notes(wish: AdjustWish, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
+def _notes(wish: AdjustOptions, kept: KeptFlight, features: Features, cell_m: float) -> list[str]:
     notes, flight = [], kept.flight
     if not wish.control:
         settings = wish.settings

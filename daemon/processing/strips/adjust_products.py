@@ -20,7 +20,7 @@ from swath.daemon.processing.carried_verdict import ADJUSTMENT, first_lines, tra
 from swath.daemon.processing.files import gone_on_failure, put_in_place, sha256_of, write_aside
 from swath.daemon.processing.flights.read import Flight as LoggedFlight
 from swath.daemon.processing.flights.read import verdict_of
-from swath.daemon.processing.strips.adjust import AdjustWish, StripsCorrected, files_of
+from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected, files_of
 from swath.daemon.processing.trajectory.files import write_trajectory
 from swath.daemon.processing.trajectory.summary import write_json
 from swath.daemon.processing.user_errors import finite
@@ -37,7 +37,7 @@ UNCORRECTED = "none"
 TOLD = 0.7  # of its prior's sigma: returns say as much as the prior does
 
 
-def write_adjustment(wish: AdjustWish, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
+def write_adjustment(wish: AdjustOptions, done: StripsCorrected, tell: Callable[[str, int, int], None]) -> Told:
     """Write all of it; the record last, as a folder with a record is whole.
 
     Raises:
@@ -110,7 +110,7 @@ def _strips(done: StripsCorrected) -> Iterator[_Strip]:
         yield _Strip(choice, *own, done.before.rms_of(names), done.after.rms_of(names))
 
 
-def _record(wish: AdjustWish, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
+def _record(wish: AdjustOptions, done: StripsCorrected, written: list[tuple[Path, Path]]) -> dict[str, Any]:
     adjusted, settings = done.adjusted, wish.settings
     heads = done.kept.flight.heads
     inputs = [part.path for flight in done.kept.logged for part in flight.session.parts]

@@ -16,10 +16,10 @@ from swath.calib.strips.signatures import Signatures, record_of, signatures
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.calibration.returns import read_flight, refuse_installations, smoothed_prior
 from swath.daemon.processing.carried_verdict import first_lines, points_verdicts, refusal, told_before, verdict_entry
-from swath.daemon.processing.flights.read import Wish, verdicts_of
+from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.strip_agreement import Agreement, difference_of
 from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
-from swath.daemon.processing.user_errors import finite, told_in_a_line
+from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.georef.mapping.frame import MappingError
 from swath.georef.strips import StripError
 
@@ -31,7 +31,7 @@ POINT_SUFFIXES = (".las", ".laz")
 
 
 @dataclass(frozen=True)
-class StripsWish:
+class StripsOptions:
     """What the command line asks for.
 
     Attributes:
@@ -44,7 +44,7 @@ class StripsWish:
     """
 
     paths: Sequence[Path]
-    logs: Wish
+    logs: GeorefOptions
     before: Sequence[Path] = ()
     rules: StripRules = field(default_factory=StripRules)
     output: Path | None = None
@@ -60,7 +60,7 @@ class Compared:
     problem: str
 
 
-def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
+def compare_strips(wish: StripsOptions, folder: Path, told: Told) -> Compared:
     """Compare.
 
     Args:
@@ -71,7 +71,7 @@ def compare_strips(wish: StripsWish, folder: Path, told: Told) -> Compared:
     Raises:
         UserError: it cannot be, one line.
     """
-    with told_in_a_line(folder, FlightError, StripError, MappingError):
+    with as_user_error(folder, FlightError, StripError, MappingError):
         now = _judged(_read(wish.paths, wish, folder / "now", told), wish, told)
         then = _judged(_read(wish.before, wish, folder / "before", told), wish, told) if wish.before else None
     record = finite(now.record() | ({"before": then.record()} if then is not None else {}))
@@ -114,7 +114,7 @@ def _kind(path: Path) -> str:
     return "points" if path.suffix.lower() in POINT_SUFFIXES else "logs"
 
 
-def _read(paths: Sequence[Path], wish: StripsWish, folder: Path, told: Told) -> Strips:
+def _read(paths: Sequence[Path], wish: StripsOptions, folder: Path, told: Told) -> Strips:
     if not is_of_logs(paths):
         strips = strips_of_files(paths, wish.rules, told, wish.logs.trajectory.week)
         strips.carried.extend(points_verdicts([source.sidecar for source in strips.look.sources]))
@@ -217,14 +217,14 @@ class Judgement:
         return lines + self.strips.notes
 
 
-def _judged(strips: Strips, wish: StripsWish, told: Told) -> Judgement:
+def _judged(strips: Strips, wish: StripsOptions, told: Told) -> Judgement:
     told(f"comparing {strips.what}", 0, 1)
     report = report_of(strips.look.names, strips.gathered, wish.rules, strips.cell_m)
     found = None if strips.seen is None else signatures(report.checks, strips.seen, strips.prior)
     return Judgement(strips, report, found)
 
 
-def _draw(wish: StripsWish, now: Judgement, then: Judgement | None) -> list[Path]:
+def _draw(wish: StripsOptions, now: Judgement, then: Judgement | None) -> list[Path]:
     if wish.output is None:
         return []
     from swath.daemon.processing.quicklook.maps import draw_differences

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from swath.daemon.processing.navigation.navigate import NavigateWish
+from swath.daemon.processing.navigation.navigate import NavigationOptions
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectoryWish:
+class TrajectoryRequest:
     """What the command line asks for.
 
     Attributes:
@@ -24,7 +24,7 @@ class TrajectoryWish:
 
     logs: Sequence[Path]
     output: Path
-    navigate: NavigateWish = field(default_factory=NavigateWish)
+    navigate: NavigationOptions = field(default_factory=NavigationOptions)
     csv: bool = False
     events: Path | None = None
     page: bool = True

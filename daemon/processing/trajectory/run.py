@@ -23,9 +23,9 @@ from swath.daemon.processing.points.clocks import read_clocks
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.trajectory.event_marks import EventTable, event_table
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
-from swath.daemon.processing.trajectory.request import TrajectoryWish
+from swath.daemon.processing.trajectory.request import TrajectoryRequest
 from swath.daemon.processing.trajectory.summary import pages_of, summary_head, summary_of_run, write_json
-from swath.daemon.processing.user_errors import told_in_a_line
+from swath.daemon.processing.user_errors import as_user_error
 from swath.georef.trajectory.buffer import TrajectoryBuffer
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError, gps_text
 
@@ -47,13 +47,13 @@ class TrajectoryReport:
     files: list[Path]
 
 
-def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
+def make_trajectory(wish: TrajectoryRequest, tell: Tell) -> TrajectoryReport:
     """Make the files.
 
     Raises:
         UserError: there is no trajectory, a line each; no file is left then.
     """
-    with told_in_a_line(wish.output, TrajectoryError):
+    with as_user_error(wish.output, TrajectoryError):
         passed_over: list[str] = []
         sessions = open_logs(wish.logs, passed_over)
         for session in sessions:
@@ -71,7 +71,9 @@ def make_trajectory(wish: TrajectoryWish, tell: Tell) -> TrajectoryReport:
         return _write(wish, files, flights, tell)
 
 
-def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell) -> TrajectoryReport:
+def _write(
+    wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], tell: Tell
+) -> TrajectoryReport:
     tell("files", 0, 1)
     trajectory = _joined(flights)
     sigma = np.concatenate([flight.velocity_sigma_l() for flight in flights])
@@ -91,7 +93,7 @@ def _write(wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navig
 
 
 def _write_as_is(
-    wish: TrajectoryWish, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
+    wish: TrajectoryRequest, files: TrajectoryFiles, sessions: Sequence[Session], holes: Sequence[str]
 ) -> TrajectoryReport:
     """The devices' own INS, without a page."""
     if wish.events is not None:
@@ -141,7 +143,7 @@ def _refuse_one_name(events: Path | None, files: TrajectoryFiles) -> None:
 
 
 def _write_events(
-    wish: TrajectoryWish, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
+    wish: TrajectoryRequest, flights: Sequence[Navigated], trajectory: Trajectory, written: Written
 ) -> EventTable | None:
     marks: list[Mark] = [mark for flight in flights for mark in flight.inputs.marks]
     if wish.events is None:
@@ -157,7 +159,7 @@ def _write_events(
 
 
 def _write_pages(
-    wish: TrajectoryWish, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
+    wish: TrajectoryRequest, files: TrajectoryFiles, flights: Sequence[Navigated], written: Written
 ) -> tuple[list[Any], list[Any]]:
     """A page a leg; verdicts and figures of all legs, in order."""
     verdicts: list[Any] = []

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from swath.daemon.log.reader import Session
     from swath.daemon.processing.navigation.navigate import Navigated, NavigatedLeg
     from swath.daemon.processing.trajectory.event_marks import EventTable
-    from swath.daemon.processing.trajectory.request import TrajectoryWish
+    from swath.daemon.processing.trajectory.request import TrajectoryRequest
     from swath.georef.navigation.diagnosis.diagnose import Finding
     from swath.georef.navigation.inputs import Setup, Start
 
@@ -79,7 +79,7 @@ def start_words(start: Start) -> str:
 
 
 def summary_head(
-    wish: TrajectoryWish, solution: str, sessions: Sequence[Session], holes: Sequence[str], warnings: Sequence[str]
+    wish: TrajectoryRequest, solution: str, sessions: Sequence[Session], holes: Sequence[str], warnings: Sequence[str]
 ) -> dict[str, Any]:
     """What every summary says: the software, what it was made of, what is missing."""
     wanted = wish.navigate.inputs
@@ -110,7 +110,7 @@ def summary_head(
 
 
 def summary_of_run(
-    wish: TrajectoryWish,
+    wish: TrajectoryRequest,
     flights: Sequence[Navigated],
     verdicts: Sequence[Any],
     figures: Sequence[Any],

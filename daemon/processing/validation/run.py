@@ -21,7 +21,7 @@ from swath.calib.equations.normals import NormalError
 from swath.calib.equations.trajectory_prior import TrajectoryPrior
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError
-from swath.calib.parameters import Wish as Model
+from swath.calib.parameters import ParameterOptions as Model
 from swath.calib.planes.fit import PlaneError
 from swath.calib.planes.search import find_planes
 from swath.calib.record.record import Document
@@ -42,8 +42,8 @@ from swath.daemon.processing.calibration.returns import KeptFlight, read_flight,
 from swath.daemon.processing.calibration.run import PLANES, prior_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, refusal, told_before, verdict_entry
 from swath.daemon.processing.files import sha256_of, write_whole
-from swath.daemon.processing.flights.read import Wish, verdicts_of
-from swath.daemon.processing.user_errors import finite, told_in_a_line
+from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
+from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.daemon.processing.validation.record import record_files, records_of
 from swath.daemon.text_files import text_of
 from swath.georef.mapping.frame import MappingError
@@ -60,7 +60,7 @@ REFUSED = (FlightError, PlaneError, HistoryError, StripError, MappingError, Cali
 
 
 @dataclass(frozen=True)
-class ValidateWish:
+class ValidationOptions:
     """What the command line asks for.
 
     Attributes:
@@ -74,7 +74,7 @@ class ValidateWish:
     """
 
     calibrations: Sequence[Path]
-    logs: Wish
+    logs: GeorefOptions
     control: Path | None = None
     histories: Sequence[Path] = ()
     anew: bool = False
@@ -102,7 +102,7 @@ class _Found:
     carried: list[Carried] = field(default_factory=list)
 
 
-def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
+def run_validation(wish: ValidationOptions, folder: Path, told: Told) -> Validated:
     """Validate.
 
     Args:
@@ -113,7 +113,7 @@ def run_validation(wish: ValidateWish, folder: Path, told: Told) -> Validated:
     Raises:
         UserError: it cannot be, one line.
     """
-    with told_in_a_line(folder, *REFUSED):
+    with as_user_error(folder, *REFUSED):
         calibrations = [read_file(path) for path in wish.calibrations]
         found = _Found({one.scanner: one for one in calibrations})
         if wish.histories:
@@ -151,7 +151,7 @@ def _entry(path: Path, named: Sequence[Path]) -> Calibration | None:
     return None
 
 
-def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -> None:
+def _against_logs(wish: ValidationOptions, found: _Found, folder: Path, told: Told) -> None:
     kept = read_flight(wish.logs, folder, told)
     refuse_installations(kept.logged)
     found.carried += verdicts_of(kept.logged)
@@ -159,7 +159,7 @@ def _against_logs(wish: ValidateWish, found: _Found, folder: Path, told: Told) -
         _against_flight(wish, found, kept, folder, told)
 
 
-def _against_flight(wish: ValidateWish, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
+def _against_flight(wish: ValidationOptions, found: _Found, kept: KeptFlight, folder: Path, told: Told) -> None:
     _refuse_others(wish, found, kept)
     flight = kept.flight
     points, notes = (None, []) if wish.control is None else control_of(wish.control, flight, ["shift"])
@@ -181,7 +181,7 @@ def _against_flight(wish: ValidateWish, found: _Found, kept: KeptFlight, folder:
     found.notes += [*kept.notes, *notes]
 
 
-def _refuse_others(wish: ValidateWish, found: _Found, kept: KeptFlight) -> None:
+def _refuse_others(wish: ValidationOptions, found: _Found, kept: KeptFlight) -> None:
     """UserError where the logs are not of the calibrations' scanners, or are one strip; what is odd is noted."""
     scanners = {head.name for head in kept.flight.heads}
     log = kept.logged[0].log
@@ -228,7 +228,7 @@ def _assumed(kept: KeptFlight) -> list[str]:
 
 
 def _anew(
-    wish: ValidateWish, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
+    wish: ValidationOptions, found: _Found, kept: KeptFlight, points: Sequence[ControlPoint], folder: Path, told: Told
 ) -> tuple[Mapping[str, Calibration], str]:
     """Return parameters from these logs and control alone, as `swath calibrate` finds them, or none and why."""
 
@@ -254,7 +254,7 @@ def _anew(
 # ---------------------------------------------------------------------- what is told
 
 
-def _written(wish: ValidateWish, found: _Found) -> Validated:
+def _written(wish: ValidationOptions, found: _Found) -> Validated:
     record: dict[str, Any] = {"calibrations": {name: one.id for name, one in found.calibrations.items()}}
     record["verdict"] = verdict_entry(found.carried, accepted=wish.logs.accept_verdict)
     lines: list[str] = first_lines(record["verdict"])

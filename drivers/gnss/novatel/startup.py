@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.startup import PhraseListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.startup import PhraseListener, StartupMessage, StartupOptions, read_setup
 
 ACCEPTED = re.compile(rb"<OK\r?\n")
 REFUSED = re.compile(rb"<ERROR:?([^\r\n]*)\r?\n")
@@ -32,7 +32,7 @@ IMU_LOGS = ("RAWIMUSXB ONNEW", "INSPVASB ONTIME 0.02", "INSPVAXB ONTIME 1", "INS
 SAVE = "SAVECONFIG"
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
     """Baud rate where it changes, PPS, logs of time, position, events and raw measurements.
 
     Raises:
@@ -54,12 +54,12 @@ def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[Start
     return (*messages, *_saving(wish))
 
 
-def imu_startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
     """Logs of the IMU and INS in a receiver's stream."""
     return (*(_command(f"LOG {log}") for log in IMU_LOGS), *_saving(wish))
 
 
-def _saving(wish: StartupWish) -> tuple[StartupMessage, ...]:
+def _saving(wish: StartupOptions) -> tuple[StartupMessage, ...]:
     return (_command(SAVE, last=True),) if wish.save else ()
 
 

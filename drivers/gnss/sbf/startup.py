@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
-from swath.drivers.startup import PhraseListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.startup import PhraseListener, StartupMessage, StartupOptions, read_setup
 
 PORT = re.compile(r"(COM[1-4]|USB[12])")
 PROMPT = rb"(?:[^>$]*\n)?[A-Z]+[0-9]+>"
@@ -27,7 +27,7 @@ SAVE = "exeCopyConfigFile, Current, Boot"
 EVENT_STREAM, FIX_STREAM, SECOND_STREAM, HEADING_STREAM, INS_STREAM, IMU_STREAM = range(1, 7)
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
     """Baud rate where it changes, PPS, streams of time, position, events and raw measurements.
 
     Raises:
@@ -50,7 +50,7 @@ def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[Start
     return (*messages, *_saving(wish))
 
 
-def imu_startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+def imu_startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
     """Streams of the INS and of its IMU, by the port of the receiver's own ``setup``."""
     port = _port(settings)
     commands = (
@@ -71,7 +71,7 @@ def _stream(number: int, port: str, blocks: str, interval: str) -> str:
     return f"setSBFOutput, Stream{number}, {port}, {blocks}, {interval}"
 
 
-def _saving(wish: StartupWish) -> tuple[StartupMessage, ...]:
+def _saving(wish: StartupOptions) -> tuple[StartupMessage, ...]:
     return (_command(SAVE, last=True),) if wish.save else ()
 
 

@@ -13,7 +13,7 @@ from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.ubx.messages import encode_frame
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, ParserCounters
-from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupWish, read_setup
+from swath.drivers.startup import Answer, AnswerListener, StartupMessage, StartupOptions, read_setup
 
 CFG_VALSET = b"\x06\x8a"
 ACK_ACK, ACK_NAK = b"\x05\x01", b"\x05\x00"  # payload: class and id of what is answered
@@ -101,7 +101,7 @@ def encode_valset(items: tuple[Item, ...], layers: int) -> bytes:
     return encode_frame(CFG_VALSET, payload)
 
 
-def startup_messages(settings: DeviceSettings, wish: StartupWish) -> tuple[StartupMessage, ...]:
+def startup_messages(settings: DeviceSettings, wish: StartupOptions) -> tuple[StartupMessage, ...]:
     """Output of UBX on the port, rates, time pulse, messages; the baud rate first where it changes.
 
     Raises:

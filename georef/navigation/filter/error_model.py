@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gradient_of
 from swath.georef.geodesy.vectors import cross
 from swath.georef.navigation.filter.strapdown import (
@@ -163,7 +163,7 @@ def drive_of(setup: Setup, layout: Layout) -> Drive:
     return Drive(setup.noise.angle_random_walk**2, setup.noise.velocity_random_walk**2, variance, correlation_s)
 
 
-@kernel
+@jit_inline
 def _put_skew(top: FloatArray, i: int, j: int, factor: float, v: Three) -> None:
     """Block (i, j) ← factor [v]×."""
     top[i, j], top[i, j + 1], top[i, j + 2] = 0.0, -factor * v[2], factor * v[1]
@@ -171,7 +171,7 @@ def _put_skew(top: FloatArray, i: int, j: int, factor: float, v: Three) -> None:
     top[i + 2, j], top[i + 2, j + 1], top[i + 2, j + 2] = -factor * v[1], factor * v[0], 0.0
 
 
-@kernel
+@jit_inline
 def _put_sensor(top: FloatArray, row: int, at: int, sums: FloatArray, first: int, gain: Three) -> None:
     """Three columns of one sensor error: its sum with the minus sign, divided by 1 + scale.
 
@@ -192,7 +192,7 @@ def _put_sensor(top: FloatArray, row: int, at: int, sums: FloatArray, first: int
                 top[E_POSITION + i, at + j] = 0.5 * span_s * column[i]
 
 
-@kernel
+@jit_inline
 def _force_of(sums: FloatArray) -> Three:
     """∫ C f dt: row sums of the force's sums."""
     return (
@@ -202,7 +202,7 @@ def _force_of(sums: FloatArray) -> Three:
     )
 
 
-@kept
+@jit_cached
 def transition(sums: FloatArray, x: FloatArray, top: FloatArray) -> None:
     """The first nine rows of the transition matrix over a step, to second order in its length.
 
@@ -242,7 +242,7 @@ def transition(sums: FloatArray, x: FloatArray, top: FloatArray) -> None:
         _put_sensor(top, E_VELOCITY, E_ACCEL_LEAN, sums, SUM_FORCE_ACROSS, (0.0, 0.0, 0.0))
 
 
-@kept
+@jit_cached
 def decays(drive: Drive, span_s: float, decay: FloatArray) -> None:
     """(n,) e^(−t/τ) of every error; 1 where it is constant."""
     last_s, last = math.inf, 1.0
@@ -253,7 +253,7 @@ def decays(drive: Drive, span_s: float, decay: FloatArray) -> None:
         decay[i] = last
 
 
-@kernel
+@jit_inline
 def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
     """Bring the estimates of lasting errors of observations nearer to zero (STATE_SIZE,), as their expectation goes.
 
@@ -270,7 +270,7 @@ def fade(x: FloatArray, decay: FloatArray, layout: Layout) -> None:
                 x[column + i] *= decay[first + i]
 
 
-@kept
+@jit_cached
 def propagate(p: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray) -> None:
     """P ← Φ P Φᵀ.
 
@@ -300,7 +300,7 @@ def propagate(p: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArra
             p[i, j] *= decay[i] * decay[j]
 
 
-@kept
+@jit_cached
 def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, bridged: FloatArray) -> None:
     """P ← P + Q of a step: white noise of rates and forces, the drift of biases, made-up samples.
 
@@ -336,7 +336,7 @@ def add_noise(p: FloatArray, sums: FloatArray, drive: Drive, decay: FloatArray, 
         p[i, i] += drive.variance[i] * (1.0 - decay[i] * decay[i])
 
 
-@kept
+@jit_cached
 def accumulate(
     total: FloatArray, total_decay: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray
 ) -> None:
@@ -362,7 +362,7 @@ def accumulate(
         total_decay[j] *= decay[j]
 
 
-@kept
+@jit_cached
 def begin_accumulation(total: FloatArray, total_decay: FloatArray) -> None:
     """Identity."""
     total[:, :] = 0.0
@@ -371,7 +371,7 @@ def begin_accumulation(total: FloatArray, total_decay: FloatArray) -> None:
     total_decay[:] = 1.0
 
 
-@kernel
+@jit_inline
 def turned_on_by(x: FloatArray, psi: Three) -> None:
     """q ← exp(ψ / 2) ⊗ q, of unit length."""
     size2 = 0.25 * (psi[0] * psi[0] + psi[1] * psi[1] + psi[2] * psi[2])
@@ -388,7 +388,7 @@ def turned_on_by(x: FloatArray, psi: Three) -> None:
     x[ATTITUDE + 2], x[ATTITUDE + 3] = v * length, t * length
 
 
-@kept
+@jit_cached
 def inject(x: FloatArray, error: FloatArray, layout: Layout) -> None:
     """Add an error (n,) to the state (STATE_SIZE,), attitude by its exponential."""
     for i in range(6):

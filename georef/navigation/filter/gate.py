@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kernel
+from swath.georef.compiled import jit_inline
 from swath.georef.navigation.filter.error_model import E_ATTITUDE, E_POSITION, E_VELOCITY, Layout
 from swath.georef.navigation.filter.types import (
     ALIKE,
@@ -47,7 +47,7 @@ PATIENCE = 6  # times `reacquire_ns` for which a leap is taken for a wrong fix
 SETTLING = 25.0  # factor on χ² beyond which even a state that settles has an observation refused
 
 
-@kernel
+@jit_inline
 def widen(run: Running, kind: int, layout: Layout, nu: FloatArray, m: int) -> bool:
     """Make the covariance as large as the innovation says; False: this kind says nothing of the state's truth."""
     square = 0.0
@@ -73,7 +73,7 @@ def widen(run: Running, kind: int, layout: Layout, nu: FloatArray, m: int) -> bo
     return True
 
 
-@kernel
+@jit_inline
 def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
     """Whether the state has so large a share of an innovation's covariance that it is to blame for a large one."""
     if not (kind == _POSITION or kind == _VELOCITY or kind == _HEADING or kind == _ATTITUDE):
@@ -85,7 +85,7 @@ def drifted(kind: int, s: FloatArray, noise: FloatArray, m: int) -> bool:
     return whole > DRIFTED * own
 
 
-@kernel
+@jit_inline
 def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int, limit: float) -> float:
     """What the latest innovations of a kind say of this one's, which is then added to them.
 
@@ -111,7 +111,7 @@ def noise_factor(run: Running, kind: int, white: FloatArray, chi2: float, m: int
     return 0.0 if alike > PERSISTENT * mean else mean
 
 
-@kernel
+@jit_inline
 def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: int) -> bool:
     """Whether the state has drifted more than predicted, or begun so, and is finding itself again.
 
@@ -123,7 +123,7 @@ def settling(run: Running, model: Model, kind: int, lost: bool, chi2: float, m: 
     return bool(run.clock[NOW] < run.refused[SETTLED_NS, kind])
 
 
-@kernel
+@jit_inline
 def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bool:
     """Tell whether positions that leapt away are still beyond the gate, however badly the state is known by now.
 
@@ -135,7 +135,7 @@ def still_away(run: Running, model: Model, kind: int, chi2: float, m: int) -> bo
     return bool(run.clock[NOW] - since <= PATIENCE * model.reacquire_ns)
 
 
-@kernel
+@jit_inline
 def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> bool:
     """Whether positions lie far off since one leapt there: from within the gate, from one epoch to the next.
 
@@ -156,7 +156,7 @@ def leapt(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: 
     return bool(since > 0 and now - since <= PATIENCE * model.reacquire_ns)
 
 
-@kernel
+@jit_inline
 def judge(run: Running, model: Model, kind: int, settles: bool, chi2: float, m: int) -> int:
     """Fate of an innovation by its χ² and by how many of its kind were refused before it."""
     gate = model.rules.gate[m]

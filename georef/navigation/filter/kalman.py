@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 
 
-@kernel
+@jit_inline
 def factorise(matrix: FloatArray, m: int) -> bool:
     """Lower Cholesky factor of the first m rows in place; False: not positive, and the matrix is spoilt."""
     for j in range(m):
@@ -30,7 +30,7 @@ def factorise(matrix: FloatArray, m: int) -> bool:
     return True
 
 
-@kernel
+@jit_inline
 def whiten(factor: FloatArray, vector: FloatArray, m: int) -> None:
     """vector ← L⁻¹ vector."""
     for i in range(m):
@@ -40,7 +40,7 @@ def whiten(factor: FloatArray, vector: FloatArray, m: int) -> None:
         vector[i] = value / factor[i, i]
 
 
-@kernel
+@jit_inline
 def whiten_rows(factor: FloatArray, rows: FloatArray, m: int) -> None:
     """rows (m, n) ← L⁻¹ rows."""
     for i in range(m):
@@ -51,7 +51,7 @@ def whiten_rows(factor: FloatArray, rows: FloatArray, m: int) -> None:
             rows[i, j] /= factor[i, i]
 
 
-@kept
+@jit_cached
 def innovation_covariance(p: FloatArray, rows: FloatArray, noise: FloatArray, m: int, s: FloatArray) -> None:
     """s ← H P Hᵀ + R of the first m rows; p: (n, n), rows: (3, n), noise, s: (3, 3)."""
     n = len(p)
@@ -69,7 +69,7 @@ def innovation_covariance(p: FloatArray, rows: FloatArray, noise: FloatArray, m:
             s[j, i] = s[i, j]
 
 
-@kept
+@jit_cached
 def take_component(
     p: FloatArray, h: FloatArray, innovation: float, error: FloatArray, gain: FloatArray
 ) -> tuple[float, float]:
@@ -100,7 +100,7 @@ def take_component(
     return rest / variance, 1.0 / variance
 
 
-@kernel
+@jit_inline
 def joseph(p: FloatArray, h: FloatArray, gain: FloatArray, variance: float) -> None:
     """P ← (I − K h) P (I − K h)ᵀ + K Kᵀ, with P hᵀ = K · variance known."""
     n = len(p)

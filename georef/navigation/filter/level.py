@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kernel
+from swath.georef.compiled import jit_inline
 from swath.georef.geodesy.gravity import normal_of
 from swath.georef.geodesy.vectors import cross, dot, plus
 from swath.georef.navigation.filter.strapdown import POSITION
@@ -21,7 +21,7 @@ class Axes(NamedTuple):
     down: Three
 
 
-@kernel
+@jit_inline
 def level_axes(x: FloatArray) -> Axes:
     """North, east and down at the state's position, in e; at a pole those of longitude 0."""
     up, _ = normal_of(x[POSITION], x[POSITION + 1], x[POSITION + 2])
@@ -30,13 +30,13 @@ def level_axes(x: FloatArray) -> Axes:
     return Axes(cross(up, east), east, (-up[0], -up[1], -up[2]))
 
 
-@kernel
+@jit_inline
 def in_level(axes: Axes, v: Three) -> Three:
     """Components north, east, down of a vector in e."""
     return dot(axes.north, v), dot(axes.east, v), dot(axes.down, v)
 
 
-@kernel
+@jit_inline
 def attitude_rows(axes: Axes, rot: Matrix) -> tuple[Three, Matrix]:
     """Roll, pitch, heading, and the rows that make errors of them out of ψ in e."""
     nose = in_level(axes, (rot[0][0], rot[1][0], rot[2][0]))
@@ -52,7 +52,7 @@ def attitude_rows(axes: Axes, rot: Matrix) -> tuple[Three, Matrix]:
     return angles, (roll, pitch, plus(d, -nose[2], roll))
 
 
-@kernel
+@jit_inline
 def wrapped(angle: float) -> float:
     """To −π … π."""
     return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.navigation.bridging import UNKNOWN_FORCE_MPS2, UNKNOWN_RATE_RADPS
 from swath.georef.navigation.filter.error_model import (
@@ -73,7 +73,7 @@ _INFLATED, _REJECTED, _UNUSABLE = int(Fate.INFLATED), int(Fate.REJECTED), int(Fa
 GAP_FACTOR = 1.5  # an interval that begins so much later than the one before has ended is a gap
 
 
-@kernel
+@jit_inline
 def quadratic(p: FloatArray, first: int, v: Three) -> float:
     """vᵀ P v of the 3×3 block at first."""
     value: float = (
@@ -90,7 +90,7 @@ def quadratic(p: FloatArray, first: int, v: Three) -> float:
     return value
 
 
-@kept
+@jit_cached
 def level_sigmas(x: FloatArray, p: FloatArray, sigma: FloatArray) -> None:
     """(9,) sigmas of position and velocity north, east, down, of roll, pitch, heading, of P's lower triangle."""
     axes = level_axes(x)
@@ -102,7 +102,7 @@ def level_sigmas(x: FloatArray, p: FloatArray, sigma: FloatArray) -> None:
         sigma[6 + i] = math.sqrt(max(quadratic(p, E_ATTITUDE, by[i]), 0.0))
 
 
-@kept
+@jit_cached
 def end_step(run: Running, model: Model) -> None:
     """Bring the covariance to now, and the expectation of errors that die away."""
     if run.sums[SUM_TIME] <= 0.0:
@@ -118,7 +118,7 @@ def end_step(run: Running, model: Model) -> None:
     run.bridge[:, :] = 0.0
 
 
-@kept
+@jit_cached
 def write_node(run: Running, nodes: Nodes, before: FloatArray, first: int) -> None:
     """Keep what the smoother needs, and begin the way to the next node."""
     k = run.clock[NODE]
@@ -138,7 +138,7 @@ def write_node(run: Running, nodes: Nodes, before: FloatArray, first: int) -> No
     begin_accumulation(run.total, run.total_decay)
 
 
-@kernel
+@jit_inline
 def tell(told: Told, r: int, nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
     """Write innovation, sigma, normalised innovation and χ²; returns χ². s becomes its factor."""
     for i in range(3):
@@ -156,7 +156,7 @@ def tell(told: Told, r: int, nu: FloatArray, s: FloatArray, m: int, white: Float
     return chi2
 
 
-@kernel
+@jit_inline
 def chi2_of(nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
     """νᵀ S⁻¹ ν; ``white`` gets L⁻¹ ν, s its factor L. Infinite where S is not positive."""
     for i in range(m):
@@ -170,7 +170,7 @@ def chi2_of(nu: FloatArray, s: FloatArray, m: int, white: FloatArray) -> float:
     return chi2
 
 
-@kernel
+@jit_inline
 def multiply(matrix: FloatArray, factor: float) -> None:
     """(3, 3) times a number."""
     for i in range(3):
@@ -178,7 +178,7 @@ def multiply(matrix: FloatArray, factor: float) -> None:
             matrix[i, j] *= factor
 
 
-@kept
+@jit_cached
 def observe(run: Running, model: Model, rows: Rows, r: int, nodes: Nodes, told: Told) -> None:
     """Take observation r at the state's time, or say why not."""
     nu, noise, s = run.small[0], run.small[1:4], run.small[4:7]
@@ -227,7 +227,7 @@ def observe(run: Running, model: Model, rows: Rows, r: int, nodes: Nodes, told: 
     take(run, model, nodes, m)
 
 
-@kernel
+@jit_inline
 def take(run: Running, model: Model, nodes: Nodes, m: int) -> None:
     """Whiten and take the components one by one, then correct the state."""
     nu, factor = run.small[0], run.small[1:4]
@@ -244,7 +244,7 @@ def take(run: Running, model: Model, nodes: Nodes, m: int) -> None:
     inject(run.x, run.error, model.layout)
 
 
-@kernel
+@jit_inline
 def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
     """Add to the step what a made-up sample adds, (6,) by axis of b; over a gap that nobody bridged, what may be."""
     unseen_turn, unseen_push = (UNKNOWN_RATE_RADPS * gap_s) ** 2, (UNKNOWN_FORCE_MPS2 * gap_s) ** 2
@@ -258,7 +258,7 @@ def bridge_over(run: Running, made_up: FloatArray, gap_s: float) -> None:
                 run.bridge[3 + i, j] += share * (made_up[3 + axis] + unseen_push)
 
 
-@kernel
+@jit_inline
 def share_of(samples: Samples, i: int, now_ns: int, first: bool) -> float:
     """Which share of a sample's increments belongs to the time from now to its end.
 
@@ -275,7 +275,7 @@ def share_of(samples: Samples, i: int, now_ns: int, first: bool) -> float:
     return 1.0
 
 
-@kept
+@jit_cached
 def advance(
     samples: Samples, first: int, last: int, rows: Rows, next_row: int, run: Running, model: Model,
     path: Path, nodes: Nodes, told: Told,
@@ -324,7 +324,7 @@ def advance(
     return next_row
 
 
-@kernel
+@jit_inline
 def end_sample(run: Running, model: Model, nodes: Nodes) -> None:
     """End a step, and set a node, where they are due."""
     now_ns = run.clock[NOW]
@@ -337,7 +337,7 @@ def end_sample(run: Running, model: Model, nodes: Nodes) -> None:
         run.clock[NEXT_NODE] = (now_ns // model.node_ns + 1) * model.node_ns
 
 
-@kernel
+@jit_inline
 def write_path(run: Running, path: Path, bridged: bool) -> None:
     """State and sigmas at the end of a sample."""
     out = run.clock[OUT]
@@ -350,7 +350,7 @@ def write_path(run: Running, path: Path, bridged: bool) -> None:
     run.clock[OUT] = out + 1
 
 
-@kernel
+@jit_inline
 def advance_share(x: FloatArray, sums: FloatArray, angle: Three, velocity: Three, part_s: float, span_s: float) -> None:
     """Over a part of a sample, with its share of the increments."""
     if part_s <= 0.0:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of, normal_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_of, times, transposed_times
 from swath.georef.navigation.filter.error_model import (
@@ -132,7 +132,7 @@ def _scales_of(scale: Mapping[int, float], vertical: Mapping[int, float]) -> Flo
     return np.stack([whole, whole * [float(vertical.get(int(fix), 1.0)) for fix in FixType]], axis=1)
 
 
-@kernel
+@jit_inline
 def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, Three]:
     """Specific force in e, of the latest sample, and the body's acceleration relative to e by it."""
     f = times(rot, three(sums, LAST_FORCE))
@@ -141,7 +141,7 @@ def _acceleration(x: FloatArray, sums: FloatArray, rot: Matrix) -> tuple[Three, 
     return f, (f[0] + g[0] + twice * x[VELOCITY + 1], f[1] + g[1] - twice * x[VELOCITY], f[2] + g[2])
 
 
-@kernel
+@jit_inline
 def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
     """Lever arm of an antenna, as estimated where it is."""
     if antenna == 0 and layout.lever_arm >= 0:
@@ -149,7 +149,7 @@ def _arm_of(x: FloatArray, rules: Rules, layout: Layout, antenna: int) -> Three:
     return row(rules.arms_b, antenna)
 
 
-@kernel
+@jit_inline
 def _swing_of(x: FloatArray, sums: FloatArray, rot: Matrix, arm: Three) -> tuple[Three, Three]:
     """Rate of the body relative to e, in b, and the velocity it gives the arm's end, in b."""
     earth = transposed_times(rot, (0.0, 0.0, EARTH_RATE_RADPS))
@@ -157,7 +157,7 @@ def _swing_of(x: FloatArray, sums: FloatArray, rot: Matrix, arm: Three) -> tuple
     return rate, cross(rate, arm)
 
 
-@kernel
+@jit_inline
 def _set_noise(noise: FloatArray, sigma: Three, correlation: FloatArray, of: int) -> None:
     """Covariance of three sigmas and the correlations (of, of + 1, of + 2) of pairs 01, 02, 12."""
     for i in range(3):
@@ -169,7 +169,7 @@ def _set_noise(noise: FloatArray, sigma: Three, correlation: FloatArray, of: int
         noise[i, j] = noise[j, i] = share * sigma[i] * sigma[j]
 
 
-@kernel
+@jit_inline
 def _position(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int, fix: int,
     figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray,
@@ -210,7 +210,7 @@ def _position(
         _add_slow(three(x, SLOW), rules.share, layout.slow, nu, rows, noise)
 
 
-@kernel
+@jit_inline
 def _add_slow(slow: Three, share: float, at: int, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
     """Add the time-correlated share of a position's or velocity's error, whose place among the errors is ``at``."""
     factor = noise.copy()
@@ -225,7 +225,7 @@ def _add_slow(slow: Three, share: float, at: int, nu: FloatArray, rows: FloatArr
             noise[i, j] *= 1.0 - share
 
 
-@kernel
+@jit_inline
 def _velocity(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, antenna: int, fix: int,
     figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray,
@@ -270,7 +270,7 @@ def _velocity(
         _add_slow(three(x, SLOW_VELOCITY), rules.velocity_share, layout.slow_velocity, nu, rows, noise)
 
 
-@kernel
+@jit_inline
 def _heading(
     x: FloatArray,
     rules: Rules,
@@ -307,7 +307,7 @@ def _heading(
                 noise[i, j] *= 1.0 - rules.heading_share
 
 
-@kernel
+@jit_inline
 def _attitude(
     x: FloatArray, rules: Rules, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray
 ) -> None:
@@ -321,7 +321,7 @@ def _attitude(
     _set_noise(noise, (max(figures[3], floor), max(figures[4], floor), max(figures[5], floor)), figures, 6)
 
 
-@kernel
+@jit_inline
 def _standing(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
     """No velocity."""
     axes = level_axes(x)
@@ -332,7 +332,7 @@ def _standing(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArr
     _set_noise(noise, three(figures, 3), figures, 6)
 
 
-@kernel
+@jit_inline
 def _rolling(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> None:
     """No velocity along y and z of b: δ(Cᵀ v) = Cᵀ (δv + v × ψ)."""
     rot = rot_of(x[ATTITUDE], x[ATTITUDE + 1], x[ATTITUDE + 2], x[ATTITUDE + 3])
@@ -346,7 +346,7 @@ def _rolling(x: FloatArray, figures: FloatArray, nu: FloatArray, rows: FloatArra
     _set_noise(noise, (1.0, figures[4], figures[5]), figures, 6)
 
 
-@kernel
+@jit_inline
 def _height(
     x: FloatArray, layout: Layout, figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray
 ) -> None:
@@ -359,7 +359,7 @@ def _height(
     _set_noise(noise, (figures[3], 1.0, 1.0), figures, 6)
 
 
-@kept
+@jit_cached
 def predict(
     x: FloatArray, sums: FloatArray, rules: Rules, layout: Layout, what: NDArray[np.uint8], figures: FloatArray,
     nu: FloatArray, rows: FloatArray, noise: FloatArray,
@@ -395,7 +395,7 @@ def predict(
     return said_first(figures, nu, rows, noise)
 
 
-@kernel
+@jit_inline
 def said_first(figures: FloatArray, nu: FloatArray, rows: FloatArray, noise: FloatArray) -> int:
     """Bring components with a finite innovation and a sigma to the front; returns how many there are."""
     m = 0

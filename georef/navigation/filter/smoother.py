@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.vectors import dot, rot_of
 from swath.georef.navigation.filter.error_model import (
     E_ACCEL_LEAN,
@@ -154,7 +154,7 @@ def _means(run: FilterRun, mean: FloatArray | None) -> tuple[FloatArray, list[Fl
     return means, felt
 
 
-@kept
+@jit_cached
 def _forward(nodes: Nodes, mean: FloatArray, means: FloatArray, felt: FloatArray) -> None:
     """Carry the errors' mean (n,), which is changed, over a block of nodes.
 
@@ -183,7 +183,7 @@ def _forward(nodes: Nodes, mean: FloatArray, means: FloatArray, felt: FloatArray
         copy_into(means[k], mean)
 
 
-@kernel
+@jit_inline
 def _unpack(packed: FloatArray, p: FloatArray) -> None:
     """Lower triangle by rows to (n, n)."""
     at = 0
@@ -193,7 +193,7 @@ def _unpack(packed: FloatArray, p: FloatArray) -> None:
             at += 1
 
 
-@kernel
+@jit_inline
 def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """out ← a b, (n, n)."""
     n = len(a)
@@ -206,7 +206,7 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
                     out[i, j] += factor * b[k, j]
 
 
-@kernel
+@jit_inline
 def _over_component(
     adjoint: FloatArray, information: FloatArray, h: FloatArray, gain: FloatArray, innovation: float, inverse: float
 ) -> None:
@@ -234,7 +234,7 @@ def _over_component(
             information[i, j] += h[i] * h[j] * (through + inverse) - h[i] * seen[j] - seen[i] * h[j]
 
 
-@kernel
+@jit_inline
 def _over_way(
     adjoint: FloatArray, information: FloatArray, top: FloatArray, decay: FloatArray, work: FloatArray
 ) -> None:
@@ -268,7 +268,7 @@ def _over_way(
     copy_into(adjoint, back)
 
 
-@kernel
+@jit_inline
 def difference(x: FloatArray, from_x: FloatArray, out: FloatArray) -> None:
     """out (9,) ← x ⊟ from_x: what has to be added to the one to get the other."""
     for i in range(6):
@@ -286,7 +286,7 @@ def difference(x: FloatArray, from_x: FloatArray, out: FloatArray) -> None:
     put(out, E_ATTITUDE, (factor * i, factor * j, factor * k))
 
 
-@kernel
+@jit_inline
 def _separate(x: FloatArray, error: FloatArray, out: FloatArray) -> None:
     """out (9,) ← −error north, east, down, and of roll, pitch, heading."""
     axes = level_axes(x)
@@ -297,7 +297,7 @@ def _separate(x: FloatArray, error: FloatArray, out: FloatArray) -> None:
         out[6 + i] = -(by[i][0] * error[6] + by[i][1] * error[7] + by[i][2] * error[8])
 
 
-@kernel
+@jit_inline
 def _position_sigmas_in_gnss_time(x: FloatArray, p: FloatArray, late: int, sigma: FloatArray) -> None:
     """sigma (3,) ← of r + v τ, north, east, down, with τ the time offset, whose place among the errors is ``late``.
 
@@ -312,7 +312,7 @@ def _position_sigmas_in_gnss_time(x: FloatArray, p: FloatArray, late: int, sigma
         sigma[i] = math.sqrt(max(variance, 0.0))
 
 
-@kept
+@jit_cached
 def _backward(
     nodes: Nodes, layout: Layout, means: FloatArray, felt: FloatArray, adjoint: FloatArray, information: FloatArray,
     state: FloatArray, sigma: FloatArray, sensor_sigma: FloatArray, leave: FloatArray, arrive: FloatArray,
@@ -352,7 +352,7 @@ def _backward(
         _over_way(adjoint, information, nodes.top[k], nodes.decay[k], once)
 
 
-@kept
+@jit_cached
 def _bend(
     path: Path, node_ns: Int64Array, leave: FloatArray, arrive: FloatArray, node_sigma: FloatArray,
     position_e: FloatArray, velocity_e: FloatArray, q: FloatArray, sigma: FloatArray,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.gravity import EARTH_RATE_RADPS, gravity_of
 from swath.georef.geodesy.vectors import cross, plus, rot_of, times
 from swath.georef.navigation.inputs import Inertial
@@ -66,32 +66,32 @@ def samples_of(inertial: Inertial) -> Samples:
     )
 
 
-@kernel
+@jit_inline
 def row(array: FloatArray, k: int) -> Three:
     """Row k of (n, 3)."""
     return array[k, 0], array[k, 1], array[k, 2]
 
 
-@kernel
+@jit_inline
 def three(array: FloatArray, k: int) -> Three:
     """Elements k, k + 1, k + 2 of (n,)."""
     return array[k], array[k + 1], array[k + 2]
 
 
-@kernel
+@jit_inline
 def put(array: FloatArray, k: int, v: Three) -> None:
     """Set elements k, k + 1, k + 2 of (n,)."""
     array[k], array[k + 1], array[k + 2] = v
 
 
-@kernel
+@jit_inline
 def copy_into(out: FloatArray, of: FloatArray) -> None:
     """out[i] ← of[i] as far as out goes; compiles in a tenth of the time that an assignment of slices takes."""
     for i in range(len(out)):
         out[i] = of[i]
 
 
-@kernel
+@jit_inline
 def corrected(measured: Three, bias: Three, scale: Three, lean: Three, interval_s: float) -> Three:
     """True increments of measured ones: u = (measured − bias · interval) / (1 + scale), less what axes see of others.
 
@@ -104,7 +104,7 @@ def corrected(measured: Three, bias: Three, scale: Three, lean: Three, interval_
     return leaned((u, v, w), lean)
 
 
-@kernel
+@jit_inline
 def leaned(u: Three, lean: Three) -> Three:
     """u − M(l) u."""
     return (
@@ -114,7 +114,7 @@ def leaned(u: Three, lean: Three) -> Three:
     )
 
 
-@kernel
+@jit_inline
 def rotated_velocity(angle: Three, velocity: Three) -> Three:
     """∫ exp([φ(t)]×) f dt over an interval of constant rate and force, in the axes at its begin.
 
@@ -133,7 +133,7 @@ def rotated_velocity(angle: Three, velocity: Three) -> Three:
     return plus(plus(velocity, first, once), second, cross(angle, once))
 
 
-@kernel
+@jit_inline
 def half_turn(angle: Three) -> tuple[float, float]:
     """cos(φ/2), sin(φ/2) / φ of a rotation vector."""
     square = 0.25 * (angle[0] * angle[0] + angle[1] * angle[1] + angle[2] * angle[2])
@@ -145,7 +145,7 @@ def half_turn(angle: Three) -> tuple[float, float]:
     return math.cos(size), 0.5 * math.sin(size) / size
 
 
-@kernel
+@jit_inline
 def turn(x: FloatArray, angle_b: Three, earth_rad: float) -> None:
     """q ← exp(−earth / 2) ⊗ q ⊗ exp(angle_b / 2), of unit length again."""
     cos, half = half_turn(angle_b)
@@ -160,7 +160,7 @@ def turn(x: FloatArray, angle_b: Three, earth_rad: float) -> None:
     x[ATTITUDE + 2], x[ATTITUDE + 3] = v * length, t * length
 
 
-@kernel
+@jit_inline
 def add_sums(sums: FloatArray, rot: Matrix, angle: Three, velocity: Three, span_s: float) -> None:
     """Add a part to the sums, with the attitude in its middle."""
     for i in range(3):
@@ -178,7 +178,7 @@ def add_sums(sums: FloatArray, rot: Matrix, angle: Three, velocity: Three, span_
     put(sums, LAST_FORCE, (velocity[0] / span_s, velocity[1] / span_s, velocity[2] / span_s))
 
 
-@kept
+@jit_cached
 def advance_part(x: FloatArray, sums: FloatArray, angle_b: Three, velocity_b: Three, span_s: float) -> None:
     """Navigate over a sample or a part of one.
 
@@ -209,7 +209,7 @@ def advance_part(x: FloatArray, sums: FloatArray, angle_b: Three, velocity_b: Th
     turn(x, angle, earth)
 
 
-@kernel
+@jit_inline
 def coning_and_sculling(before: FloatArray, angle: Three, velocity: Three, span_s: float) -> tuple[Three, Three]:
     """What a linear course of rate and force over two intervals adds to the increments of the second.
 
@@ -230,7 +230,7 @@ def coning_and_sculling(before: FloatArray, angle: Three, velocity: Three, span_
     return coned, plus(sculled, share, cross(velocity_1, angle))
 
 
-@kernel
+@jit_inline
 def keep_before(before: FloatArray, angle: Three, velocity: Three, span_s: float) -> None:
     """This interval will be the one before."""
     put(before, 0, angle)
@@ -238,7 +238,7 @@ def keep_before(before: FloatArray, angle: Three, velocity: Three, span_s: float
     before[6] = span_s
 
 
-@kept
+@jit_cached
 def _navigate(samples: Samples, begin_ns: int, x: FloatArray, states: FloatArray) -> None:
     before, sums, now_ns = np.zeros(7), np.zeros(SUMS_SIZE), begin_ns
     for i in range(len(samples.time_ns)):

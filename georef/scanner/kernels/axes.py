@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kernel
+from swath.georef.compiled import jit_inline
 from swath.georef.geodesy.vectors import (
     cross,
     dot,
@@ -56,7 +56,7 @@ from swath.georef.scanner.kernels.types import Axes, Mounted, Scanning, Three, T
 NOWHERE = (0.0, 0.0, 0.0)
 
 
-@kernel
+@jit_inline
 def through_mount(block: FloatArray, n: int, k: int, mounted: Mounted, source: int, target: int, moved: float) -> None:
     """Vectors of the head as the boresight's ω and φ see them; ``moved`` 1: places, 0: directions."""
     if len(mounted.inner) == 1:
@@ -70,7 +70,7 @@ def through_mount(block: FloatArray, n: int, k: int, mounted: Mounted, source: i
             mount(block, i, source, target, matrix_at(mounted.inner, k + i), shift)
 
 
-@kernel
+@jit_inline
 def attitudes(block: FloatArray, n: int, k: int, q_e_from_b: FloatArray, w: float, v: Three, r: Three) -> None:
     """(w, v) ⊗ exp(share · r / 2), scalar first, from rows SIN and COS of `half_turns`."""
     here = slice(k, k + n)
@@ -85,7 +85,7 @@ def attitudes(block: FloatArray, n: int, k: int, q_e_from_b: FloatArray, w: floa
         q_z[i] = w * h[2] + v[2] * cos + crossed[2]
 
 
-@kernel
+@jit_inline
 def turn_axes(block: FloatArray, n: int, k: int, kind: int, mounted: Mounted, tilts: bool) -> None:
     """Rows in b: HEAD the beam, START from the body's origin to the point, ACROSS ∂point/∂θ, TILT ∂point/∂Δη."""
     outer, lever, slope = matrix_at(mounted.outer, 0), vector_at(mounted.lever_arm_b, 0), mounted.slope
@@ -109,7 +109,7 @@ def turn_axes(block: FloatArray, n: int, k: int, kind: int, mounted: Mounted, ti
             put(block, TILT, i, times(outer, three(block, TILT, i)))
 
 
-@kernel
+@jit_inline
 def fill_axes(block: FloatArray, n: int, k: int, track: Track, axes: Axes, turning: int, at: int, phi2: float) -> None:
     """Fill ``axes`` from row k on for the n returns of a block."""
     epochs, shares = axes.epoch[k : k + n], axes.share[k : k + n]
@@ -125,7 +125,7 @@ def fill_axes(block: FloatArray, n: int, k: int, track: Track, axes: Axes, turni
     attitudes(block, n, k, axes.q_e_from_b, q[turning, 0], v, vector_at(track.rotvec_b, turning))
 
 
-@kernel
+@jit_inline
 def take_readings(block: FloatArray, n: int, part: Any, scanning: Scanning, rate: Any, acceleration: Any) -> None:
     """The encoder's, as errors of its parameters see them."""
     fixed = scanning.select >= FIBRE_BY_CHANNEL
@@ -137,7 +137,7 @@ def take_readings(block: FloatArray, n: int, part: Any, scanning: Scanning, rate
             block[RATE, i], block[ACCELERATION, i] = rate[i], acceleration[i]
 
 
-@kernel
+@jit_inline
 def fill_covariance(
     block: FloatArray, n: int, k: int, part: Any, track: Track, turning: int, interval: Interval, doubt: Doubt
 ) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from swath.georef.compiled import kernel
+from swath.georef.compiled import jit_inline
 from swath.georef.scanner.kernels.types import Eight, Three, Two
 
 LINE, NUTATING, RISLEY, SPINNING = 0, 1, 2, 3
@@ -24,13 +24,13 @@ FIXED_ANGLE, RANGE = 4, 7
 _EIGHTH = 0.25 * math.pi
 
 
-@kernel
+@jit_inline
 def mirror_angle(theta: float) -> float:
     """Of the normal of a line scanner's mirror."""
     return _EIGHTH + 0.5 * theta
 
 
-@kernel
+@jit_inline
 def line_beam(row: Eight, sin: float, cos: float) -> Three:
     """Off a mirror whose normal stands at 45° − θ/2 to a laser on the +y side: u = u0 − 2 (u0·n) n (FORMULAS 2.2).
 
@@ -41,7 +41,7 @@ def line_beam(row: Eight, sin: float, cos: float) -> Three:
     return twice * row[2] - row[0], twice * row[3] * sin - row[1], twice * row[3] * cos
 
 
-@kernel
+@jit_inline
 def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
     """∂u/∂θ and ∂u/∂Δη of `line_beam`."""
     twice = 2.0 * (row[0] * row[2] + row[1] * row[3] * sin)
@@ -55,7 +55,7 @@ def line_turn(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
     return across, (by_eta * row[2] - row[1], by_eta * row[3] * sin + row[0], by_eta * row[3] * cos)
 
 
-@kernel
+@jit_inline
 def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
     """Off a mirror whose normal leans by ψ from its shaft, the laser along +x (FORMULAS 2.2, Palmer)."""
     aside = row[0] * cos
@@ -63,7 +63,7 @@ def nutating_beam(row: Eight, sin: float, cos: float) -> Three:
     return 1.0 - 2.0 * x * x, -2.0 * x * y, -2.0 * x * z
 
 
-@kernel
+@jit_inline
 def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
     """∂u/∂γ of `nutating_beam`."""
     sin, cos = row[0] * sin, row[0] * cos
@@ -72,7 +72,7 @@ def nutating_turn(row: Eight, sin: float, cos: float) -> Three:
     return -4.0 * x * dx, -2.0 * (dx * y + x * dy), -2.0 * (dx * z + x * dz)
 
 
-@kernel
+@jit_inline
 def risley_beam(row: Eight, first: Two, second: Two) -> Three:
     """Through the last of a Risley pair's four surfaces by Snell's law as vectors (FORMULAS 2.2).
 
@@ -87,7 +87,7 @@ def risley_beam(row: Eight, first: Two, second: Two) -> Three:
     return row[4] * x + more * nx, row[4] * y + more * ny, row[4] * z + more * nz
 
 
-@kernel
+@jit_inline
 def risley_turn(row: Eight, first: Two, second: Two) -> Three:
     """∂u/∂γ of `risley_beam`."""
     x, y, z = row[0] * first[1], row[0] * first[0], row[1]
@@ -101,20 +101,20 @@ def risley_turn(row: Eight, first: Two, second: Two) -> Three:
     return dmore * nx + more * dnx - row[4] * y, dmore * ny + more * dny + row[4] * x, dmore * nz
 
 
-@kernel
+@jit_inline
 def spinning_angle(row: Eight, theta: float) -> float:
     """Azimuth of a channel of a spinning head."""
     return row[6] * theta + row[2]
 
 
-@kernel
+@jit_inline
 def spinning_beam(row: Eight, sin: float, cos: float) -> tuple[Three, Three]:
     """Where a spinning head's beam starts (m), and its direction; azimuth from y towards x (FORMULAS 2.2)."""
     start = row[4] * sin + row[3] * cos, row[4] * cos - row[3] * sin, row[5]
     return start, (row[1] * sin, row[1] * cos, row[0])
 
 
-@kernel
+@jit_inline
 def spinning_turn(row: Eight, start: Three, direction: Three, range_m: float) -> Three:
     """∂point/∂θ, m/rad."""
     return row[6] * (start[1] + range_m * direction[1]), -row[6] * (start[0] + range_m * direction[0]), 0.0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kernel, whole
+from swath.georef.compiled import jit_inline, whole
 from swath.georef.geodesy.vectors import (
     LARGE_ANGLE,
     SMALL_ANGLE_2,
@@ -61,26 +61,26 @@ MEASURED, VARIANCE, READING, RATE, ACCELERATION, ANGLE_OFF = (whole(row) for row
 ROWS = 68
 
 
-@kernel
+@jit_inline
 def three(block: FloatArray, at: int, i: int) -> Three:
     """Three rows."""
     return block[at, i], block[at + 1, i], block[at + 2, i]
 
 
-@kernel
+@jit_inline
 def put(block: FloatArray, at: int, i: int, v: Three) -> None:
     """Into three rows."""
     block[at, i], block[at + 1, i], block[at + 2, i] = v
 
 
-@kernel
+@jit_inline
 def clear(block: FloatArray, at: int) -> None:
     """Three rows to zero."""
     for i in range(BLOCK):
         put(block, at, i, (0.0, 0.0, 0.0))
 
 
-@kernel
+@jit_inline
 def beam_at(block: FloatArray, i: int) -> Eight:
     """The geometry's row."""
     return (
@@ -95,7 +95,7 @@ def beam_at(block: FloatArray, i: int) -> Eight:
     )
 
 
-@kernel
+@jit_inline
 def sines(block: FloatArray, n: int, sin: int, cos: int) -> None:
     """Sine and cosine of row ANGLE."""
     large = 0
@@ -108,7 +108,7 @@ def sines(block: FloatArray, n: int, sin: int, cos: int) -> None:
             block[sin, i], block[cos, i] = sine_cosine_of_large(block[ANGLE, i], block[sin, i], block[cos, i])
 
 
-@kernel
+@jit_inline
 def aim(block: FloatArray, n: int, kind: int) -> None:
     """θ to the beam in the head."""
     if kind == LINE:
@@ -141,7 +141,7 @@ def aim(block: FloatArray, n: int, kind: int) -> None:
             put(block, HEAD, i, risley_beam(beam_at(block, i), first, second))
 
 
-@kernel
+@jit_inline
 def swing(block: FloatArray, n: int, kind: int) -> None:
     """∂point/∂θ and ∂point/∂Δη in the head, m/rad; Δη is of line scanners only."""
     if kind == LINE:
@@ -166,7 +166,7 @@ def swing(block: FloatArray, n: int, kind: int) -> None:
             put(block, ACROSS, i, (rho * across[0], rho * across[1], rho * across[2]))
 
 
-@kernel
+@jit_inline
 def lean(block: FloatArray, n: int, slope: float) -> None:
     """Sine and cosine of slope · θ."""
     if slope == 0.0:
@@ -178,14 +178,14 @@ def lean(block: FloatArray, n: int, slope: float) -> None:
     sines(block, n, SLOPE_SIN, SLOPE_COS)
 
 
-@kernel
+@jit_inline
 def mount(block: FloatArray, i: int, source: int, target: int, inner: Matrix, shift: Three) -> None:
     """A vector of the head through κ, gimbal and installation, and about slope · θ."""
     v = plus(shift, 1.0, times(inner, three(block, source, i)))
     put(block, target, i, turned_by(block[SLOPE_SIN, i], block[SLOPE_COS, i], v))
 
 
-@kernel
+@jit_inline
 def factors(block: FloatArray, n: int, phi2: float) -> None:
     """a, b of `turn_factors` for the share of the interval that has passed."""
     if phi2 < SMALL_ANGLE_2:
@@ -198,7 +198,7 @@ def factors(block: FloatArray, n: int, phi2: float) -> None:
             block[A, i], block[B, i] = turn_factors(phi2 * share * share, share)
 
 
-@kernel
+@jit_inline
 def half_turns(block: FloatArray, n: int, phi2: float) -> None:
     """Rows SIN and COS: of half the turn since the interval began, the sine by its whole length."""
     if phi2 < SMALL_ANGLE_2:
@@ -213,14 +213,14 @@ def half_turns(block: FloatArray, n: int, phi2: float) -> None:
             block[SIN, i], block[COS, i] = sin / length, cos
 
 
-@kernel
+@jit_inline
 def give(block: FloatArray, n: int, at: int, out: Any) -> None:
     """Three rows to (n, 3)."""
     for i in range(n):
         out[i, 0], out[i, 1], out[i, 2] = block[at, i], block[at + 1, i], block[at + 2, i]
 
 
-@kernel
+@jit_inline
 def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> None:
     """Three rows to those of (3, …) from column k on."""
     for axis in range(3):
@@ -229,7 +229,7 @@ def hand_over(block: FloatArray, n: int, at: int, out: FloatArray, k: int) -> No
             row[i] = block[at + axis, i]
 
 
-@kernel
+@jit_inline
 def new_block() -> FloatArray:
     """Room; its size is a constant here, so that rows are known to be apart."""
     return np.zeros((ROWS, BLOCK))

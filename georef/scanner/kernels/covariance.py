@@ -15,7 +15,7 @@ import math
 from typing import Any, NamedTuple, TypeAlias
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.geodesy.earth import down_of, geodetic_of
 from swath.georef.geodesy.vectors import cross, dot, plus, rot_at, transposed_times, vector_at
 from swath.georef.records import Int64Array
@@ -110,14 +110,14 @@ class Doubt(NamedTuple):
     covariance_e: FloatArray
 
 
-@kernel
+@jit_inline
 def with_outer(c: Six, factor: float, a: Three) -> Six:
     """C + factor · a aᵀ; xx, xy, xz, yy, yz, zz."""
     x, y, z = factor * a[0], factor * a[1], factor * a[2]
     return c[0] + x * a[0], c[1] + x * a[1], c[2] + x * a[2], c[3] + y * a[1], c[4] + y * a[2], c[5] + z * a[2]
 
 
-@kernel
+@jit_inline
 def sum_of(a: Six, factor: float, b: Six) -> Six:
     """a + factor · b."""
     return (
@@ -130,14 +130,14 @@ def sum_of(a: Six, factor: float, b: Six) -> Six:
     )
 
 
-@kernel
+@jit_inline
 def with_transpose(a: Three, b: Three) -> Six:
     """a bᵀ + b aᵀ."""
     mixed = a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1]
     return 2.0 * a[0] * b[0], mixed[0], mixed[1], 2.0 * a[1] * b[1], mixed[2], 2.0 * a[2] * b[2]
 
 
-@kernel
+@jit_inline
 def applied(c: Six, a: Three) -> Three:
     """C a."""
     return (
@@ -147,7 +147,7 @@ def applied(c: Six, a: Three) -> Three:
     )
 
 
-@kernel
+@jit_inline
 def turned(c: Six, rows: Matrix) -> Six:
     """R C Rᵀ."""
     x, y, z = rows
@@ -155,7 +155,7 @@ def turned(c: Six, rows: Matrix) -> Six:
     return dot(x, cx), dot(x, cy), dot(x, cz), dot(y, cy), dot(y, cz), dot(z, cz)
 
 
-@kernel
+@jit_inline
 def of_turn(c: Six, arm: Three) -> Six:
     """Of δψ × arm, where C is that of the rotation vector δψ: −[arm]× C [arm]×, written out."""
     x, y, z = arm
@@ -170,27 +170,27 @@ def of_turn(c: Six, arm: Three) -> Six:
     )
 
 
-@kernel
+@jit_inline
 def six(block: FloatArray, i: int) -> Six:
     """The covariance so far."""
     at = COVARIANCE
     return block[at, i], block[at + 1, i], block[at + 2, i], block[at + 3, i], block[at + 4, i], block[at + 5, i]
 
 
-@kernel
+@jit_inline
 def keep(block: FloatArray, i: int, c: Six) -> None:
     """The covariance so far."""
     put(block, COVARIANCE, i, (c[0], c[1], c[2]))
     put(block, COVARIANCE_2, i, (c[3], c[4], c[5]))
 
 
-@kernel
+@jit_inline
 def axes_at(block: FloatArray, i: int) -> Matrix:
     """Rows of rot_e_from_b."""
     return three(block, ROT, i), three(block, ROT_2, i), three(block, ROT_3, i)
 
 
-@kernel
+@jit_inline
 def put_axes(block: FloatArray, i: int, rows: Matrix) -> None:
     """Rows of rot_e_from_b."""
     put(block, ROT, i, rows[0])
@@ -198,7 +198,7 @@ def put_axes(block: FloatArray, i: int, rows: Matrix) -> None:
     put(block, ROT_3, i, rows[2])
 
 
-@kernel
+@jit_inline
 def take_axes(block: FloatArray, n: int, rot: Matrix, phi: Three) -> None:
     """Axes of returns since the attitude ``rot``, by rows A and B of `turn_factors` about φ."""
     once = cross(rot[0], phi), cross(rot[1], phi), cross(rot[2], phi)  # r · (φ × v) = (r × φ) · v
@@ -210,7 +210,7 @@ def take_axes(block: FloatArray, n: int, rot: Matrix, phi: Three) -> None:
         put_axes(block, i, (x, y, plus(plus(rot[2], a, once[2]), b, twice[2])))
 
 
-@kept
+@jit_cached
 def at_epoch(flown: Flown, k: int) -> tuple[Six, Six]:
     """Covariance of the position in e, m², and of the attitude as a rotation vector in b, rad², at an epoch.
 
@@ -231,7 +231,7 @@ def at_epoch(flown: Flown, k: int) -> tuple[Six, Six]:
     return place, with_outer(turn, of_h * of_h, transposed_times(rot, down))
 
 
-@kept
+@jit_cached
 def interval_at(flown: Flown, at: int) -> Interval:
     """Of the interval that begins with epoch ``at``."""
     place, turn = at_epoch(flown, at)
@@ -244,7 +244,7 @@ def interval_at(flown: Flown, at: int) -> Interval:
     return place, sum_of(next_place, -1.0, place), turn, sum_of(next_turn, -1.0, turn), velocity, rate
 
 
-@kernel
+@jit_inline
 def doubt_range(block: FloatArray, n: int, known: Known, incidence_rad: Any) -> None:
     """Row VARIANCE; a footprint on a surface that leans adds to it (FORMULAS 6.2)."""
     own, quarter = known.range_sigma_m * known.range_sigma_m, 0.25 * known.divergence_rad
@@ -256,14 +256,14 @@ def doubt_range(block: FloatArray, n: int, known: Known, incidence_rad: Any) -> 
             block[VARIANCE, i] += sigma * sigma
 
 
-@kernel
+@jit_inline
 def add_along(block: FloatArray, n: int) -> None:
     """What the range does."""
     for i in range(n):
         keep(block, i, with_outer(six(block, i), block[VARIANCE, i], three(block, HEAD, i)))
 
 
-@kernel
+@jit_inline
 def begin(block: FloatArray, n: int, interval: Interval, more: Six, known: Known) -> None:
     """What attitude, scan angle and time do; ``more`` is added to the attitude's covariance."""
     _, _, turn, by_share, velocity, rate = interval
@@ -282,7 +282,7 @@ def begin(block: FloatArray, n: int, interval: Interval, more: Six, known: Known
         keep(block, i, with_outer(six(block, i), time_variance, moved))
 
 
-@kernel
+@jit_inline
 def add_gram(block: FloatArray, n: int, g: FloatArray) -> None:
     """What all errors do that turn, shift and lengthen, but for the turns alone; and the range."""
     shift = g[3, 3], g[3, 4], g[3, 5], g[4, 4], g[4, 5], g[5, 5]
@@ -303,7 +303,7 @@ def add_gram(block: FloatArray, n: int, g: FloatArray) -> None:
         keep(block, i, sum_of(six(block, i), 1.0, with_transpose(h, along)))
 
 
-@kernel
+@jit_inline
 def add_error(block: FloatArray, n: int, e: Any, lever: Three) -> None:
     """What one error does."""
     turn, by_angle = (e[0], e[1], e[2]), (e[TURN_BY_ANGLE], e[TURN_BY_ANGLE + 1], e[TURN_BY_ANGLE + 2])
@@ -324,7 +324,7 @@ def add_error(block: FloatArray, n: int, e: Any, lever: Three) -> None:
         keep(block, i, with_outer(six(block, i), 1.0, effect))
 
 
-@kernel
+@jit_inline
 def spread(block: FloatArray, n: int, interval: Interval, known: Known) -> None:
     """Rows COVARIANCE, in e, of the others: vectors, share of the interval, angle, measured range and its variance.
 
@@ -346,7 +346,7 @@ def spread(block: FloatArray, n: int, interval: Interval, known: Known) -> None:
         keep(block, i, sum_of(sum_of(c, 1.0, place), block[SHARE, i], by_share))
 
 
-@kernel
+@jit_inline
 def give_six(block: FloatArray, n: int, covariance_e: Any) -> None:
     """The covariance to (n, 6)."""
     for i in range(n):

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from swath.georef.arrays import FloatArray, IntArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 
 Tile: TypeAlias = tuple[FloatArray, FloatArray]
 
@@ -32,7 +32,7 @@ FIRST, TRAIN, PLACE = range(3)
 FROM, TO, MIDDLE = range(3)
 
 
-@kept
+@jit_cached
 def cut(
     rows: Any,
     time_ns: IntArray,
@@ -77,7 +77,7 @@ def cut(
     return n, m
 
 
-@kernel
+@jit_inline
 def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple[int, int]:
     """Pulses from, to of the pieces at most ``reach`` away in time, of the same train."""
     first, last = piece, piece
@@ -89,7 +89,7 @@ def window_of(pieces: IntArray, m: int, n: int, piece: int, reach: int) -> tuple
     return pieces[first, FIRST], pieces[last + 1, FIRST] if last + 1 < m else n
 
 
-@kernel
+@jit_inline
 def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
     """Cholesky in place; the solution in ``right``. False: the points do not tell."""
     for j in range(size):
@@ -116,7 +116,7 @@ def solve(normal: FloatArray, right: FloatArray, size: int) -> bool:
     return True
 
 
-@kernel
+@jit_inline
 def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatArray, begin: int, tile: Tile) -> int:
     """Times and readings from pulse ``begin`` of each window on into the tile, a column each, zeros behind its end.
 
@@ -139,7 +139,7 @@ def take(pulse_ns: IntArray, angle: FloatArray, windows: IntArray, scale: FloatA
     return rows
 
 
-@kernel
+@jit_inline
 def add_up(tile: Tile, rows: int, sums: FloatArray) -> None:
     """Sums of x^k, k from 1 to 8, and of x^k y, k from 0 to 4; two rows at a time, one after the other."""
     x_of, y_of = tile
@@ -163,7 +163,7 @@ def add_up(tile: Tile, rows: int, sums: FloatArray) -> None:
             sums[RIGHT + 4, lane] = sums[RIGHT + 4, lane] + x4 * y + u4 * v
 
 
-@kernel
+@jit_inline
 def sum_up(
     pulse_ns: IntArray,
     angle: FloatArray,
@@ -183,7 +183,7 @@ def sum_up(
         add_up(tile, take(pulse_ns, angle, windows, scale, begin, tile), sums)
 
 
-@kernel
+@jit_inline
 def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
     """Coefficients of the polynomial with these sums, in its window's unit, into row 0 of ``work``, zeros behind."""
     work[0] = 0.0
@@ -194,7 +194,7 @@ def fit(sums: FloatArray, lane: int, size: int, work: FloatArray) -> bool:
     return solve(work[1:], work[0], ORDER) if size == ORDER else solve(work[1:], work[0], size)
 
 
-@kernel
+@jit_inline
 def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tuple[int, int, int, int]:
     """Window of a piece, as from pulse, to pulse, how many pieces to either side; number of coefficients, 0: none."""
     first, last, reach, wide = 0, 0, 0, False
@@ -211,13 +211,13 @@ def choose(pulse_ns: IntArray, pieces: IntArray, piece: int, steady: bool) -> tu
     return first, last, reach, ORDER if count >= FOR_QUARTIC else 3
 
 
-@kernel
+@jit_inline
 def pulses_of(pieces: IntArray, piece: int, n: int) -> tuple[int, int]:
     """Pulses from, to of a piece."""
     return pieces[piece, FIRST], pieces[piece + 1, FIRST] if piece + 1 < len(pieces) else n
 
 
-@kernel
+@jit_inline
 def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: float, slope: Any, bend: Any) -> None:
     """Rates and accelerations at times by the polynomial in row 0 of ``work``; 0 where nothing tells."""
     c1, c2, c3, c4 = work[0, 1], 2.0 * work[0, 2], 3.0 * work[0, 3], 4.0 * work[0, 4]
@@ -230,7 +230,7 @@ def give(work: FloatArray, told: bool, pulse_ns: Any, middle_ns: int, unit_ns: f
             slope[i], bend[i] = 0.0, 0.0
 
 
-@kernel
+@jit_inline
 def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: FloatArray, rate: Any, more: Any) -> None:
     """From pulses first to last to their rows, of which a pulse may have several."""
     for i in range(first, last):
@@ -238,7 +238,7 @@ def spread(pulses: IntArray, first: int, last: int, slope: FloatArray, bend: Flo
             rate[row], more[row] = slope[i - first], bend[i - first]
 
 
-@kept
+@jit_cached
 def rates(
     pulses: IntArray,
     pulse_ns: IntArray,

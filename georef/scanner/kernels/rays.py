@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from swath.georef.arrays import FloatArray
-from swath.georef.compiled import kept, kernel, whole
+from swath.georef.compiled import jit_cached, jit_inline, whole
 from swath.georef.geodesy.earth import E2
 from swath.georef.geodesy.vectors import (
     angle_of,
@@ -74,7 +74,7 @@ ORIGIN, POINT = ACROSS, TILT  # places in a block, free again when the axes are 
 FIRST = whole(0)
 
 
-@kernel
+@jit_inline
 def ibrc_of(ranging: Ranging, intensity: float) -> float:
     """Linear between the knots, level beyond them."""
     knots, values = ranging.ibrc_intensity, ranging.ibrc_m
@@ -89,7 +89,7 @@ def ibrc_of(ranging: Ranging, intensity: float) -> float:
     return float(values[at] + (intensity - knots[at]) * ranging.ibrc_slope[at])
 
 
-@kernel
+@jit_inline
 def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int]:
     """Interval of the trajectory with t: its times, 1 / ns between them, fate, epoch. Outside all one of no length."""
     at = locate_epoch(track.time_ns, t, guess)
@@ -99,7 +99,7 @@ def interval_of(track: Track, t: int, guess: int) -> tuple[int, int, float, int,
     return begin, end, 1.0 / (end - begin), GAP if end - begin > track.max_gap_ns else DONE, at
 
 
-@kernel
+@jit_inline
 def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int, Three, Three]:
     """The interval with t, the position at its epoch, and the way to the next."""
     begin, end, per_ns, fate, at = interval_of(track, t, guess)
@@ -107,7 +107,7 @@ def way_at(track: Track, t: int, guess: int) -> tuple[int, int, float, int, int,
     return begin, end, per_ns, fate, at, here, plus(vector_at(track.position_e, at + 1), -1.0, here)
 
 
-@kernel
+@jit_inline
 def level_at(track: Track, at: int) -> tuple[Three, Three]:
     """Down, and level to the right of the nose, in e at an epoch."""
     x, y, z = vector_at(track.position_e, at)
@@ -116,7 +116,7 @@ def level_at(track: Track, at: int) -> tuple[Three, Three]:
     return down, unit(cross(down, (rot_e_from_b[0][0], rot_e_from_b[1][0], rot_e_from_b[2][0])))
 
 
-@kernel
+@jit_inline
 def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int, Matrix, Three, float, Matrix]:
     """The interval with t, and its turn as the boresight's ω and φ see it.
 
@@ -134,7 +134,7 @@ def turn_at(model: Model, t: int, guess: int) -> tuple[int, int, float, int, int
     return begin, end, per_ns, fate, at, turn, transposed_times(outer, phi), dot(phi, phi), arms
 
 
-@kernel
+@jit_inline
 def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> int:
     """Row of the table; −1 where it has none."""
     if select == ONE:
@@ -144,7 +144,7 @@ def channel_of(select: int, channels: int, channel: int, encoder_rad: float) -> 
     return channel if channel < channels else -1
 
 
-@kernel
+@jit_inline
 def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scanning, covered: int) -> None:
     """Fates before ranges are looked at; ``covered`` is what the trajectory says, ``known`` (1,) or (n,)."""
     select, channels, moves = scanning.select, len(scanning.table), len(known) > 1
@@ -158,7 +158,7 @@ def judge(part: Any, times_ns: Int64Array, fate: Any, known: Any, scanning: Scan
         fate[i] = NO_TIME if times_ns[i] < 0 else verdict
 
 
-@kernel
+@jit_inline
 def take_table(block: FloatArray, part: Any, scanning: Scanning) -> None:
     """The table's row of each return; of returns without one the first."""
     table, select = scanning.table, scanning.select
@@ -168,7 +168,7 @@ def take_table(block: FloatArray, part: Any, scanning: Scanning) -> None:
             block[BEAM + column, i] = table[channel, column]
 
 
-@kernel
+@jit_inline
 def take(block: FloatArray, part: Any, ranging: Ranging, scanning: Scanning, rate: Any, acceleration: Any) -> None:
     """Ranges and scan angles."""
     n = len(part)
@@ -195,7 +195,7 @@ def take(block: FloatArray, part: Any, ranging: Ranging, scanning: Scanning, rat
             block[THETA, i] += latency * rate[i] + torsion * acceleration[i]
 
 
-@kernel
+@jit_inline
 def gate(block: FloatArray, fate: Any, minimum_m: float, maximum_m: float) -> None:
     """Fates by range, and where no light comes through."""
     for i in range(len(fate)):
@@ -206,7 +206,7 @@ def gate(block: FloatArray, fate: Any, minimum_m: float, maximum_m: float) -> No
             fate[i] = verdict if math.isfinite(block[ALONG, i]) else NOT_FINITE
 
 
-@kernel
+@jit_inline
 def to_e(
     block: FloatArray,
     n: int,
@@ -232,7 +232,7 @@ def to_e(
         put(block, POINT, i, plus(origin, block[COUNTED, i], u))
 
 
-@kernel
+@jit_inline
 def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: float, per_ns: float) -> None:
     """Where returns are in an interval that begins then."""
     for i in range(len(stamps)):
@@ -240,7 +240,7 @@ def shares(block: FloatArray, row: int, stamps: Any, begin: int, offset_ns: floa
         block[row, i] = (passed + offset_ns) * per_ns
 
 
-@kernel
+@jit_inline
 def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceleration: Any) -> None:
     """Ranges, scan angles, and the beams as the boresight's ω and φ see them; ``part`` are the rows from k on."""
     ranging, scanning, mounted, _ = model
@@ -257,7 +257,7 @@ def beams(block: FloatArray, k: int, part: Any, model: Model, rate: Any, acceler
         through_mount(block, n, k, mounted, HEAD_START, START, 1.0)
 
 
-@kernel
+@jit_inline
 def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], out: Out) -> None:
     """What became of the returns of a block; ``level`` is down and to the right."""
     give(block, n, ORIGIN, out.origin_e[here])
@@ -272,7 +272,7 @@ def hand_out(block: FloatArray, n: int, here: Any, level: tuple[Three, Three], o
         off_nadir[i] = angle_of(dot(beam, right), dot(beam, down))
 
 
-@kept
+@jit_cached
 def cast(
     rows: StructArray, time_ns: Int64Array, model: Model, out: Out, axes: Axes | None, doubt: Doubt | None
 ) -> None:

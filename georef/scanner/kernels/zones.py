@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from swath.georef.arrays import FloatArray, IntArray
-from swath.georef.compiled import kept, kernel
+from swath.georef.compiled import jit_cached, jit_inline
 
 LIGHT_MPS = 299_792_458.0
 GAP, AMBIGUOUS, NO_RETURN = -1, -2, -3  # in the place of a zone
@@ -26,14 +26,14 @@ LAST_ORDINAL, LAST_TICKS, LAST_ID, PERIOD, LEAST, MOST, OLD_LEAST, OLD_MOST, SIN
 STATE_SIZE = 10
 
 
-@kernel
+@jit_inline
 def ticks_of(time_ns: int, tick_hz: int) -> int:
     """Counter of a time that is floor(ticks · 10⁹ / tick_hz)."""
     seconds = time_ns // 1_000_000_000
     return seconds * tick_hz + ((time_ns - seconds * 1_000_000_000) * tick_hz + 999_999_999) // 1_000_000_000
 
 
-@kernel
+@jit_inline
 def note_step(state: IntArray, ticks: int) -> None:
     """Remember the time between two pulses of which one follows the other: the extremes of the last few hundred."""
     state[PERIOD] = ticks
@@ -44,7 +44,7 @@ def note_step(state: IntArray, ticks: int) -> None:
         state[LEAST], state[MOST], state[SINGLES] = ticks, ticks, 0
 
 
-@kernel
+@jit_inline
 def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
     """Number of a pulse in the train; after a break it goes on far ahead.
 
@@ -78,14 +78,14 @@ def next_ordinal(state: IntArray, pulse_id: Any, ticks: int) -> int:
     return last + steps
 
 
-@kernel
+@jit_inline
 def median_of(sorted_m: FloatArray, count: int) -> float:
     """Of so many values in rising order."""
     median: float = sorted_m[count // 2]
     return median
 
 
-@kernel
+@jit_inline
 def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: float) -> None:
     """A value into the running median's window, the oldest out; counts: values there, place in the ring, left out."""
     counts[2] -= 1
@@ -106,14 +106,14 @@ def push(sorted_m: FloatArray, ring_m: FloatArray, counts: IntArray, value: floa
     counts[0], counts[1] = count + 1, (at + 1) % MEDIAN_OF
 
 
-@kernel
+@jit_inline
 def even(state: IntArray) -> bool:
     """Whether pulses come at even times: those between two of them are then known to the tick."""
     widest = max(state[MOST], state[OLD_MOST])
     return bool(widest > 0 and widest - min(state[LEAST], state[OLD_LEAST]) <= 1)
 
 
-@kernel
+@jit_inline
 def add_pulse(
     pulses: IntArray, angles_rad: FloatArray, known: int, state: IntArray, ordinal: int, ticks: int, row: Any
 ) -> int:
@@ -142,7 +142,7 @@ def add_pulse(
     return known + 1
 
 
-@kernel
+@jit_inline
 def nearest_emission(
     pulses: IntArray,
     angles_rad: FloatArray,
@@ -175,7 +175,7 @@ def nearest_emission(
     return best, best_miss
 
 
-@kernel
+@jit_inline
 def verdict(miss_m: float, period_m: float, margin: float, zone: int, apparent_m: float, blind_m: float) -> int:
     """The zone, or why there is none."""
     if abs(miss_m) > 0.5 * period_m:
@@ -185,7 +185,7 @@ def verdict(miss_m: float, period_m: float, margin: float, zone: int, apparent_m
     return zone
 
 
-@kept
+@jit_cached
 def resolve_zones(
     rows: Any,
     predicted_m: FloatArray,

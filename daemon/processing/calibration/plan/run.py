@@ -15,8 +15,8 @@ from swath.calib.equations.observability import RULES_OF_ALL
 from swath.calib.equations.trajectory_prior import gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight, FlightError, Head, Tangent
-from swath.calib.outcome import Held
-from swath.calib.parameters import ParameterError, Wish
+from swath.calib.outcome import FixedParameter
+from swath.calib.parameters import ParameterError, ParameterOptions
 from swath.calib.plan import Line, Predicted, Scan, Surface, planned, predict
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.processing.calibration.model import of_parameters, tables_in_words
@@ -60,7 +60,7 @@ EXPECTED = {
 
 
 @dataclass(frozen=True)
-class PlanWish:
+class PlanOptions:
     """What is asked.
 
     Attributes:
@@ -71,7 +71,7 @@ class PlanWish:
         control_sigma_m: of them.
     """
 
-    model: Wish = field(default_factory=lambda: Wish("scanner"))
+    model: ParameterOptions = field(default_factory=lambda: ParameterOptions("scanner"))
     sigmas: tuple[float, float, float] | None = None
     control: bool = True
     control_sigma_m: float = 0.01
@@ -153,7 +153,7 @@ class PlannedCalibration:
         return f"This flight does not determine {words}."
 
 
-def plan_calibration(plan: Plan, wish: PlanWish) -> PlannedCalibration:
+def plan_calibration(plan: Plan, wish: PlanOptions) -> PlannedCalibration:
     """Predict a plan's calibration.
 
     Raises:
@@ -197,7 +197,7 @@ def _gps(time_s: float) -> int:
 def _rows(predicted: Predicted) -> list[dict[str, Any]]:
     """A parameter each, in files' units, in the order of the model."""
     by_name = {parameter.name: (number, parameter) for number, parameter in enumerate(PARAMETERS)}
-    found: list[tuple[str, float, Held | None]] = [
+    found: list[tuple[str, float, FixedParameter | None]] = [
         (name, sigma, None) for name, sigma in zip(predicted.names, predicted.sigmas.tolist(), strict=True)
     ]
     found += [(f"{held.scanner}.{held.name}", held.sigma, held) for held in predicted.held if held.remedy]

@@ -21,7 +21,7 @@ from swath.calib.labels import (
     unknown,
     words_of,
 )
-from swath.calib.outcome import Held, Residuals
+from swath.calib.outcome import FixedParameter, Residuals
 from swath.calib.summary import ReportInput
 from swath.calib.verdict import held_words
 from swath.daemon.processing.calibration.report.pictures import SUSPECT
@@ -153,13 +153,13 @@ def held_table(report: ReportInput) -> Table | None:
     return Table("Not determined by this flight", heads, rows, under, left=(0, 2, 3, 4), stacked=True)
 
 
-def _would_be(held: Held) -> str:
+def _would_be(held: FixedParameter) -> str:
     one = unknown(f"{held.scanner}.{held.name}")
     sigma = held.sigma * one.factor
     return f"{number(sigma, f'.{decimals_of(sigma)}f')} {one.unit}" if math.isfinite(sigma) else "none"
 
 
-def _alike(held: Held) -> str:
+def _alike(held: FixedParameter) -> str:
     names = [(name if "." in name else f"{held.scanner}.{name}", value) for name, value in held.with_others]
     rows = [(unknown(name), value) for name, value in names]
     return ", ".join(f"{one.words} ({number(value, '+.2f')})" for one, value in rows) or "–"
